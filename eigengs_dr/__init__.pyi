@@ -10,7 +10,9 @@ from .collection.manifest import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.fit import Fit, FitInterrupted, fit
-from .fitting.options import level_counts
+from .fitting.maps import Map
+from .fitting.method import DEFAULT, Method
+from .fitting.options import Goal, level_counts
 from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, sample, save_image
 from .image.metrics import ms_ssim, psnr, ssim
@@ -24,6 +26,7 @@ from .viewer.view import view
 __version__: str
 
 __all__ = [
+    "DEFAULT",
     "BackendError",
     "ClusterError",
     "EigenGS",
@@ -31,9 +34,12 @@ __all__ = [
     "Fit",
     "FitInterrupted",
     "Gaussians",
+    "Goal",
     "ImageError",
     "ImageRow",
     "LargeFit",
+    "Map",
+    "Method",
     "RunInterrupted",
     "concatenate",
     "convert_scene",

@@ -16,7 +16,8 @@ that it is the density of the whole image.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -27,21 +28,19 @@ from numpy.typing import NDArray
 from ..backend.arrays import Float, types_in
 from ..backend.recording import exclusive
 from ..backend.selection import select
-from ..fitting.density_control import Part, PartControl
-from ..fitting.descent import FitProblem, run
+from ..fitting.control import Redistribute, Relocate
+from ..fitting.descent import State, begin, descend, last
+from ..fitting.method import Method
+from ..fitting.objective import Affine, Extent, Part, Pixels, data_of, values_in
 from ..fitting.options import FitOptions
+from ..fitting.pixels import BRIGHT, WHITE, check_normals
 from ..fitting.placement.adaptive import density_from_hessian, place_by_density
 from ..fitting.placement.density import Owners, density_ratio, squared_error
 from ..fitting.placement.filters import Canvas
-from ..fitting.schedule import Schedule, relocations
 from ..fitting.solvers.conjugate_gradient import solve
-from ..fitting.target import BRIGHT, WHITE, FitTarget, make_target, read_data, unit_of
-from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
-from ..raster.binning.tiles import Grid
-from ..raster.render import to_tensor, to_tiles
-from .draw import draw
+from ..raster.render import to_tensor
 from .grid import Block
 from .windows import Window
 
@@ -54,29 +53,34 @@ class Settings(NamedTuple):
     Attributes
     ----------
     options : FitOptions
+        With a space.
     gaussians : int
         Number of Gaussians of all blocks.
     spacing : float
         Mean distance of the Gaussians, in pixels.
+    affine : Affine
+        The unit of the fit.
     background : tuple of float
-        Value of every pixel before the Gaussians are added, in the space of the colours.
+        Value of every pixel before the Gaussians are added, in the unit of the fit.
     """
 
     options: FitOptions
     gaussians: int
     spacing: float
+    affine: Affine = Affine()
     background: tuple[float, ...] = ()
+
+    @property
+    def space(self) -> str:
+        """Space of the colours."""
+        return self.options.space or "ycbcr"
 
 
 class Surveyed(NamedTuple):
-    """Result of `survey`: the integral of the density over the core, and the sums of its values.
-
-    Data have a unit too: 1, or the largest magnitude, see `eigengs_dr.fitting.target.unit_of`.
-    """
+    """Result of `survey`: the integral of the density over the core, and the sums of its values."""
 
     mass: float
     total: NDArray[np.float64]
-    unit: float
 
 
 class PlaceTask(NamedTuple):
@@ -133,31 +137,38 @@ class FitTask(NamedTuple):
 
 
 @exclusive()
-def survey(task: PlaceTask, settings: Settings) -> Surveyed:
-    """Measure how many Gaussians a block needs, relative to others, before any fit."""
-    options = settings.options
-    pixels = task.window.read()
-    bright = BRIGHT.get(options.space)
+def measure_extent(task: PlaceTask, settings: Settings) -> Extent:
+    """Return the smallest and the largest value of a block, and their sum; refuse bad pixels."""
+    pixels, space = task.window.read()[task.block.core], settings.space
+    bright = BRIGHT.get(space)
     if bright and task.window.encoding == "linear" and pixels.max() > WHITE:
         raise ImageError(f"{task.window.name}: light above 1; give the space {bright!r}")
-    if options.space == "normal":
-        read_data(pixels, options.space)  # no other range makes normals
-    target = make_target(pixels, options.space)
-    canvas, _, density = _density(target, settings)
-    core = task.block.core
-    return Surveyed(
-        _mass(canvas, density, task.block),
-        target.values[core].sum(axis=(0, 1), dtype=np.float64),
-        unit_of(pixels, options.space),
-    )
+    if space == "normal":
+        check_normals(pixels)  # no other range makes normals
+    return Extent.of(values_in(pixels, space))
 
 
-def _density(target: FitTarget, settings: Settings) -> tuple[Canvas, Float, Float]:
-    """Return the canvas of a window, and squared Hessian and density on it."""
+@exclusive()
+def survey(task: PlaceTask, settings: Settings) -> Surveyed:
+    """Measure how many Gaussians a block needs, relative to others, before any fit."""
+    objective = _objective(task, settings)
+    canvas, _, density = _density(objective, settings)
+    values = objective.picture(objective.model.target).numpy()[task.block.core]
+    total = values.sum(axis=(0, 1), dtype=np.float64)
+    return Surveyed(_mass(canvas, density, task.block), total)
+
+
+def _objective(task: PlaceTask | FitTask, settings: Settings) -> Pixels:
+    """Return the objective of a window."""
     types = types_in(select(settings.options.backend))
-    canvas = Canvas.of(types, Grid(target.shown.shape[1], target.shown.shape[0]))
-    image = to_tiles(types, target.shown, canvas.grid)
-    return canvas, *density_from_hessian(canvas, image, settings.spacing)
+    data = data_of(task.window.read(), settings.space, affine=settings.affine)
+    return Pixels.of(data, settings.space, types)
+
+
+def _density(objective: Pixels, settings: Settings) -> tuple[Canvas, Float, Float]:
+    """Return the canvas of a window, and squared Hessian and density on it."""
+    canvas = Canvas.of(objective.types, objective.grid)
+    return canvas, *density_from_hessian(canvas, objective.shown, settings.spacing)
 
 
 def _mass(canvas: Canvas, density: Float, block: Block) -> float:
@@ -176,7 +187,7 @@ def place(task: PlaceTask, settings: Settings) -> Arrays:
         The mean (n, 2) in pixels of the window, inside of the core, and the factor (n, 3).
     """
     options, count, spacing = settings.options, task.gaussians, settings.spacing
-    canvas, energy, density = _density(make_target(task.window.read(), options.space), settings)
+    canvas, energy, density = _density(_objective(task, settings), settings)
     types, grid = canvas.types, canvas.grid
     if task.old is not None:
         mean, factor, ratio = (task.old[name] for name in ("mean", "factor", "ratio"))
@@ -188,7 +199,7 @@ def place(task: PlaceTask, settings: Settings) -> Arrays:
             size=size,
             space="data",
             backend=types.backend,
-            cutoff=options.cutoff,
+            cutoff=options.method.cutoff,
         )
         density *= Owners.of(old).average(old.color[0])
     column, row, _, _ = canvas.pixels()
@@ -213,12 +224,12 @@ def find_density(task: FitTask, settings: Settings, step_done: StepDone | None =
         Mean (n, 2) and factor (n, 3) of the own Gaussians in pixels of the window, their ratio
         (n, 1), see `PlaceTask`, and the mass (1,) of the density in the core.
     """
-    target = make_target(task.window.read(), settings.options.space)
-    problem = _start(task, target, settings)
-    found = _descend(problem, task, settings, step_done)
-    canvas, _, density = _density(target, settings)
+    shown = _objective(task, settings)
+    objective, start = _start(task, shown, settings)
+    found = _descend(objective, start, task, settings, step_done)
+    canvas, _, density = _density(shown, settings)
     owners = Owners.of(found)
-    error = squared_error(found, problem.target, problem.weight, owners.lists)
+    error = squared_error(found, objective, owners.lists)
     ratio = density_ratio(owners, error, density)
     arrays = found.to_arrays()
     return {
@@ -238,59 +249,65 @@ def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = No
     dict of str to ndarray
         Mean, factor and color of the own Gaussians, in pixels of the window.
     """
-    target = make_target(task.window.read(), settings.options.space)
-    problem = _start(task, target, settings)
+    objective, start = _start(task, _objective(task, settings), settings)
     part = Part(task.own, task.block.core)
-    control = PartControl(problem.target, problem.weight, target.shown, part=part)
-    found = _descend(problem._replace(control=control), task, settings, step_done)
+    found = _descend(replace(objective, part=part), start, task, settings, step_done)
     if task.part.stop == task.iterations:
         # The last steps may make a set worse that is nearly perfect; earlier ones, any set.
-        before, after = (
-            float(dr.sum(squared_error(g, problem.target, problem.weight))[0])
-            for g in (problem.gaussians, found)
-        )
-        found = found if after < before else problem.gaussians
+        before, after = (float(dr.sum(squared_error(g, objective))[0]) for g in (start, found))
+        found = found if after < before else start
     arrays = found.to_arrays()
     return {name: arrays[name][task.own] for name in ("mean", "factor", "color")}
 
 
-def _start(task: FitTask, target: FitTarget, settings: Settings) -> FitProblem:
-    """Return the Gaussians with their first colours, and what the fixed ones leave to them."""
-    options, values = settings.options, target.values
-    height, width, channels = values.shape
+def _start(task: FitTask, objective: Pixels, settings: Settings) -> tuple[Pixels, Gaussians]:
+    """Return what the fixed Gaussians leave to the others, and these with their first colours."""
+    options, channels = settings.options, objective.channels
     background = np.array(settings.background, np.float32)
+
+    def make(arrays: Arrays, background: NDArray[np.float32]) -> Gaussians:
+        uncolored = np.zeros((len(arrays["mean"]), channels), np.float32)
+        return Gaussians.from_arrays(
+            arrays["mean"],
+            arrays["factor"],
+            arrays.get("color", uncolored),
+            background,
+            size=objective.size,
+            space=settings.space,
+            backend=objective.types.backend,
+            cutoff=options.method.cutoff,
+        )
+
     if task.fixed is not None and len(task.fixed["mean"]):
-        arrays = task.fixed | {"background": np.zeros(channels, np.float32)}
-        others = SetData(arrays, (width, height), "data", options.cutoff)
-        values = values - draw(others, options.backend)
-    solved = "color" in task.arrays
-    uncolored = np.zeros((len(task.arrays["mean"]), channels), np.float32)
-    placed = Gaussians.from_arrays(
-        task.arrays["mean"],
-        task.arrays["factor"],
-        task.arrays.get("color", uncolored),
-        background,
-        size=(width, height),
-        space=options.space,
-        backend=options.backend,
-        cutoff=options.cutoff,
-    ).bounded()
-    if not solved:
-        placed = solve(placed, values, options.solve_steps, background=background)
-    return FitProblem(placed, values, target.weight)
+        objective = objective.minus(make(task.fixed, np.zeros(channels, np.float32)))
+    placed = make(task.arrays, background).bounded()
+    if "color" not in task.arrays:
+        steps = options.method.solve_steps
+        placed = solve(placed, objective, steps, background=settings.background)
+    return objective, placed
 
 
 def _descend(
-    problem: FitProblem, task: FitTask, settings: Settings, step_done: StepDone | None
+    objective: Pixels,
+    start: Gaussians,
+    task: FitTask,
+    settings: Settings,
+    step_done: StepDone | None,
 ) -> Gaussians:
-    def after(taken: int, found: Gaussians) -> bool:
-        if step_done and taken and taken % 10 == 0:
-            dr.sync_thread()  # steps run asynchronously
-            step_done(taken)
-        return False
+    """Take the steps of a task; nothing moves between them without a part."""
+    method, seed = settings.options.method.without(Redistribute), settings.options.seed
+    if objective.part is None:
+        method = replace(method, controls=())
 
-    schedule = settings.options.method.schedule
-    return run(problem, schedule, task.iterations, after, part=task.part)
+    def states() -> Generator[State, None, None]:
+        steps = descend(objective, method, begin(start), task.iterations, seed, task.part)
+        for taken, state in enumerate(steps, 1):
+            if step_done and taken % 10 == 0:
+                dr.sync_thread()  # steps run asynchronously
+                step_done(taken)
+            yield state
+
+    return last(states(), start)
 
 
 SHORT_ROUNDS, LAST_ROUNDS = 3, 5
@@ -299,7 +316,7 @@ what the optimiser knows; fewer leave seams. On 1,024x1,024 pixels in blocks of 
 rounds were alike, and better than 1 or 6."""
 
 
-def rounds(schedule: Schedule, iterations: int) -> list[range]:
+def rounds(method: Method, iterations: int) -> list[range]:
     """Return the steps of every round of a descent.
 
     Gaussians relocate before the first step of a round, so that neighbours do so at once and see
@@ -307,11 +324,13 @@ def rounds(schedule: Schedule, iterations: int) -> list[range]:
 
     Examples
     --------
-    >>> rounds(Schedule("adam", {"color": 0.01}), 30)
+    >>> import eigengs_dr as eg
+    >>> rounds(eg.DEFAULT, 30)
     [range(0, 10), range(10, 20), range(20, 30)]
     """
-    cuts = [0, *relocations(schedule, iterations)]
-    number, last = LAST_ROUNDS if cuts[1:] else SHORT_ROUNDS, cuts.pop()
-    number = max(1, min(number, iterations - last))
-    cuts += [last + k * (iterations - last) // number for k in range(number + 1)]
+    relocate = method.control(Relocate)
+    cuts = [0, *(relocate.steps(iterations) if relocate else [])]
+    number, latest = LAST_ROUNDS if cuts[1:] else SHORT_ROUNDS, cuts.pop()
+    number = max(1, min(number, iterations - latest))
+    cuts += [latest + k * (iterations - latest) // number for k in range(number + 1)]
     return [range(start, stop) for start, stop in pairwise(cuts)]

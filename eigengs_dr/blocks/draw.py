@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..fitting.objective import Affine
 from ..gaussian.file import SetData, crop
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
@@ -161,8 +163,36 @@ def compare_tasks(
         yield CompareTask(block, source.window(block.rows, block.columns), part, backend)
 
 
-def compare(task: CompareTask, shared: Any = None) -> tuple[float, float]:
-    """Return the sums of the squared errors of a part in the spaces of psnr_ycbcr and psnr_rgb."""
-    pixels, shown = task.window.read(), draw(task.data, task.backend)
-    space = float_space(task.data.space)
-    return squared_error(shown, pixels, space), squared_error(shown, pixels, "rgb")
+def compare(
+    task: CompareTask, shared: Any = None, *, affine: Affine, codes: bool
+) -> tuple[float, float]:
+    """Return the sums of the squared errors of a part in the spaces of psnr_ycbcr and psnr_rgb.
+
+    Parameters
+    ----------
+    task : CompareTask
+        Its set is in the unit of a fit.
+    affine : Affine
+        That unit.
+    codes : bool
+        Whether data are codes. The peak of others is their range, and psnr_rgb is NaN.
+    """
+    pixels, data = task.window.read(), task.data
+    if data.space != "data":
+        scaled = {name: data.arrays[name] * np.float32(affine.scale) for name in COLORS}
+        scaled["background"] += np.float32(affine.offset)
+        shown = draw(data._replace(arrays=data.arrays | scaled), task.backend)
+        floats = squared_error(shown, pixels, float_space(data.space))
+        return floats, squared_error(shown, pixels, "rgb")
+    # Differences of the values as they are fitted keep their digits.
+    shown = draw(data, task.backend)
+    values = (pixels - np.float32(affine.offset)) / np.float32(affine.scale)
+    floats = squared_error(shown, values, "data")
+    if not codes:
+        return floats, math.nan
+    floats *= affine.scale**2
+    return floats, squared_error(shown * affine.scale + affine.offset, pixels, "rgb")
+
+
+COLORS = ("color", "background")
+"""What a set has in the unit of its colours."""

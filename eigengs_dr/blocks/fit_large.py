@@ -12,9 +12,10 @@ from ..backend.arguments import takes_numbers
 from ..backend.executor import executor_for
 from ..backend.feedback import defer_interrupts, shows_progress
 from ..backend.selection import select
+from ..fitting.method import DEFAULT, Method
+from ..fitting.objective import restored
 from ..fitting.options import FitOptions, named_options
-from ..fitting.target import in_unit
-from ..gaussian.file import CUTOFF, check_suffix, write
+from ..gaussian.file import check_suffix, write
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
@@ -79,8 +80,8 @@ def fit_large(
     iterations: int = 1000,
     block: int = BLOCK_SIDE,
     space: str = "ycbcr",
-    solve_steps: int = 10,
-    cutoff: float = CUTOFF,
+    method: Method = DEFAULT,
+    seed: int = 0,
     backend: str | None = None,
     progress: Any = None,
     client: Any = None,
@@ -105,8 +106,8 @@ def fit_large(
         Number of steps of every block.
     block : int, optional
         Largest side of a block in pixels, at least 32.
-    space, solve_steps, cutoff, backend : optional
-        See `eigengs_dr.fit`.
+    space, method, seed, backend : optional
+        See `eigengs_dr.fit`. Placement is that of `eigengs_dr.DEFAULT`, whatever the method.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(done, total, row)``: what is done of a stage, in blocks or steps of blocks. The
@@ -140,7 +141,7 @@ def fit_large(
 
     Notes
     -----
-    The result draws no random numbers. It does not depend on the order of the blocks, nor on where
+    One seed gives one result. It does not depend on the order of the blocks, nor on where
     they are fitted or whether the run was interrupted; a run that goes on beside another processor
     differs in the last bits.
 
@@ -156,8 +157,8 @@ def fit_large(
         gaussians=gaussians,
         iterations=iterations,
         space=space,
-        solve_steps=solve_steps,
-        cutoff=cutoff,
+        method=method,
+        seed=seed,
         backend=backend,
         encoding=encoding,
     )
@@ -168,9 +169,9 @@ def fit_large(
     if output is not None:
         check_suffix(output)
         require_writable(output)
-        names = ("iterations", "space", "solve_steps", "cutoff", "encoding")
+        names = ("iterations", "space", "seed", "encoding")
         decisive = {name: getattr(options, name) for name in names}
-        decisive |= {"gaussians": settings.gaussians, "block": block}
+        decisive |= {"method": repr(method), "gaussians": settings.gaussians, "block": block}
         keep = open_checkpoint(output, source.identity | decisive, [])
     with (
         keep as checkpoint,
@@ -179,7 +180,7 @@ def fit_large(
         run = Run(source, blocks, settings, executor_for(client), checkpoint, progress, interrupted)
         data = run.fit()
         errors = run.measure(data)
-        result = in_unit(Gaussians.from_data(data, backend), run.image.unit)
+        result = restored(Gaussians.from_data(data, backend), run.settings.affine)
         if output is not None:
             write(output, result.data())
     ycbcr, rgb = (psnr_from_mse(e / (3 * source.width * source.height)) for e in errors)
@@ -201,6 +202,7 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Se
     count = options.gaussians
     if count is None:
         count = max(1, pixels // PIXELS_PER_GAUSSIAN)
+    assert isinstance(count, int)
     spacing = (pixels / max(count, 1)) ** 0.5
     blocks = divide(image.width, image.height, side, choose_halo(spacing))
     least = max(len(blocks), -(-pixels // round(MAX_SPACING**2)))

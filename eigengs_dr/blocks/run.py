@@ -4,18 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.executor import Executor, completed
-from ..fitting.schedule import first_phase
+from ..fitting.control import Redistribute
+from ..fitting.objective import Extent
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
-from .block import FitTask, PlaceTask, Settings, find_density, fit_block, place, rounds, survey
+from .block import (
+    FitTask,
+    PlaceTask,
+    Settings,
+    find_density,
+    fit_block,
+    measure_extent,
+    place,
+    rounds,
+    survey,
+)
 from .draw import compare, compare_tasks
 from .grid import Arrays, Block, BlockSets, deal
 from .windows import Source, Window
@@ -30,10 +41,9 @@ class Run:
     Attributes
     ----------
     image : Source
-        After `fit` with the unit of the fit, in which the set is.
     blocks : list of Block
     settings : Settings
-        With the background, after `fit`.
+        With the unit and the background, after `fit`.
     executor : Executor
     checkpoint : Checkpoint or None
         Where blocks that are done wait for the end of the run.
@@ -56,12 +66,14 @@ class Run:
     stage: str = ""
     done: int = 0
     total: int = 0
+    extent: Extent = field(init=False)
 
     def fit(self) -> SetData:
         """Place and fit all Gaussians; a long fit places them again where error was left."""
         options = self.settings.options
         steps = options.iterations
-        first = first_phase(options.method.schedule, steps)
+        control = options.method.control(Redistribute)
+        first = sum(control.steps(steps)) if control else 0
         mass = self._survey()
         placed = self._place(mass)
         if first:
@@ -71,29 +83,32 @@ class Run:
         return SetData(
             sets.arrays | {"background": background},
             (self.image.width, self.image.height),
-            options.space,
-            options.cutoff,
+            self.settings.space,
+            options.method.cutoff,
         )
 
     def measure(self, data: SetData) -> tuple[float, float]:
-        """Return the sums of the squared errors for psnr_ycbcr and psnr_rgb."""
+        """Return the sums of the squared errors for psnr_ycbcr and psnr_rgb.
+
+        The set is in the unit of the fit.
+        """
         self._begin("measure", len(self.blocks))
         tasks = compare_tasks(self.image, data, self.blocks, self.settings.options.backend)
-        ycbcr, rgb = np.sum(self._in_order(compare, tasks), axis=0).tolist()
+        work = partial(compare, affine=self.settings.affine, codes=self.extent.is_of_codes)
+        ycbcr, rgb = np.sum(self._in_order(work, tasks), axis=0).tolist()
         return ycbcr, rgb
 
     def _survey(self) -> NDArray[np.float64]:
-        """Return the masses of all blocks, and set the background: the mean of the image.
+        """Return the masses of all blocks; set the unit, and the background: the mean of the image.
 
-        Data above the unit of a fit are looked at twice: they are fitted, and so placed, in a unit
-        that the whole image says.
+        The image is read twice: it is placed in a unit that all blocks say.
         """
-        self._begin("survey", len(self.blocks))
-        found = self._in_order(survey, (PlaceTask(self._window(b), b) for b in self.blocks))
-        unit = max(value.unit for value in found)
-        if unit > 1:
-            self.image = replace(self.image, unit=unit)
-            return self._survey()
+        self._begin("survey", 2 * len(self.blocks))
+        tasks = [PlaceTask(self._window(b), b) for b in self.blocks]
+        extents = self._in_order(measure_extent, tasks)
+        self.extent = reduce(Extent.joined, extents)
+        self.settings = self.settings._replace(affine=self.extent.affine(self.settings.space))
+        found = self._in_order(survey, tasks)
         figures = np.array([[value.mass, *value.total] for value in found])
         if self.checkpoint is not None:
             figures = _first_figures(self.checkpoint, figures)
@@ -133,7 +148,7 @@ class Run:
 
     def _fit_blocks(self, sets: BlockSets, steps: int) -> BlockSets:
         """Fit all blocks, round by round, from sets without colours."""
-        parts = rounds(self.settings.options.method.schedule, steps)
+        parts = rounds(self.settings.options.method, steps)
         self._begin("fit", len(self.blocks) * steps)
         first = self._kept_round(len(parts))
         self.resumed += first * len(self.blocks)
@@ -144,7 +159,7 @@ class Run:
                 sets.counts,
                 ("mean", "factor", "color"),
                 self.image.channels,
-                self.settings.options.cutoff,
+                self.settings.options.method.cutoff,
             )
             task = partial(self._fit_task, sets=sets, steps=steps, part=part)
             for block, arrays in self._fitted(f"fit{number}-", fit_block, task, len(part)):

@@ -43,15 +43,12 @@ class Window(NamedTuple):
         The image and the part, for errors.
     encoding : {"srgb", "linear"}
         What the pixels are.
-    unit : float
-        Data are divided by it.
     """
 
     load: Callable[[], Pixels]
     keep_grey: bool
     name: str
     encoding: str = "srgb"
-    unit: float = 1.0
 
     def read(self) -> NDArray[np.float32]:
         """Return the pixels: float32 of shape (h, w, 3), in sRGB, or data, perhaps (h, w, 1).
@@ -65,8 +62,7 @@ class Window(NamedTuple):
         pixels = self.load()
         try:
             if self.keep_grey:
-                data = check_data(pixels, copy=False)
-                return data if self.unit == 1 else data / np.float32(self.unit)
+                return check_data(pixels, copy=False)
             return check_image(pixels, copy=False, encoding=self.encoding)
         except ImageError as error:
             raise ImageError(f"{self.name}: {str(error).removeprefix('image: ')}") from None
@@ -88,7 +84,7 @@ class Source:
         What tells this image from others, in numbers and texts.
     pixels : str or array
         The path of a file that is read by windows; or what ``pixels[rows, columns]`` is a part of.
-    keep_grey, encoding, unit
+    keep_grey, encoding
         See `Window`.
     """
 
@@ -100,7 +96,6 @@ class Source:
     pixels: Any
     keep_grey: bool
     encoding: str = "srgb"
-    unit: float = 1.0
 
     def window(self, rows: slice, columns: slice) -> Window:
         """Return a part of the image."""
@@ -109,7 +104,7 @@ class Source:
             load = partial(_read_part, self.pixels, rows, columns)
         else:
             load = partial(np.asarray, np.asarray(self.pixels[rows, columns]))
-        return Window(load, self.keep_grey, f"{self.name}, {part}", self.encoding, self.unit)
+        return Window(load, self.keep_grey, f"{self.name}, {part}", self.encoding)
 
 
 def open_source(source: Any, keep_grey: bool = False, encoding: str | None = None) -> Source:

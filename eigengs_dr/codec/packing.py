@@ -16,8 +16,8 @@ from ..backend.arguments import takes_numbers
 from ..backend.arrays import types_of
 from ..backend.recording import exclusive
 from ..fitting.fit import Fit
-from ..fitting.maps import combine, read_maps
-from ..fitting.target import make_target
+from ..fitting.maps import Map, read_maps
+from ..fitting.objective import values_in
 from ..gaussian.channels import TextureMap, channel_weights, show_sums, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
@@ -198,7 +198,7 @@ def _image_of(g: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
         raise ValueError(f"pack: image has shape {pixels.shape}, the set needs {expected}")
     if g.space == "radiance":
         return to_pu21(to_linear(pixels))
-    return pixels if g.space == "linear" else make_target(pixels, g.space).values
+    return pixels if g.space == "linear" else values_in(pixels, g.space)
 
 
 def _shown(g: Gaussians) -> Array:
@@ -256,16 +256,16 @@ def _images_of(g: Gaussians, images: Images, encoding: str | None) -> tuple[list
         raise ValueError(
             f"pack: images are of {', '.join(images)}; give one of each of {', '.join(spaces)}"
         )
-    found = read_maps({name: images[name] for name in spaces}, spaces, encoding)
+    given = {name: Map(images[name], space) for name, space in spaces.items()}
+    found = read_maps(given, encoding=encoding)
     for image, m in zip(found, g.maps, strict=True):
         expected = (g.height, g.width, m.channels)
         if image.pixels.shape != expected:
             raise ValueError(
                 f"pack: map {m.name!r} has shape {image.pixels.shape}, the set needs {expected}"
             )
-    units = [image.unit for image in found]
-    pixels: list[Array] = [i.pixels * np.float32(i.unit) for i in found]
-    return pixels, combine(found, units).values
+    values = [values_in(image.pixels, image.space) for image in found]
+    return [image.pixels for image in found], np.concatenate(values, axis=2)
 
 
 def _errors(a: list[Array], b: list[Array]) -> list[float]:

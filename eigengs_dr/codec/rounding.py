@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..fitting.descent import FitProblem, run
-from ..fitting.options import PRESETS
+from ..fitting.descent import begin, descend, last
+from ..fitting.method import DEFAULT
+from ..fitting.objective import Pixels
 from ..fitting.solvers.conjugate_gradient import solve
 from ..gaussian.gaussians import Gaussians, like
 from ..raster.render import render
@@ -262,9 +263,7 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
     count = len(gaussians)
     groups = min(GROUPS, count)
     group_of = np.argsort(_along_curve(gaussians)) % groups
-    schedule = PRESETS["default"].schedule
-    rates = {name: RATE * rate for name, rate in schedule.rates.items()}
-    slow = replace(schedule, rates=rates, redistribute_after=0)
+    slow = replace(DEFAULT.at_rates(RATE), controls=())
     free, rest = np.arange(count), np.asarray(target, np.float32)
     done: list[Symbols] = []
     current, inside = gaussians, _all_inside(gaussians)
@@ -276,9 +275,10 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
         if not len(free):
             break
         rest = rest - planes_of(like(gaussians, **dequantize(done[-1], steps)))
-        current = solve(current[np.flatnonzero(~now)], rest, 2, warm_start=True)
+        objective = Pixels.plain(rest, current)
+        current = solve(current[np.flatnonzero(~now)], objective, 2, warm_start=True)
         if inside:  # descent would move means outside the image into it
-            current = run(FitProblem(current, rest), slow, STEPS)
+            current = last(descend(objective, slow, begin(current), STEPS), current)
     symbols = Symbols(*map(np.concatenate, zip(*done, strict=True)))
     return _content(gaussians, [symbols], steps, current.to_arrays()["background"])
 

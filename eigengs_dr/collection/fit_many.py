@@ -7,21 +7,28 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from ..backend.feedback import shows_progress
 from ..backend.selection import select
-from ..fitting.fit import Fit, fit_image
+from ..fitting.fit import Fit, fit_images
+from ..fitting.objective import is_codes
 from ..fitting.options import FitOptions, refuse_unknown
-from ..fitting.start import load_start
-from ..fitting.target import unit_of
-from ..gaussian.gaussians import Gaussians
+from ..fitting.start import load_start, set_in
 from ..image.color import rendered_as
 from ..image.pixels import EncodedImage
-from .fit_batch import fit_batch, fits_in_batches
 from .manifest import ImageRow, fingerprint
 from .run import Job, run_images
 from .sources import Images
+
+MAX_SIDE = 256
+"""Longer side, in pixels, of the largest images that are fitted in groups."""
+
+MAX_GAUSSIANS = 1 << 15
+"""Most Gaussians of an image of a group: Dr.Jit adds up to so many numbers in one order, more in
+parts that depend on how many sums there are."""
+
+MAX_CUTOFF = 3.1
+"""Largest cutoff at which no Gaussian of a fit is steep, see `eigengs_dr.raster.evaluate.is_steep`.
+One steep Gaussian changes the arithmetic of all, so those of another image may not share it."""
 
 MAX_GROUP_PIXELS = 1 << 18
 """Largest number of pixels of a group: 4 images of 256x256, or 64 of 64x64. Larger groups are not
@@ -69,9 +76,8 @@ def fit_many(
         write the results, so they need the same file system, or URLs. On llvm the results have
         the same bits whatever the number of workers.
     options : Any
-        Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, init, start,
-        preset, solve_steps, space, seed, backend, target_psnr, target_space, max_gaussians,
-        levels, cutoff and encoding. A start is read once.
+        Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, target_psnr,
+        start, space, method, seed, backend and encoding. A start is read once.
 
     Returns
     -------
@@ -99,8 +105,8 @@ def fit_many(
     Notes
     -----
     Small images of one size that follow each other are fitted in groups, see
-    `eigengs_dr.collection.fit_batch`. On llvm a result equals that of `eigengs_dr.fit` bit for bit,
-    whatever the other images are. On cuda sums run in another order: long fits end some tenths of a
+    `eigengs_dr.fitting.fit.fit_images`. On llvm a result equals that of `eigengs_dr.fit` bit for
+    bit, whatever the other images are. On cuda sums run in another order: long fits end some tenths of a
     decibel apart, up or down.
 
     Examples
@@ -121,7 +127,7 @@ def fit_many(
     job = Job(
         partial(_fit_group, options=settings),
         partial(_may_join, options=settings),
-        rendered_as(settings.space) is None,
+        rendered_as(settings.space or "ycbcr") is None,
         settings.encoding,
         settings.iterations,
         _decisive(settings),
@@ -133,28 +139,41 @@ def fit_many(
 def _decisive(settings: FitOptions) -> dict[str, Any]:
     """Return the options on which results depend; a start by what it holds."""
     options = {name: value for name, value in vars(settings).items() if name != "backend"}
+    options["method"] = repr(settings.method)
+    if settings.goal:
+        options["target_psnr"] = vars(settings.goal)
+    if settings.levels:
+        options["gaussians"] = list(settings.levels)
     if settings.start is not None:
         start: Any = settings.start
-        options["start"] = fingerprint(start if isinstance(start, Gaussians) else start.gaussians)
+        options["start"] = fingerprint(set_in(start))
     return options
 
 
 def _may_join(group: list[EncodedImage], added: EncodedImage, options: FitOptions) -> bool:
     """Group small images of one size, up to `MAX_GROUP_PIXELS`."""
     first, last = group[-1].pixels, added.pixels
-    alike = first.shape == last.shape and _is_batchable(group[-1], options)
+    alike = first.shape == last.shape and _is_groupable(group[-1], options)
     area = (len(group) + 1) * last.shape[0] * last.shape[1]
-    return alike and _is_batchable(added, options) and area <= MAX_GROUP_PIXELS
+    return alike and _is_groupable(added, options) and area <= MAX_GROUP_PIXELS
 
 
-def _is_batchable(image: EncodedImage, options: FitOptions) -> bool:
-    """Return whether a batch may hold an image."""
-    plain = image.encoding == "srgb" and unit_of(image.pixels, options.space) == 1
-    return plain and fits_in_batches(options, image.pixels)
+def _is_groupable(image: EncodedImage, options: FitOptions) -> bool:
+    """Return whether a group may hold an image: results have the bits of fits alone."""
+    pixels, method = image.pixels, options.method
+    return (
+        image.encoding == "srgb"
+        and (options.space != "data" or is_codes(pixels))
+        and options.start is None
+        and not method.place.has_colors
+        and options.goal is None
+        and not options.levels
+        and method.cutoff <= MAX_CUTOFF
+        and max(pixels.shape[:2]) <= MAX_SIDE
+        and options.count_for(pixels.shape[0] * pixels.shape[1]) <= MAX_GAUSSIANS
+    )
 
 
 def _fit_group(images: list[EncodedImage], options: FitOptions) -> list[Fit]:
     """Fit one image, or several that may be in one batch."""
-    if len(images) == 1:
-        return [fit_image(images[0], options)]
-    return fit_batch(np.stack([image.pixels for image in images]), options)
+    return fit_images(images, options)

@@ -1,7 +1,7 @@
-"""Gradient descent on all parameters of the Gaussians of one image.
+"""The state of a descent, the loop over its steps, and the program of one step.
 
-A step takes three kernels: the sum over Gaussians, which writes the derivative of the error instead
-of an image; the adjoint; and the optimiser, with one lane per Gaussian.
+A step takes three kernels: the sum over Gaussians, which writes the derivative of the objective
+instead of an image; the adjoint; and the optimiser, with one lane per Gaussian.
 """
 
 from __future__ import annotations
@@ -9,313 +9,323 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of, upload
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, take
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.binning.lists import TileLists
-from ..raster.kernels import residual, sum_lanes
+from ..raster.kernels import sum_lanes
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
-from ..raster.render import batch_to_tiles, bin_gaussians
-from .parameterization import Parameterization, Variables
-from .schedule import (
-    Relocation,
-    Schedule,
-    first_phase,
-    lr_factor,
-    next_build,
-    relocations,
-    surplus_for,
-)
+from ..raster.render import bin_gaussians
+from .method import Method
+from .objective import Pixels, Quadratic
+from .variables import Coordinates, Variables
 
-MSE_EPSILON = 1e-10
-"""Mean squared error added before the logarithm, which would diverge at an error of 0."""
+LOSS_EPSILON = 1e-10
+"""Mean loss added before the logarithm of a level, which would diverge at 0."""
 
 
-class TiledImage(NamedTuple):
-    """The image of a descent on the device, or a batch of images.
+class Moving(NamedTuple):
+    """What a step changes.
 
     Attributes
     ----------
-    values : Float
-        In the space of the set, in the tile layout of `eigengs_dr.raster.kernels`.
-    weight : Float, or None
-        Factor of the errors before squaring, in tile layout.
-    lists : TileLists, or None
-        Lists that are valid for the current set; None if there are none yet.
+    variables : dict of str to arrays
+        The variables that the optimiser moves.
+    moments : dict of str to tuple
+        The state of the optimiser for each variable.
+    time : Float, shape (1,)
+        Steps since the optimiser started.
+    packed : Float
+        The parameters of the set for the kernels.
+    rate_scale : Float or None
+        Factor of the learning rates of means and shapes, one for each Gaussian.
     """
 
-    values: Float
-    weight: Float = None
-    lists: TileLists | None = None
+    variables: Variables
+    moments: dict[str, tuple]
+    time: Float
+    packed: Float
+    rate_scale: Float | None
 
 
-class Control(Protocol):
-    """The density control of a descent: Gaussians that are placed anew, move and leave.
-
-    `eigengs_dr.fitting.density_control` has those of one image and of levels.
-    """
-
-    @property
-    def redistributes(self) -> bool:
-        """Whether all Gaussians are placed anew after a first phase."""
-
-    def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
-        """Return a new set of `count` Gaussians, denser where the old set left more error."""
-
-    def relocate(self, gaussians: Gaussians, how: Relocation, image: TiledImage) -> Gaussians:
-        """Return as many Gaussians, less those that `how` drops.
-
-        Some have moved to where the old set left most error, and all are perturbed.
-        """
-
-
-StepProgram: TypeAlias = Callable[..., "Descent"]
-"""One step of a descent, see `step_program`."""
-
-
-class FitProblem(NamedTuple):
-    """The start and the target of a descent.
+@dataclass(frozen=True)
+class State:
+    """The state of a descent between two steps.
 
     Attributes
     ----------
     gaussians : Gaussians
-        The set before the first step.
-    target : ndarray of float32, shape (H, W, C)
-        The image in the space of the set. For a batch, (M, H, W, C): the set holds the Gaussians of
-        all images, image after image, and its background has M values.
-    weight : ndarray of float32, shape (H, W, C), or None
-        Factor of the errors before squaring.
-    control : Control, or None
-        None where Gaussians must keep their places.
+        The current set, of a batch image after image.
+    count : int
+        Number of Gaussians of an image that are asked for.
+    surplus : int
+        How many more a control may place before the last ones have left.
+    chosen : bool
+        Whether the user chose the Gaussians: controls then move them only for the better.
+    squares : Float or None, shape (images,)
+        The sums of ``h (p - t)^2`` that a control has measured before this step.
+    fixed : Gaussians or None
+        The set whose variables move; None until the next step, which starts the optimiser.
+    moving : Moving or None
+    since : int
+        The step at which the optimiser started.
+    lists : tuple of TileLists
+        Of the current set, one for each of the numbers of the levels, and of all.
+    until : int
+        The step that needs new lists.
     """
 
     gaussians: Gaussians
-    target: NDArray[np.float32]
-    weight: NDArray[np.float32] | None = None
-    control: Control | None = None
+    count: int
+    surplus: int = 0
+    chosen: bool = False
+    squares: Float | None = None
+    fixed: Gaussians | None = None
+    moving: Moving | None = None
+    since: int = 0
+    lists: tuple[TileLists, ...] = ()
+    until: int = 0
 
+    def replaced(self, gaussians: Gaussians) -> State:
+        """Return the state with another set, from which the optimiser starts anew."""
+        nothing = {"fixed": None, "moving": None, "lists": ()}
+        return replace(self, gaussians=gaussians, **nothing)
 
-def run(
-    problem: FitProblem,
-    schedule: Schedule,
-    iterations: int,
-    after: Callable[[int, Gaussians], bool] | None = None,
-    *,
-    levels: Sequence[int] = (),
-    surplus: int = 0,
-    part: range | None = None,
-) -> Gaussians:
-    """Take the steps of `descend`, to the last one or until `after` ends it.
-
-    Parameters
-    ----------
-    problem, schedule, iterations, levels, surplus, part
-        See `descend`.
-    after : callable, optional
-        ``after(step, gaussians)`` with the set before the first step, as step 0, and after every
-        step. True ends the descent; it may raise an error to do so.
-
-    Returns
-    -------
-    Gaussians
-        The last set, without gradients.
-    """
-    sets = descend(problem, schedule, iterations, levels=levels, surplus=surplus, part=part)
-    with closing(sets):
-        for step, found in enumerate(sets):
-            if after and after(step, found):
-                break
-    return dr.detach(found)
+    @property
+    def total(self) -> int:
+        """Number of Gaussians of an image."""
+        return len(self.gaussians) // dr.width(self.gaussians.background[0])
 
 
 def descend(
-    problem: FitProblem,
-    schedule: Schedule,
+    objective: Pixels,
+    method: Method,
+    state: State,
     iterations: int,
-    *,
-    levels: Sequence[int] = (),
-    surplus: int = 0,
+    key: int = 0,
     part: range | None = None,
-) -> Generator[Gaussians, None, None]:
-    """Yield the set before the first step and after every step of gradient descent.
+) -> Generator[State, None, None]:
+    """Yield the state after every step of a descent: the loop of every fit.
 
     Parameters
     ----------
-    problem : FitProblem
-        The start and the target. With a control, Gaussians move between steps, see `relocations`.
-        If it redistributes, a first phase shows where error is left, and the other steps start
-        from redistributed Gaussians, see `first_phase`; there are more Gaussians until the last of
-        the moves, see `surplus_for`. These functions are in `eigengs_dr.fitting.schedule`.
-    schedule : Schedule
+    objective : Pixels
+    method : Method
+    state : State
+        See `begin`.
     iterations : int
-        Number of steps, with the first phase.
-    levels : sequence of int, optional
-        Numbers n. The first n Gaussians shall form the image too, as well as they can.
-    surplus : int, optional
-        Number of Gaussians of each image that relocations, if there are any, drop from the start.
-        A descent that redistributes has none, and gets its own.
+        Number of steps of the whole descent, by which rates fall and controls act.
+    key : int, optional
+        All random numbers depend on it and on the step.
     part : range, optional
-        The steps to take, some of ``range(iterations)``, without a first phase; by default all. A
-        part starts without the moments of the optimiser. It starts with a warm-up, unless Gaussians
-        relocate before its first step: without one, a stop in the middle of 100 steps costs 0.55
-        dB, with one 0.16 dB (1,024x1,024 pixels, one Gaussian for 20 pixels).
+        The steps to take, by default all; the optimiser starts anew at the first.
 
     Yields
     ------
-    Gaussians
-        The current set. After the last relocation it has as many Gaussians as the start, less the
-        argument `surplus`. Steps run asynchronously: its arrays may not be computed yet.
+    State
+        Steps run asynchronously: its arrays may not be computed yet. After the last control there
+        are as many Gaussians as asked for.
     """
-    with release_later(problem):  # a set of the caller may share NumPy's memory
-        yield problem.gaussians
-        first = 0 if part is not None else first_phase(schedule, iterations)
-        if problem.control and problem.control.redistributes and first:
-            for current in _run_phase(problem, schedule, range(first), first):
-                yield current
-            iterations, images = iterations - first, number_of_images(problem)
-            count, pixels = len(current) // images, current.width * current.height
-            surplus = surplus_for(schedule, count, pixels, iterations)
-            anew = problem.control.redistribute(dr.detach(current), len(current) + images * surplus)
-            problem = problem._replace(gaussians=anew)
-        part = range(iterations) if part is None else part
-        yield from _run_phase(problem, schedule, part, iterations, levels, surplus)
-
-
-def number_of_images(problem: FitProblem) -> int:
-    """Return how many images a problem has: more than one for a batch."""
-    return len(problem.target) if problem.target.ndim == 4 else 1
-
-
-def _run_phase(
-    problem: FitProblem,
-    schedule: Schedule,
-    part: range,
-    iterations: int,
-    levels: Sequence[int] = (),
-    surplus: int = 0,
-) -> Generator[Gaussians, None, None]:
-    """Yield the set after every step of a part of a phase of so many iterations."""
-    fixed = problem.gaussians
-    types = types_of(fixed.mean)
-    images = number_of_images(problem)
-    state, variables = start_descent(fixed, schedule, images), schedule.variables()
-    target = batch_to_tiles(types, problem.target)
-    weight = None if problem.weight is None else batch_to_tiles(types, problem.weight)
-    moves_at = relocations(schedule, iterations, surplus) if problem.control else {}
-    start = 0 if part.start in moves_at else part.start
-    factors = [lr_factor(schedule, step, iterations, start) for step in range(iterations)]
-    rates, stop = rate_table(types, schedule, factors), part.start
-    lists: list[TileLists] = []
-    with freeze_program(step_program(schedule, fixed, levels)) as take_step:
+    part = range(iterations) if part is None else part
+    acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
+    changes = sorted({*(step for _, steps in acts for step in steps), part.stop})
+    rates, largest = rate_table(objective.types, method, iterations), 0
+    with release_later(state), freeze_program(step_program(objective, method)) as take_step:
         for step in part:
-            if step in moves_at and problem.control:
-                image = TiledImage(target, weight, lists[-1] if lists else None)
-                current = dr.detach(state.gaussians)
-                fixed = problem.control.relocate(current, moves_at[step], image)
-                state, stop = start_descent(fixed, schedule, images), step
-            if step == stop:
-                end = min((s for s in moves_at if s > step), default=part.stop)
-                stop, moves = next_build(schedule, step, iterations, min(end, part.stop))
-                pad, growth = variables.reach(fixed, moves)
-                pad = pad if state.rate_scale is None else pad * state.rate_scale
-                counts, lists = (*levels, len(fixed)), []  # old lists make room for new ones
-                lists = [
-                    bin_gaussians(
-                        prefix(state.gaussians, n), _prefix(pad, n), growth, images=images
-                    )
-                    for n in counts
-                ]
-            index = dr.opaque(types.UInt, step)
-            state = take_step(
-                replace(state, gaussians=None), fixed, target, weight, lists, rates, index
+            for control, steps in acts:
+                if step in steps:
+                    state = control(state, objective, step, iterations, key)
+            if state.moving is None:
+                state = started(state, method, step, objective.grid.images)
+            if not state.lists or step >= state.until:
+                end = next(change for change in changes if change > step)
+                state = _listed(state, objective, method, step, iterations, end)
+            largest = max(largest, len(state.fixed))
+            moving, moved = take_step(
+                largest,
+                state.moving,
+                state.fixed,
+                objective.model,
+                list(state.lists),
+                rates,
+                dr.opaque(objective.types.UInt, step),
             )
-            yield state.gaussians
+            state = replace(state, moving=moving, gaussians=moved, squares=None)
+            yield state
 
 
-def rate_table(types: ArrayTypes, schedule: Schedule, factors: Sequence[float]) -> Float:
+def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussians:
+    """Take all steps of a descent; return its last set without derivatives.
+
+    `gaussians` is the set before the first step, for a descent of no steps.
+    """
+    with closing(states):
+        for state in states:
+            gaussians = state.gaussians
+    return dr.detach(gaussians)
+
+
+def begin(gaussians: Gaussians, images: int = 1, chosen: bool = False) -> State:
+    """Return the state before the first step from the Gaussians of one image after another."""
+    return State(gaussians, len(gaussians) // images, chosen=chosen)
+
+
+def started(state: State, method: Method, step: int, images: int = 1) -> State:
+    """Return the state in which the optimiser starts at the current set, before a step."""
+    gaussians = dr.detach(state.gaussians)
+    encoded = method.coordinates.encode(gaussians)
+    variables = {name: dr.detach(encoded[name]) for name in method.rates}
+    dr.eval(variables)
+    moments = {name: method.optimizer.start(value) for name, value in variables.items()}
+    types, scale = types_of(gaussians.mean), None
+    if method.rate_exponent:
+        zeros = dr.zeros(types.Float, len(gaussians))
+        color = [row + zeros for row in gaussians.color]
+        scale = rate_scale_of(color, method.rate_exponent, images)
+        dr.eval(scale)
+    moving = Moving(variables, moments, dr.opaque(types.Float, 0), pack(gaussians), scale)
+    return replace(state, fixed=gaussians, moving=moving, since=step, lists=())
+
+
+def _listed(
+    state: State, objective: Pixels, method: Method, step: int, iterations: int, end: int
+) -> State:
+    """Make the tile lists of the current set; they last until `end`, or until it moved too far."""
+    assert state.fixed is not None and state.moving is not None
+    until, moves = next_build(method, step, iterations, end, state.since)
+    pad, growth = method.coordinates.reach(state.fixed, moves)
+    if state.moving.rate_scale is not None:
+        pad *= state.moving.rate_scale
+    counts, gaussians = (*objective.levels, len(state.gaussians)), state.gaussians
+    state = replace(state, lists=())  # old lists make room for new ones
+    images = objective.grid.images
+    lists = [
+        bin_gaussians(prefix(gaussians, n), _prefix(pad, n), growth, images=images) for n in counts
+    ]
+    return replace(state, lists=tuple(lists), until=until)
+
+
+def next_build(
+    method: Method, step: int, iterations: int, end: int, since: int = 0
+) -> tuple[int, dict[str, float]]:
+    """Return how long the tile lists of a step last, and how far the variables move until then.
+
+    Parameters
+    ----------
+    method : Method
+    step, iterations : int
+        The step that needs lists, and the number of steps of the descent.
+    end : int
+        A step that needs no lists, or other ones.
+    since : int, optional
+        The step at which the optimiser started.
+
+    Returns
+    -------
+    stop : int
+        The step that needs new lists, at most `end`.
+    moves : dict of str to float
+        Sums of the rates of every variable.
+    """
+    largest, total, stop = max(method.rates.values()), 0.0, step
+    while stop < end:
+        warm = min(1.0, (stop - since + 1) / max(1, method.warm_up))
+        factor = method.rate_factor(stop, iterations) * warm
+        if stop > step and largest * (total + factor) > method.drift:
+            break
+        total += factor
+        stop += 1
+    return stop, {name: rate * total for name, rate in method.rates.items()}
+
+
+def rate_table(types: ArrayTypes, method: Method, iterations: int) -> Float:
     """Return the learning rates of all steps, step after step, as Float."""
-    table = np.outer(factors, list(schedule.rates.values()))
+    factors = [method.rate_factor(step, iterations) for step in range(iterations)]
+    table = np.outer(factors, list(method.rates.values()))
     return upload(types.Float, table.ravel().astype(np.float32 if types.bits == 32 else np.float64))
 
 
-def step_program(schedule: Schedule, like: Gaussians, levels: Sequence[int] = ()) -> StepProgram:
+StepProgram: TypeAlias = Callable[..., tuple[Moving, Gaussians]]
+"""One step of a descent, see `step_program`."""
+
+
+def step_program(objective: Pixels, method: Method) -> StepProgram:
     """Make the function of one step for `eigengs_dr.backend.recording.freeze_program`.
 
     Dr.Jit traces the function once and replays it without Python. The program belongs to one run: a
     replay does not notice other settings, such as the betas of another optimiser.
 
-    Parameters
-    ----------
-    schedule : Schedule
-    like : Gaussians
-        A set with the channels of the image.
-    levels : sequence of int, optional
-        As for `descend`.
-
     Returns
     -------
     callable
-        ``step(state, fixed, target, weight, lists, rates, index) -> state`` for a `Descent`; it
-        descends on the mean squared error, then projects the variables into their bounds.
+        ``step(largest, moving, fixed, model, lists, rates, index) -> moving, gaussians``: it
+        descends on the mean of ``h (p - t)^2``, then projects the variables into their bounds. With
+        levels it descends on the sum of the logarithms of these means for the prefixes of the set,
+        so that no level suffers for another. `largest` is the largest number of Gaussians so far: a
+        program of its own for each, since Dr.Jit 1.5 writes beyond arrays if a program is replayed
+        for more Gaussians than it was recorded for.
     """
-    coordinates, optimizer = schedule.variables(), schedule.make_optimizer()
-    channels = like.channels
+    channels, levels = objective.channels, bool(objective.levels)
 
     def step(
-        state: Descent,
+        largest: int,
+        moving: Moving,
         fixed: Gaussians,
-        target: Float,
-        weight: Float,
+        model: Quadratic,
         lists: list[TileLists],
         rates: Float,
         index: UInt,
-    ) -> Descent:
-        radius = kernel_radius(fixed.cutoff)
+    ) -> tuple[Moving, Gaussians]:
+        radius, background = kernel_radius(fixed.cutoff), list(fixed.background)
         gradient: list = []
         for listed in lists:
-            delta, squares = residual(
-                state.packed, list(fixed.background), listed, radius, target, weight
-            )
-            parts = adjoint_pieces(state.packed, delta, channels, listed, radius)
+            delta, squares = model.compare(moving.packed, background, listed, radius)
+            parts = adjoint_pieces(moving.packed, delta, channels, listed, radius)
             dr.eval(parts)
             number = listed.sizes.width * listed.sizes.height * channels
             factor = 2 / number
             if levels:
-                # The sum of the logarithms of the errors, so that no level suffers for another.
-                mean = sum(sum_lanes(squares, listed)) / number
-                factor = factor / (mean + MSE_EPSILON)
+                factor = factor / (sum(sum_lanes(squares, listed)) / number + LOSS_EPSILON)
             sums = _sum_level(parts, listed, channels, len(fixed))
             before = gradient or [0.0] * len(sums)
             gradient = [g + s * factor for g, s in zip(before, sums, strict=True)]
         sizes = lists[0].sizes
-        return _move(state, fixed, gradient, rates, index, (sizes.width, sizes.height))
-
-    def _move(
-        state: Descent, fixed: Gaussians, gradient: Float, rates: Float, index: UInt, size: tuple
-    ) -> Descent:
-        """Take the step of the optimiser; all of it is one kernel with a lane per Gaussian."""
-        Float = type(state.packed)
-        slopes = _pull_back(coordinates, fixed, state.variables, gradient, size)
-        variables, moments = {}, {}
-        for k, name in enumerate(schedule.rates):
-            rate = dr.gather(Float, rates, index * len(schedule.rates) + k)
-            if state.rate_scale is not None and name != "color":
-                rate *= state.rate_scale
-            variables[name], moments[name] = optimizer.step(
-                state.variables[name], slopes[name], state.moments[name], rate, Float(index) + 1
-            )
-        variables = coordinates.project(fixed, variables, size)
-        moved = coordinates.decode(fixed, variables, size)
-        return Descent(variables, moments, moved, pack(moved), state.rate_scale)
+        return _move(method, moving, fixed, gradient, rates, index, (sizes.width, sizes.height))
 
     return step
+
+
+def _move(
+    method: Method,
+    moving: Moving,
+    fixed: Gaussians,
+    gradient: list,
+    rates: Float,
+    index: UInt,
+    size: tuple,
+) -> tuple[Moving, Gaussians]:
+    """Take the step of the optimiser; all of it is one kernel with a lane per Gaussian."""
+    Float, coordinates = type(moving.packed), method.coordinates
+    slopes = _pull_back(coordinates, fixed, moving.variables, gradient, size)
+    time = moving.time + 1
+    warm = dr.minimum(time * (1 / max(1, method.warm_up)), 1)
+    variables, moments = {}, {}
+    for k, name in enumerate(method.rates):
+        rate = dr.gather(Float, rates, index * len(method.rates) + k) * warm
+        if moving.rate_scale is not None and name != "color":
+            rate *= moving.rate_scale
+        variables[name], moments[name] = method.optimizer.step(
+            moving.variables[name], slopes[name], moving.moments[name], rate, time
+        )
+    variables = coordinates.project(fixed, variables, size)
+    moved = coordinates.decode(fixed, variables, size)
+    return Moving(variables, moments, time, pack(moved), moving.rate_scale), moved
 
 
 def _sum_level(parts: Float, lists: TileLists, channels: int, count: int) -> list:
@@ -328,7 +338,7 @@ def _sum_level(parts: Float, lists: TileLists, channels: int, count: int) -> lis
 
 
 def _pull_back(
-    coordinates: Parameterization,
+    coordinates: Coordinates,
     fixed: Gaussians,
     variables: Variables,
     gradient: list,
@@ -348,7 +358,7 @@ def _pull_back(
         return {name: dr.grad(value) for name, value in traced.items()}
 
 
-def _prefix(pad: Float, count: int) -> Float:
+def _prefix(pad: Any, count: int) -> Any:
     """Return the first `count` entries of an array, or a number as it is."""
     if isinstance(pad, float) or dr.width(pad) in (1, count):
         return pad
@@ -362,52 +372,11 @@ def prefix(gaussians: Gaussians, count: int) -> Gaussians:
     return take(gaussians, dr.arange(types_of(gaussians.mean).UInt, count))
 
 
-@dataclass(frozen=True)
-class Descent:
-    """The state of a descent.
-
-    Attributes
-    ----------
-    variables : dict of str to arrays
-        The variables that the optimiser moves.
-    moments : dict of str to tuple
-        The state of the optimiser for each variable.
-    gaussians : Gaussians or None
-        The set of these variables. A step does not need it, and each array that a frozen program
-        gets costs a microsecond.
-    packed : Float
-        The parameters of this set for the kernels.
-    rate_scale : Float or None
-        Factor of the learning rates of means and shapes, one for each Gaussian.
-    """
-
-    variables: Variables
-    moments: dict[str, tuple]
-    gaussians: Any
-    packed: Float
-    rate_scale: Float = None
-
-
-def start_descent(gaussians: Gaussians, schedule: Schedule, images: int = 1) -> Descent:
-    """Return the state before the first step, for the Gaussians of one image after another."""
-    encoded, optimizer = schedule.variables().encode(gaussians), schedule.make_optimizer()
-    variables = {name: dr.detach(encoded[name]) for name in schedule.rates}
-    dr.eval(variables)
-    moments = {name: optimizer.start(value) for name, value in variables.items()}
-    rate_scale = None
-    if schedule.rate_exponent:
-        zeros = dr.zeros(types_of(gaussians.mean).Float, len(gaussians))
-        color = [dr.detach(row) + zeros for row in gaussians.color]
-        rate_scale = rate_scale_of(color, schedule.rate_exponent, images)
-        dr.eval(rate_scale)
-    return Descent(variables, moments, gaussians, pack(gaussians), rate_scale)
-
-
 MAX_RATE_SCALE = 1.7
 """How much faster or slower than the others a Gaussian may move."""
 
 
-def rate_scale_of(color: list, exponent: float, images: int = 1) -> Float:
+def rate_scale_of(color: Sequence[Float], exponent: float, images: int = 1) -> Float:
     """Return factors of learning rates for the Gaussians of one image after another.
 
     The error depends most on bright Gaussians, so they move less. With the length of a colour |c|,
@@ -416,7 +385,7 @@ def rate_scale_of(color: list, exponent: float, images: int = 1) -> Float:
 
     Parameters
     ----------
-    color : list of Float, shape (N,)
+    color : sequence of Float, shape (N,)
         By channels.
     exponent : float
     images : int, optional

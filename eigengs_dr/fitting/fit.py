@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,18 +16,22 @@ from ..backend.arguments import takes_numbers
 from ..backend.feedback import defer_interrupts, shows_progress, to_html
 from ..backend.recording import exclusive
 from ..gaussian.channels import channel_weights
-from ..gaussian.file import CUTOFF, FitFigures, write
+from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians, scale_channels
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
-from .levels import refine_levels
-from .maps import MapImage, balance, combine, read_maps, score_maps, shape_of
-from .measure import Row, measure
-from .options import FitOptions, Levels, Start, named_options
-from .refine import FitProgress, Refinement, Score, refine
-from .search import search_count
-from .start import load_start, mean_picture, start_for
-from .target import FitTarget, PixelsOrPath, in_unit, make_target, read_pixels, unit_of
+from .descent import begin
+from .fewest import fewest
+from .levels import place_levels, sort_levels
+from .loop import FitProgress, Refinement, Score, refine, sets_of
+from .maps import Map, MapImage, balance, combine, read_maps, score_maps
+from .measure import Row, psnrs
+from .method import DEFAULT, Method
+from .objective import Affine, Pixels, data_of, fitted, picture, restored
+from .options import FitOptions, Goal, Start, named_options
+from .pixels import Image, PixelsOrPath, check_weight, read_pixels
+from .place import Adaptive
+from .start import check_start, load_start, set_in, start_from, types_for
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +49,12 @@ class Fit:
         shows the set before refinement. Seconds count from the call of `fit`; they include
         placement, upload, the colour solve and the measurements.
         A descent has more Gaussians than asked for in its first two thirds, see
-        `eigengs_dr.fitting.schedule.surplus_for`; those sets have no rows.
-        With space "data" or "normal", psnr_rgb is the PSNR of the data after clamping and rounding
-        to 8 bits, and psnr_ycbcr the PSNR of the unchanged data; for values above 1.5, the largest
-        of them is the peak. With space "radiance" or "log", psnr_ycbcr is in PU21, see
-        `eigengs_dr.psnr`.
+        `eigengs_dr.fitting.control.Surplus`; those sets have no rows. With a weight, the squared
+        errors of all PSNRs are weighted.
+        With space "data", psnr_ycbcr is the PSNR of the data, with their range as the peak, or 1
+        for codes between 0 and 1; psnr_rgb is that of codes after rounding to 8 bits, and NaN for
+        other data, which have none. With space "normal" both have the peak 1. With space "radiance"
+        or "log", psnr_ycbcr is in PU21, see `eigengs_dr.psnr`.
     image : ndarray of float32, shape (H, W, 3), or (H, W, 1) for data of one channel; or dict
         The rendering of the set: RGB without clamping; for light, sRGB clamped at 0; or the data.
         For maps, the rendering of each by its name.
@@ -121,23 +125,17 @@ class FitInterrupted(KeyboardInterrupt):
 @shows_progress
 @takes_numbers
 def fit(
-    image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike],
-    gaussians: int | None = None,
+    image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map],
+    gaussians: int | Sequence[int] | None = None,
     iterations: int = 1000,
-    init: str = "auto",
+    target_psnr: float | Goal | None = None,
     start: Start | None = None,
-    preset: str = "default",
-    solve_steps: int = 10,
-    space: str | Mapping[str, str] | None = None,
+    space: str | None = None,
+    weight: ArrayLike | None = None,
+    method: Method = DEFAULT,
     seed: int = 0,
     backend: str | None = None,
     progress: Any = None,
-    target_psnr: float | Mapping[str, float] | None = None,
-    target_space: str = "rgb",
-    max_gaussians: int | None = None,
-    levels: Levels | None = None,
-    weights: Mapping[str, float] | None = None,
-    cutoff: float = CUTOFF,
     encoding: str | None = None,
 ) -> Fit:
     """Fit an image by a given number of Gaussians, or by as few as a target PSNR needs.
@@ -149,28 +147,29 @@ def fit(
     ----------
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL; or a mapping
         A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`. A
-        mapping holds the images of maps by name, with at most 16 channels together. Data whose
-        three channels are equal count as one channel.
-    gaussians : int, optional
+        mapping holds the images of maps by name, with at most 16 channels together; a `Map` says
+        the space, the weight and the goal of one. Data whose three channels are equal count as one
+        channel.
+    gaussians : int or sequence of int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
-        images; with a start, the number of its Gaussians.
+        images; with a start, the number of its Gaussians. Several rising numbers such as
+        ``[5000, 7000, 9000]`` are levels of detail, see `level_counts`: the first Gaussians form
+        the image too, and ``result.gaussians[:n]`` is a level. Inside a level, Gaussians with a
+        larger removal cost come first, so that every prefix forms an image.
     iterations : int, optional
         Largest number of refinement steps; 0 keeps the colours of the solve.
-    init : {"auto", "adaptive", "grid", "random"}, optional
-        Placement by the image alone. "auto" is that of the preset: "adaptive" for "default".
+    target_psnr : float or Goal, optional
+        PSNR in dB to reach with as few Gaussians as possible, instead of their number. Each map
+        shall reach it, unless it has a goal of its own. A `Goal` says the space of the PSNR and the
+        largest number of Gaussians too. The search takes up to about twice `iterations` steps, see
+        `eigengs_dr.fitting.fewest`.
     start : Gaussians, Fit, path-like or EigenGS, optional
         Instead of a placement, Gaussians to start from, scaled to the size of the image: the set of
-        the frame before of a film, a file, ``model.encode(image)``. A model stands for the set that
-        it makes of the image, which suits many images.
-    preset : {"default", "gaussianimage", "eigengs"}, optional
-        The method, see `eigengs_dr.fitting.options`; "eigengs" needs a model as the start.
-    solve_steps : int, optional
-        Steps of conjugate gradients in the colour solve. With a start they go on from its colours;
-        those of a model need none, unless the image and the model differ in size.
-    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, or mapping; optional
-        Space of the colours and of the squared error, by default "ycbcr". For maps, the space of a
-        map by its name; by default "linear" for albedo, color and the like, "normal" for normals,
-        and "data" for other names, see `eigengs_dr.gaussian.channels.usual_space`.
+        the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
+        that it makes of the image, which suits many images. Where a start turns out to be useless,
+        the first steps place the Gaussians anew.
+    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
+        Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
         weigh more in the dark. "data" uses one or three channels unchanged (roughness, heights).
         "normal" uses the codes ``(n + 1) / 2`` of a normal map; renderings have normals of length
@@ -178,37 +177,19 @@ def fit(
         Gaussians sum to logarithms of light, see `eigengs_dr.image.color.to_log`. For an image of
         light above 1, "linear" becomes "radiance", and "ycbcr" and "rgb" become "log": a texture
         would clamp their sums.
+    weight : array_like, shape (H, W) or (H, W, C), optional
+        Factors of the squared errors of pixels, or of their channels in the space of the colours;
+        finite and at least 0. A pixel of weight 0 does not count; it may be NaN.
+    method : Method, optional
+        How to fit, by default `DEFAULT`; `eigengs_dr.paper` has those of the papers.
     seed : int, optional
-        Seed of the random numbers. Only the placement "random" and presets without a colour
-        solve use random numbers; the preset "default" gives one result for all seeds.
+        Seed of all random numbers: those of the noise that relocations add to means and shapes.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
         trace, or a row of a set with more Gaussians than asked for.
-    target_psnr : float or mapping, optional
-        PSNR in dB to reach with as few Gaussians as possible; excludes `gaussians`. Each map shall
-        reach it, or its own, if a mapping names every map. The search takes up to about twice
-        `iterations` steps, see `eigengs_dr.fitting.search`.
-    target_space : {"rgb", "ycbcr"}, optional
-        Whether `target_psnr` is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light
-        above 1 have one PSNR alone, see `eigengs_dr.image.metrics.float_space`.
-    max_gaussians : int, optional
-        Largest number of Gaussians for `target_psnr`. By default the Gaussians have at most as
-        many parameters as the image has numbers: 3 Gaussians for 8 pixels in colour.
-    levels : int or sequence of int, optional
-        Levels of detail: the first Gaussians form the image too. Either the number of Gaussians up
-        to each level, such as ``[5000, 7000, 9000]``; or the number of levels, of which each has 4
-        times as many Gaussians as the one before, see `level_counts`. ``result.gaussians[:n]`` is a
-        level. Inside a level, Gaussians with a larger removal cost come first, so that every prefix
-        forms an image.
-    weights : mapping of str to float, optional
-        For maps, factors of their errors, by default 1. They multiply the weights that the function
-        finds: one over the root mean square error after a first colour solve, so that all maps gain
-        alike in decibels; or with `target_psnr`, one over the error of the goal.
-    cutoff : float, optional
-        Radius of a Gaussian in standard deviations, in (0, 12]; the set keeps it.
     encoding : {"srgb", "linear"}, optional
         What the pixels of the image are: sRGB codes, or light as in renderings. By default what the
         image says (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
@@ -221,8 +202,8 @@ def fit(
     Raises
     ------
     ValueError
-        If the image is unusable or an argument is out of range; if maps differ in size, or an
-        argument names a map that is not there.
+        If the image is unusable or an argument is out of range; if maps differ in size, or
+        arguments contradict each other.
     BackendError
         If the backend is not available.
     FitInterrupted
@@ -231,6 +212,10 @@ def fit(
     Notes
     -----
     On one machine and backend, one seed gives the same result bit for bit.
+
+    The factors of the errors of maps that the function finds are one over the root mean square
+    error after a first colour solve, so that all maps gain alike in decibels; or with goals, one
+    over the error of the goal. The weights of maps multiply them.
 
     Examples
     --------
@@ -244,167 +229,213 @@ def fit(
     Gaussians(100, 32x32 pixels, maps albedo, roughness, cutoff=3)
     """
     started = time.perf_counter()
-    maps: list[MapImage] = []
-    if isinstance(image, Mapping):
-        maps = _maps_alone(image, space, start, preset, encoding, weights, target_psnr)
-        space, target_psnr = "data", max((m.goal for m in maps if m.goal is not None), default=None)
-    elif weights is not None or isinstance(space, Mapping) or isinstance(target_psnr, Mapping):
-        raise ValueError("weights, and a space or target_psnr by name, are for a mapping of images")
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
-        init=init,
+        target_psnr=target_psnr,
         start=start,
-        preset=preset,
-        solve_steps=solve_steps,
-        space=space or "ycbcr",
+        space=space,
+        method=method,
         seed=seed,
         backend=backend,
-        cutoff=cutoff,
-        target_psnr=target_psnr,
-        target_space=target_space,
-        max_gaussians=max_gaussians,
-        levels=levels,
         encoding=encoding,
     )
-    if maps:
-        return fit_maps(maps, options, started, progress)
+    factors = check_weight(weight)
+    if isinstance(image, Mapping):
+        if start is not None or space is not None or method.needs_model:
+            raise ValueError(
+                "maps take no start and no space; a Map says the space of one: "
+                "Map(image, space='data')"
+            )
+        goal = options.goal
+        maps = read_maps(image, goal, factors, encoding)
+        if goal is None and maps[0].goal is not None:
+            goal = Goal(max(m.goal for m in maps if m.goal is not None))
+            options = replace(options, target_psnr=goal)
+        return fit_maps(maps, options, factors, started, progress)
     source = os.path.basename(image) if isinstance(image, (str, os.PathLike)) else ""
     try:
-        return replace(fit_image(image, options, progress), source=source)
+        [found] = fit_images([image], options, factors, progress)
     except FitInterrupted as stop:
         raise FitInterrupted(replace(stop.result, source=source)) from None
-
-
-def _maps_alone(
-    images: Mapping[str, ArrayLike],
-    space: str | Mapping[str, str] | None,
-    start: Start | None,
-    preset: str,
-    encoding: str | None,
-    weights: Mapping[str, float] | None,
-    target_psnr: float | Mapping[str, float] | None,
-) -> list[MapImage]:
-    """Read maps; refuse what they do not take."""
-    if start is not None or preset != "default":
-        raise ValueError("maps need preset 'default' and no start; leave them out")
-    if isinstance(space, str):
-        raise ValueError(f"space is {space!r}; for maps give the space of each by its name")
-    return read_maps(images, space, encoding, weights, target_psnr)
+    return replace(found, source=source)
 
 
 @exclusive()
-def fit_image(image: PixelsOrPath, options: FitOptions, progress: FitProgress | None = None) -> Fit:
-    """Fit an image with the options of one record; see `fit` for results and errors."""
-    started = time.perf_counter()
-    pixels, options = read_pixels(image, options)
-    options.check_image(pixels)
-    unit = unit_of(pixels, options.space)
-    if unit != 1:
-        pixels = pixels / np.float32(unit)
-    if options.start is not None:
-        start = load_start(options.start, options.backend)
-        whole = in_unit(start, 1 / unit) if isinstance(start, Gaussians) else start
-        options = replace(options, start=whole)
-    mean_image = mean_picture(options, pixels.shape[1], pixels.shape[0])
-    score = partial(measure, image=pixels, started=started, base_image=mean_image)
-    goal = target_key(options.space, options.target_space), options.target_psnr or 0.0
+def fit_images(
+    images: Sequence[PixelsOrPath],
+    options: FitOptions,
+    weight: Image | None = None,
+    progress: FitProgress | None = None,
+) -> list[Fit]:
+    """Fit an image, or several of one size together; see `fit` for results and errors.
+
+    The results of a batch have the bits of single fits on llvm: sums run in the same order, and no
+    image changes the arithmetic of another. The seconds are an equal share of the whole time.
+    """
+    started, source = time.perf_counter(), options.start
+    start = None if source is None else load_start(source, options.backend)
+    wanted = options.space or (set_in(start).space if start is not None else "ycbcr")
+    read = [read_pixels(image, wanted, weight, options.encoding) for image in images]
+    pixels, space = [p for p, _ in read], read[0][1]
+    height, width, channels = pixels[0].shape
+    options.check_image(width, height, channels)
+    if start is not None:
+        check_start(set_in(start), (width, height), channels, space, options)
+    types, mean_image = types_for(start, options.backend), None
     with defer_interrupts() as interrupted:
-        target = make_target(pixels, options.space)
-        found, seconds_init = _refine(target, options, score, goal, started, progress, interrupted)
-    return finish(found, in_unit(found.gaussians, unit), mean_image, started, seconds_init)
+        data = [data_of(p, space, weight) for p in pixels]
+        shown = picture(types, space, pixels, data, weight)
+        objective = replace(Pixels.of(data, space, types), pictures=(shown,))
+        begun = None
+        if start is not None:
+            if isinstance(start, Gaussians):
+                start = fitted(start, data[0].affine)
+            moves = options.iterations > 0
+            objective, begun = start_from(start, objective, options.method, pixels[0], moves)
+            if options.method.needs_model:
+                mean_image = options.method.mean_image(start, width, height)
+
+        def score(gaussians: Gaussians) -> list[Row]:
+            seconds = (time.perf_counter() - started) / len(images)
+            [figures] = psnrs(gaussians, objective.pictures).transpose(0, 2, 1)
+            return [
+                {"seconds": seconds, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
+                for ycbcr, rgb in figures.tolist()
+            ]
+
+        figure = target_key(space, options.goal.space) if options.goal else ""
+        found, seconds_init = _refined(
+            objective, options, begun, score, figure, started, progress, interrupted
+        )
+    affines = [d.affine for d in data]
+    return _finished(found, affines, mean_image, started, seconds_init)
 
 
 @exclusive()
 def fit_maps(
     images: list[MapImage],
     options: FitOptions,
+    weight: Image | None,
     started: float,
     progress: FitProgress | None = None,
 ) -> Fit:
     """Fit maps from `read_maps` by one set; see `fit` for results and errors."""
-    options.check_image(shape_of(images))
+    height, width = images[0].pixels.shape[:2]
+    channels, types = sum(i.pixels.shape[2] for i in images), types_for(None, options.backend)
+    options.check_image(width, height, channels)
+    goal = options.goal
     with defer_interrupts() as interrupted:
-        weights = balance(images, options)
-        score = partial(
-            score_maps,
-            images=images,
-            weights=weights,
-            started=started,
-            space=options.target_space,
+        first = options.count_for(width * height)
+        if goal:
+            first = options.first_try(width * height, channels)
+        factors = balance(images, options.method, first, types, weight)
+        objective = combine(images, factors, types, weight)
+
+        def score(gaussians: Gaussians) -> list[Row]:
+            row = score_maps(gaussians, objective, images, goal.space if goal else "rgb")
+            return [{"seconds": time.perf_counter() - started, **row}]
+
+        [found], seconds_init = _refined(
+            objective, options, None, score, "margin", started, progress, interrupted
         )
-        target, goal = combine(images, weights), ("margin", 0.0)
-        found, seconds_init = _refine(target, options, score, goal, started, progress, interrupted)
-    maps = tuple(image.map(weight) for image, weight in zip(images, weights, strict=True))
+    maps = tuple(image.map(factor) for image, factor in zip(images, factors, strict=True))
     whole = scale_channels(found.gaussians, [1 / w for w in channel_weights(maps)])
-    return finish(found, replace(whole, maps=maps), None, started, seconds_init)
+    offsets = [i.data.affine.offset for i in images for _ in range(i.pixels.shape[2])]
+    background = type(whole.background)(
+        [row + float(b) for row, b in zip(whole.background, offsets, strict=True)]
+    )
+    named = replace(whole, background=background, maps=maps)
+    [result] = _finished([replace(found, gaussians=named)], [Affine()], None, started, seconds_init)
+    return result
 
 
-def _refine(
-    target: FitTarget,
+def _refined(
+    objective: Pixels,
     options: FitOptions,
+    begun: Gaussians | None,
     score: Score,
-    goal: tuple[str, float],
+    figure: str,
     started: float,
     progress: FitProgress | None,
     interrupted: Callable[[], bool],
-) -> tuple[Refinement, float]:
-    """Fit a target as the options say: in levels, by a given number, or by the fewest for a goal.
+) -> tuple[list[Refinement], float]:
+    """Fit an objective as the options say: by a given number, in levels, or by the fewest.
 
-    `goal` is a key of the rows of `score` and the least value in dB. Return the seconds before
+    `figure` is the key of the rows of `score` that a goal means. Return the seconds before
     refinement too.
     """
-    if options.levels is not None:
-        return refine_levels(target, options, score, started, progress, interrupted)
-    schedule, iterations = options.method.schedule, options.iterations
-    problem = start_for(target, options.first_try(target.values))
-    seconds_init = time.perf_counter() - started
-    if options.target_psnr is None:
-        found = refine(
-            problem,
-            target.pixels,
-            schedule,
+    method, iterations, key = options.method, options.iterations, options.seed
+    (width, height), channels = objective.size, objective.channels
+    counts, chosen = options.levels, begun is not None or options.method.place != Adaptive()
+    if counts:
+        begun = place_levels(objective, method, counts, iterations, key, interrupted)
+        objective = replace(objective, levels=counts[:-1])
+    elif begun is None:
+        count = options.count_for(width * height)
+        if options.goal:
+            count = options.first_try(width * height, channels)
+        begun = method.place_and_solve(objective, count, key)
+    seconds_init = (time.perf_counter() - started) / objective.grid.images
+    if options.goal:
+        most = options.most_for(width * height, channels)
+        goal = options.goal.psnr if figure != "margin" else 0.0
+        found = fewest(
+            objective,
+            method,
+            begun,
+            score,
+            (figure, goal),
+            most,
             iterations,
-            progress=progress,
-            interrupted=interrupted,
-            score=score,
+            key,
+            progress,
+            interrupted,
         )
-    else:
-        most = options.most_for(target.values)
-        found = search_count(
-            problem, score, *goal, most, schedule, iterations, progress, interrupted
-        )
-    return found, seconds_init
+        return [found], seconds_init
+    state = begin(begun, objective.grid.images, chosen)
+    refined = refine(objective, method, state, iterations, score, key, progress, interrupted)
+    if counts:
+        sets = [sort_levels(one.gaussians, objective, counts) for one in refined]
+        refined = [replace(one, gaussians=g) for one, g in zip(refined, sets, strict=True)]
+    return refined, seconds_init
 
 
-def finish(
-    found: Refinement,
-    gaussians: Gaussians,
-    base_image: NDArray[np.float32] | None,
+def _finished(
+    found: Sequence[Refinement],
+    affines: Sequence[Affine],
+    mean_image: NDArray[np.float32] | None,
     started: float,
     seconds_init: float,
-) -> Fit:
-    """Render the result of a refinement and return it as a `Fit`.
+) -> list[Fit]:
+    """Render the results of refinements in the units of their images.
 
     Raises
     ------
     FitInterrupted
-        If the refinement was interrupted.
+        If the refinement of a single image was interrupted.
     """
-    rendered = picture_of(gaussians)
-    result = Fit(
-        gaussians=gaussians,
-        trace=found.trace,
-        image=rendered if base_image is None else rendered + base_image,
-        seconds=time.perf_counter() - started,
-        seconds_init=seconds_init,
-        iterations=found.iterations,
-        stopped=found.stopped,
-        mean_image=base_image,
-        psnr_ycbcr=found.row["psnr_ycbcr"],
-        psnr_rgb=found.row["psnr_rgb"],
-        maps=found.row.get("maps", {}),
-    )
-    if found.stopped == "interrupted":
-        raise FitInterrupted(result)
-    return result
+    results = []
+    for one, gaussians, affine in zip(found, sets_of(found), affines, strict=True):
+        whole = restored(gaussians, affine)
+        rendered = picture_of(whole)
+        results.append(
+            Fit(
+                gaussians=whole,
+                trace=one.trace,
+                image=rendered if mean_image is None else rendered + mean_image,
+                seconds=0.0,
+                seconds_init=seconds_init,
+                iterations=one.iterations,
+                stopped=one.stopped,
+                mean_image=mean_image,
+                psnr_ycbcr=one.row["psnr_ycbcr"],
+                psnr_rgb=one.row["psnr_rgb"],
+                maps=one.row.get("maps", {}),
+            )
+        )
+    seconds = (time.perf_counter() - started) / len(found)
+    results = [replace(result, seconds=seconds) for result in results]
+    if found[0].stopped == "interrupted":
+        raise FitInterrupted(results[0])
+    return results

@@ -9,106 +9,70 @@ work: they depend on each other, and the first quarter does not form an image.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import drjit as dr
 import numpy as np
 
-from ..backend.arrays import types_of
 from ..gaussian.gaussians import Gaussians, concatenate
-from .density_control import LevelControl, removal_cost
-from .descent import FitProblem, run
-from .options import FitOptions, level_counts
-from .placement.adaptive import place_adaptive, residual
-from .refine import FitProgress, Refinement, Score, refine
-from .schedule import Schedule
-from .solvers.conjugate_gradient import solve
-from .start import start_from_placement
-from .target import FitTarget
+from .control import Redistribute, Surplus
+from .descent import begin, descend
+from .exchange import removal_cost
+from .method import Method
+from .objective import Pixels
 
 STEPS_PER_LEVEL = 50
-"""Refinement steps between the placements of two levels."""
+"""Most refinement steps between the placements of two levels."""
 
 
-def refine_levels(
-    target: FitTarget,
-    options: FitOptions,
-    score: Score,
-    started: float,
-    progress: FitProgress | None = None,
-    interrupted: Callable[[], bool] = lambda: False,
-) -> tuple[Refinement, float]:
-    """Place and refine nested sets for a target.
+def place_levels(
+    objective: Pixels,
+    method: Method,
+    counts: Sequence[int],
+    iterations: int,
+    key: int,
+    interrupted: Callable[[], bool],
+) -> Gaussians:
+    """Place nested sets: each level by the error after some steps of the earlier ones.
 
     Parameters
     ----------
-    target : FitTarget
-    options : FitOptions
-        With levels.
-    score : callable
-        See `eigengs_dr.fitting.refine.refine`.
-    started : float
-        Value of `time.perf_counter()` at the start of the fit.
-    progress, interrupted : callable, optional
-        See `eigengs_dr.fitting.refine.refine`.
-
-    Returns
-    -------
-    Refinement
-        Its set is sorted by levels.
-    float
-        Seconds before refinement.
+    objective : Pixels
+        Without levels.
+    method : Method
+    counts : sequence of int
+        Numbers of Gaussians up to each level.
+    iterations : int
+        Steps of the refinement that follows; placement takes at most `STEPS_PER_LEVEL` a level.
+    key, interrupted
+        See `eigengs_dr.fitting.loop.refine`.
     """
-    assert options.levels is not None
-    counts = level_counts(options.count_for(target.values), options.levels)
-    schedule = replace(options.method.schedule, redistribute_after=0)
-    start = start_from_placement(target, replace(options, gaussians=counts[0], levels=None))
-    start = start._replace(control=None)
-    steps = min(STEPS_PER_LEVEL, options.iterations)
-    placed = _place_levels(start, counts, schedule, steps, interrupted)
-    control = LevelControl(target.values, target.weight, target.shown, counts=tuple(counts))
-    seconds_init = time.perf_counter() - started
-    refined = refine(
-        start._replace(gaussians=placed, control=control),
-        target.pixels,
-        schedule,
-        options.iterations,
-        levels=counts[:-1],
-        progress=progress,
-        interrupted=interrupted,
-        score=score,
-    )
-    return refined._replace(gaussians=_sort_levels(refined.gaussians, start, counts)), seconds_init
-
-
-def _place_levels(
-    start: FitProblem,
-    counts: list[int],
-    schedule: Schedule,
-    steps: int,
-    interrupted: Callable[[], bool],
-) -> Gaussians:
-    """Add levels to the first one; place each by the residual after some steps without it."""
-    gaussians = start.gaussians
+    steps, method = min(STEPS_PER_LEVEL, iterations), replace(method, controls=())
+    gaussians = method.place_and_solve(objective, counts[0], key)
     for level, count in enumerate(counts[1:], 1):
-        below = counts[: level - 1]
-        problem = start._replace(gaussians=gaussians)
-        gaussians = run(problem, schedule, steps, lambda *_: interrupted(), levels=below)
-        left = residual(gaussians, start.target)
-        kind = gaussians.space, types_of(gaussians.mean).backend, gaussians.cutoff
-        added = place_adaptive(left, count - len(gaussians), *kind)
-        added = solve(added, left)
+        nested = replace(objective, levels=tuple(counts[: level - 1]))
+        for state in descend(nested, method, begin(gaussians), steps, key):
+            gaussians = state.gaussians
+            if interrupted():
+                break
+        gaussians = dr.detach(gaussians)
+        added = method.place_and_solve(objective.minus(gaussians), count - len(gaussians), key)
         # The background is one for all levels: a new one would change the earlier levels.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
     return gaussians
 
 
-def _sort_levels(gaussians: Gaussians, start: FitProblem, counts: list[int]) -> Gaussians:
+def without_placement(method: Method) -> Method:
+    """Return a method for sets that are placed: nothing places all Gaussians anew."""
+    return method.without(Surplus, Redistribute)
+
+
+def sort_levels(gaussians: Gaussians, objective: Pixels, counts: Sequence[int]) -> Gaussians:
     """Sort the Gaussians inside each level by their removal cost, the largest first."""
     order, before = [], 0
     for count in counts:
-        value = removal_cost(gaussians[:count], start.target, start.weight)
+        value = removal_cost(gaussians[:count], objective)
         own = np.arange(before, count)
         order.append(own[np.argsort(-value[own], kind="stable")])
         before = count

@@ -6,15 +6,14 @@ A few bytes go to the host.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, Float, types_of
+from ..backend.arrays import Float, types_of
 from ..backend.recording import exclusive, record
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import (
@@ -36,121 +35,98 @@ from ..raster.parameters import (
     kernel_radius,
     pack_parameters,
 )
-from ..raster.render import batch_to_tiles, bin_gaussians, pixels_inside
+from ..raster.render import bin_gaussians, pixels_inside
+from .objective import Picture
+from .solvers.conjugate_gradient import spread
 
 Row: TypeAlias = dict[str, Any]
 """A row of a trace: its numbers by name, and under "maps" those of every map."""
 
 
-class Shown(NamedTuple):
-    """What some channels of a set show.
-
-    Attributes
-    ----------
-    image : ndarray of float32, shape (H, W, C) or (M, H, W, C)
-        sRGB or data; of several images of a batch.
-    space : str
-        Space of the channels, one of `eigengs_dr.image.color.SPACES`.
-    channels : slice
-        The channels of the set, by default all.
-    weight : float
-        Factor of the channels in the set.
-    base : ndarray of float32, shape (H, W, C), or None
-        RGB that comes on top of the rendering.
-    """
-
-    image: NDArray[np.float32]
-    space: str
-    channels: slice = slice(None)
-    weight: float = 1.0
-    base: NDArray[np.float32] | None = None
-
-
-def measure(
-    gaussians: Gaussians,
-    image: NDArray[np.float32],
-    started: float,
-    base_image: NDArray[np.float32] | None = None,
-) -> Row:
-    """Return the seconds, psnr_ycbcr and psnr_rgb of a set for a row of a trace."""
-    parts = [Shown(image, gaussians.space, base=base_image)]
-    [[[ycbcr], [rgb]]] = psnrs(gaussians, parts).tolist()
-    return {"seconds": time.perf_counter() - started, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
-
-
 @exclusive()
-def psnrs(gaussians: Gaussians, parts: Sequence[Shown]) -> NDArray[np.float64]:
+def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float64]:
     """Compute the PSNRs of a set, as `eigengs_dr.psnr` does of its picture.
 
-    Cost: tile lists, a rendering, and the upload of the images.
+    Cost: tile lists, and a rendering.
 
     Parameters
     ----------
     gaussians : Gaussians
-        For a batch, the Gaussians of all images, image after image.
-    parts : sequence of Shown
+        In the units of the fit. For a batch, the Gaussians of all images, image after image.
+    pictures : sequence of Picture
 
     Returns
     -------
-    ndarray of float64, shape (parts, 2, images)
-        In dB, in `eigengs_dr.image.metrics.float_space` and in "rgb". The sums of the squared
-        errors of 4 pixels are in the precision of the set, those of the image in double.
+    ndarray of float64, shape (pictures, 2, images)
+        In dB, in `eigengs_dr.image.metrics.float_space` and in "rgb", which is NaN for data that
+        have no codes. The sums of the squared errors of 4 pixels are in the precision of the set,
+        those of the image in double.
     """
-    first = parts[0].image
-    images = len(first) if first.ndim == 4 else 1
-    types = types_of(gaussians.mean)
+    images = dr.width(pictures[0].scale)
     with dr.suspend_grad():
         lists = bin_gaussians(gaussians, adjoint=False, images=images)
         shape, color = detached_shape(gaussians), whole(gaussians.color, gaussians)
-        uploads = [_upload(types, part) for part in parts]
         background = list(gaussians.background)
-        sums = _squared_errors(shape, color, background, lists, gaussians.cutoff, uploads)
+        given = [
+            (p.space, p.channels.start, p.image, p.scale, p.offset, p.weight, p.base)
+            for p in pictures
+        ]
+        sums = _squared_errors(shape, color, background, lists, gaussians.cutoff, given)
         dr.eval(sums)
-    sizes = [part.image.size // images for part in parts for _ in range(2)]
-    mse = np.array([s.numpy() / size for s, size in zip(sums, sizes, strict=True)])
-    return np.vectorize(psnr_from_mse)(mse).reshape(len(parts), 2, images)
-
-
-def _upload(types: ArrayTypes, part: Shown) -> tuple:
-    """Return the space, the first channel, the weight, the image and the base of a part."""
-    image, base = (None if v is None else batch_to_tiles(types, v) for v in (part.image, part.base))
-    return part.space, part.channels.start or 0, dr.opaque(types.Float, part.weight), image, base
+    *squares, areas = np.split(np.array([s.numpy() for s in sums]), 3, axis=0)
+    mse = np.stack(squares, axis=1) / areas[:, None]
+    found: NDArray[np.float64] = np.vectorize(psnr_from_mse)(mse)
+    found[[not p.has_codes for p in pictures], 1] = np.nan
+    return found
 
 
 @record
 def _squared_errors(
-    shape: list, color: list, background: list, lists: TileLists, cutoff: float, parts: list
+    shape: list, color: list, background: list, lists: TileLists, cutoff: float, pictures: list
 ) -> list:
-    """Return the squared errors of parts in both spaces each, Float64 of shape (images,).
+    """Return the squared errors of pictures in both spaces each, Float64 of shape (images,).
 
-    A lane owns the pixels of a row of a tile. The parts are from `_upload`.
+    First those in the space of floats, then those in 8 bits, then the sums of the weights of all
+    values. A lane owns the pixels of a row of a tile. The pictures are those of `psnrs`.
     """
     types, grid = types_of(shape[0]), lists.grid
     rendered = forward(pack_parameters([*shape, *color]), background, lists, kernel_radius(cutoff))
     dr.eval(rendered)
     length = grid.tile[0]
     run = dr.arange(types.UInt, grid.tiles * grid.pixels // length)
+    owner = lists.sizes.image_of(run // (grid.pixels // length))
 
     def read(image: Float) -> list:
         channels = dr.width(image) // (grid.tiles * grid.pixels)
         values = gather_run(types, image, run, length * channels, True)
         return [values[k * channels : (k + 1) * channels] for k in range(length)]
 
-    pixels, inside = read(rendered), read(pixels_inside(types, grid))
-    found = []
-    for space, first, weight, image, base in parts:
-        totals = [types.Float(0), types.Float(0)]
-        for k, own in enumerate(read(image)):
-            sums = pixels[k][first : first + len(own)]
-            shown = show(space, [s / weight for s in sums])
-            if base is not None:
-                shown = [s + b for s, b in zip(shown, read(base)[k], strict=True)]
-            for n, kind in enumerate((float_space(space), "rgb")):
-                error = squared_difference(shown, own, kind)
-                totals[n] += dr.select(inside[k][0] > 0, error, 0)
+    pixels, inside = read(rendered), pixels_inside(types, grid)
+    floats, codes, areas = [], [], []
+    for space, first, image, scale, offset, weight, base in pictures:
+        a, b = spread(scale, owner), spread(offset, owner)
+        totals = [types.Float(0)] * 3
+        factors = read(inside if weight is None else weight)
+        bases = None if base is None else read(base)
+        for k, seen in enumerate(read(image)):
+            sums = pixels[k][first : first + len(seen)]
+            if rendered_as(space) is None and space != "normal":
+                # Differences of the values as they are fitted keep their digits.
+                error = sum(dr.square((s - v) * a) for s, v in zip(sums, seen, strict=True))
+                shown, seen = ([dr.fma(v, a, b) for v in pixel] for pixel in (sums, seen))
+            else:
+                shown = show(space, [dr.fma(s, a, b) for s in sums])
+                if bases is not None:
+                    shown = [s + v for s, v in zip(shown, bases[k], strict=True)]
+                error = squared_difference(shown, seen, float_space(space))
+            errors = error, squared_difference(shown, seen, "rgb"), types.Float(len(seen))
+            f = factors[k][0]
+            totals = [t + dr.select(f > 0, e * f, 0) for t, e in zip(totals, errors, strict=True)]
         Double = dr.float64_array_t(types.Float)
-        found += [sum_by_image(Double(total), grid) for total in totals]
-    return found
+        sums = [sum_by_image(Double(total), grid) for total in totals]
+        for group, value in zip((floats, codes, areas), sums, strict=True):
+            group.append(value)
+    return [*floats, *codes, *areas]
 
 
 def show(space: str, sums: list) -> list:

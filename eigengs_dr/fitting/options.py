@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import wraps
 from inspect import signature
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.arguments import plain_numbers, takes_numbers
-from ..gaussian.file import CUTOFF, MAX_CUTOFF, check_index_range, check_sides
+from ..gaussian.file import check_index_range, check_sides
+from ..gaussian.gaussians import Gaussians
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
-from .schedule import Schedule
-
-if TYPE_CHECKING:  # a set needs Dr.Jit, and the help of the command line none
-    from ..gaussian.gaussians import Gaussians
+from .control import Redistribute
+from .method import DEFAULT, Method, Model
+from .place import Adaptive
 
 DEFAULT_COUNT = 5000
 """Number of Gaussians by default."""
-
-INITS = ("auto", "random", "grid", "adaptive")
-"""What ``init`` takes: "auto" and the placements of `eigengs_dr.fitting.start`."""
 
 PIXELS_PER_FIRST_GAUSSIAN = 64
 """Pixels per Gaussian in the first try of a search for the number of Gaussians."""
@@ -42,6 +38,9 @@ Levels = int | Sequence[int]
 LEVEL_RATIO = 4
 """Ratio of the numbers of Gaussians up to a level and up to the level before it; 4 halves their
 spacing."""
+
+Start: TypeAlias = "Gaussians | Model | str | os.PathLike[str]"
+"""What a fit starts from: a set, the file of a set, or a model."""
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -68,23 +67,42 @@ def named_options(function: Function) -> Function:
     return call  # type: ignore[return-value]
 
 
-@runtime_checkable
-class Model(Protocol):
-    """What makes a set of an image at once, as `eigengs_dr.EigenGS` does."""
+@dataclass(frozen=True)
+class Goal:
+    """A PSNR to reach with as few Gaussians as possible.
 
-    @property
-    def gaussians(self) -> Gaussians:
-        """Gaussians at the native size of the model."""
+    Attributes
+    ----------
+    psnr : float
+        In dB, above 0 and at most 100.
+    space : {"rgb", "ycbcr"}
+        Whether it is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light above 1 have
+        one PSNR alone, see `eigengs_dr.image.metrics.float_space`.
+    max_gaussians : int or None
+        Largest number of Gaussians. By default they have at most as many parameters as the image
+        has numbers: 3 Gaussians for 8 pixels in colour.
 
-    def encode(self, image: Any, colors: str = "exact", mean: str = "gaussians") -> Gaussians:
-        """Return the set of an image at the size of the image."""
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
+    """
 
-    def dense_mean(self, width: int, height: int) -> NDArray[np.float32]:
-        """Return the pixels (height, width, C) that a set of the mean "dense" lacks."""
+    psnr: float
+    space: str = "rgb"
+    max_gaussians: int | None = None
 
-
-Start: TypeAlias = "Gaussians | Model | str | os.PathLike[str]"
-"""What a fit starts from: a set, the file of a set, or a model."""
+    def __post_init__(self) -> None:
+        for name, value in plain_numbers(vars(self), Goal.__annotations__).items():
+            object.__setattr__(self, name, value)
+        if not 0 < self.psnr <= MAX_PSNR:
+            raise ValueError(
+                f"target_psnr is {self.psnr}; it must be above 0 and at most {MAX_PSNR:g}"
+            )
+        if self.space not in ("rgb", "ycbcr"):
+            raise ValueError(f"target_space {self.space!r} is unknown; use one of rgb, ycbcr")
+        if self.max_gaussians is not None and self.max_gaussians < 1:
+            raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,144 +112,103 @@ class FitOptions:
     Raises
     ------
     ValueError
-        If an option is out of range, or two options exclude each other.
+        If an option is out of range, or two options contradict each other.
     """
 
-    gaussians: int | None = None
+    gaussians: int | Sequence[int] | None = None
     iterations: int = 1000
-    init: str = "auto"
+    target_psnr: float | Goal | None = None
     start: Start | None = None
-    preset: str = "default"
-    solve_steps: int = 10
-    space: str = "ycbcr"
+    space: str | None = None
+    method: Method = field(default=DEFAULT, repr=False)
     seed: int = 0
     backend: str | None = None
-    cutoff: float = CUTOFF
-    target_psnr: float | None = None
-    target_space: str = "rgb"
-    max_gaussians: int | None = None
-    levels: Levels | None = None
     encoding: str | None = None
 
     def __post_init__(self) -> None:
-        for name, value in plain_numbers(vars(self), FitOptions.__annotations__).items():
+        if isinstance(self.gaussians, Sequence) and not isinstance(self.gaussians, str):
+            object.__setattr__(self, "gaussians", tuple(_check_counts(None, self.gaussians)))
+        elif isinstance(self.gaussians, np.ndarray):
+            counts = tuple(_check_counts(None, self.gaussians.tolist()))
+            object.__setattr__(self, "gaussians", counts)
+        if self.target_psnr is not None and not isinstance(self.target_psnr, Goal):
+            object.__setattr__(self, "target_psnr", Goal(self.target_psnr))
+        kinds = FitOptions.__annotations__
+        if not self.levels:
+            kinds = kinds | {"gaussians": "int | None"}
+        for name, value in plain_numbers(vars(self), kinds).items():
             object.__setattr__(self, name, value)
-        if isinstance(self.levels, np.integer):
-            object.__setattr__(self, "levels", int(self.levels))
-        if self.levels is not None and not isinstance(self.levels, int):
-            object.__setattr__(self, "gaussians", _check_counts(self.gaussians, self.levels)[-1])
-        self._check_numbers()
+        for name, least in (("gaussians", 1), ("iterations", 0), ("seed", 0)):
+            count = getattr(self, name)
+            if isinstance(count, int) and count < least:
+                raise ValueError(f"{name} is {count!r}; it must be at least {least}")
         check_encoding(self.encoding)
-        for name, value, known in (
-            ("init", self.init, INITS),
-            ("preset", self.preset, tuple(PRESETS)),
-            ("space", self.space, SPACES),
-            ("target_space", self.target_space, ("rgb", "ycbcr")),
-        ):
-            if value not in known:
-                raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(known)}")
-        if self.start is not None and self.init != "auto":
-            raise ValueError(f"init {self.init!r} and a start exclude each other; give one of them")
-        if self.method.mean == "dense" and not isinstance(self.start, Model):
+        if self.space is not None and self.space not in SPACES:
+            raise ValueError(f"space {self.space!r} is unknown; use one of {', '.join(SPACES)}")
+        if not isinstance(self.method, Method):
+            raise TypeError(f"method is {self.method!r}; pass a Method, such as eigengs_dr.DEFAULT")
+        if self.method.needs_model and not isinstance(self.start, Model):
             raise ValueError(
-                f"preset {self.preset!r} starts from a model; give one as the start, such as "
+                "this method starts from a model; give one as the start, such as "
                 "EigenGS.load('natural')"
             )
-        self._check_search()
-        if self.levels is not None and (self.preset, self.placement) != ("default", "adaptive"):
+        self._check_nested()
+
+    def _check_nested(self) -> None:
+        """Raise ValueError where a search or levels need what the other options take away."""
+        places = self.method.place == Adaptive() and self.start is None
+        if self.levels and not (places and not self.method.needs_model):
+            raise ValueError("levels need the placement Adaptive and no start; leave them out")
+        if self.goal is None:
+            return
+        if self.gaussians is not None:
             raise ValueError(
-                "levels needs preset 'default' and init 'adaptive'; leave the others out"
+                "gaussians and target_psnr exclude each other; give one of them, or "
+                "target_psnr=Goal(psnr, max_gaussians=...)"
+            )
+        if not places or self.method.control(Redistribute) is None:
+            raise ValueError(
+                "target_psnr needs a method that places Gaussians by the image and redistributes "
+                "them, such as DEFAULT, and no start"
             )
 
     @property
-    def method(self) -> Preset:
-        """The preset."""
-        return PRESETS[self.preset]
+    def goal(self) -> Goal | None:
+        """The goal of a search."""
+        return self.target_psnr if isinstance(self.target_psnr, Goal) else None
 
     @property
-    def placement(self) -> str | None:
-        """The name of the placement, by default the preset's; None if there is a start."""
-        if self.start is not None:
-            return None
-        return self.method.init if self.init == "auto" else self.init
+    def levels(self) -> tuple[int, ...]:
+        """Numbers of Gaussians up to each level; () without levels."""
+        return self.gaussians if isinstance(self.gaussians, tuple) else ()
 
-    def check_image(self, pixels: NDArray[np.float32]) -> None:
-        """Raise ValueError for more Gaussians than pixels, and for an image too large to index.
-
-        Parameters
-        ----------
-        pixels : ndarray of float32, shape (H, W, C)
-        """
-        height, width, channels = pixels.shape
+    def check_image(self, width: int, height: int, channels: int) -> None:
+        """Raise ValueError for more Gaussians than pixels, and for an image too large to index."""
         check_sides((width, height))
         check_index_range(width, height, channels)
-        for name in ("gaussians", "max_gaussians"):
-            count = getattr(self, name)
+        limit = self.goal.max_gaussians if self.goal else None
+        for name, count in (("gaussians", self._count), ("max_gaussians", limit)):
             if count is not None and not 1 <= count <= width * height:
                 raise ValueError(
                     f"{name} is {count}; an image of {width}x{height} takes 1 to {width * height}"
                 )
 
-    def count_for(self, pixels: NDArray[np.float32]) -> int:
-        """Return the number of Gaussians for an image (H, W, C), if the fit does not search it."""
-        return self.gaussians or default_count(pixels.shape[0] * pixels.shape[1])
+    @property
+    def _count(self) -> int | None:
+        return self.levels[-1] if self.levels else self.gaussians  # type: ignore[return-value]
 
-    def most_for(self, pixels: NDArray[np.float32]) -> int:
-        """Return the largest number of Gaussians that a search tries for an image (H, W, C)."""
-        return self.max_gaussians or max_gaussians_for(pixels)
+    def count_for(self, pixels: int) -> int:
+        """Return the number of Gaussians for so many pixels, if the fit does not search it."""
+        return self._count or default_count(pixels)
 
-    def first_try(self, pixels: NDArray[np.float32]) -> FitOptions:
-        """Return the options of the start for an image (H, W, C): a search starts with few."""
-        if self.target_psnr is None:
-            return self
-        few = max(1, pixels.shape[0] * pixels.shape[1] // PIXELS_PER_FIRST_GAUSSIAN)
-        return replace(
-            self,
-            gaussians=min(self.most_for(pixels), few),
-            target_psnr=None,
-            target_space="rgb",
-            max_gaussians=None,
-        )
+    def most_for(self, pixels: int, channels: int) -> int:
+        """Return the largest number of Gaussians that a search tries."""
+        limit = self.goal.max_gaussians if self.goal else None
+        return limit or max_gaussians_for(pixels, channels)
 
-    def _check_numbers(self) -> None:
-        counts = {name: getattr(self, name) for name in ("iterations", "solve_steps", "seed")}
-        for name in ("gaussians", "max_gaussians"):
-            if getattr(self, name) is not None:
-                counts[name] = getattr(self, name)
-        for name, count in counts.items():
-            if count < 0:
-                least = 1 if name.endswith("gaussians") else 0
-                raise ValueError(f"{name} is {count!r}; it must be at least {least}")
-        if not 0 < self.cutoff <= MAX_CUTOFF:
-            raise ValueError(
-                f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
-            )
-
-    def _check_search(self) -> None:
-        """Raise ValueError for options that contradict a search for the number of Gaussians."""
-        if self.target_psnr is None:
-            if self.max_gaussians is not None or self.target_space != "rgb":
-                raise ValueError(
-                    "max_gaussians and target_space belong to target_psnr; give target_psnr too"
-                )
-            return
-        for name in ("levels", "gaussians"):
-            if getattr(self, name) is not None:
-                raise ValueError(f"{name} and target_psnr exclude each other; give one of them")
-        if self.preset != "default" or self.placement != "adaptive":
-            raise ValueError(
-                "target_psnr works with preset 'default' and init 'adaptive', not with "
-                f"{self.preset!r} and {self.placement or 'a start'!r}"
-            )
-        check_goal(self.target_psnr)
-
-
-def check_goal(target_psnr: float) -> None:
-    """Raise ValueError for a PSNR in dB that no fit can have as its goal."""
-    if not 0 < target_psnr <= MAX_PSNR:
-        raise ValueError(
-            f"target_psnr is {target_psnr}; it must be above 0 and at most {MAX_PSNR:g}"
-        )
+    def first_try(self, pixels: int, channels: int) -> int:
+        """Return the number of Gaussians with which a search starts."""
+        return min(self.most_for(pixels, channels), max(1, pixels // PIXELS_PER_FIRST_GAUSSIAN))
 
 
 def default_count(pixels: int) -> int:
@@ -239,10 +216,9 @@ def default_count(pixels: int) -> int:
     return min(DEFAULT_COUNT, pixels)
 
 
-def max_gaussians_for(pixels: NDArray[np.float32]) -> int:
-    """Return the number of Gaussians with as many parameters as an image (H, W, C) has numbers."""
-    channels = pixels.shape[2]
-    return max(1, pixels.size // (COLOR_PARAMETERS + channels))
+def max_gaussians_for(pixels: int, channels: int) -> int:
+    """Return the number of Gaussians with as many parameters as an image has numbers."""
+    return max(1, pixels * channels // (COLOR_PARAMETERS + channels))
 
 
 @takes_numbers
@@ -295,61 +271,3 @@ def _check_counts(count: int | None, levels: Sequence[int]) -> list[int]:
     if count is not None and counts[-1] != count:
         raise ValueError(f"levels {written}: the last must be the number of Gaussians, {count}")
     return [int(n) for n in counts]
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A method: the placement, the start of the colours and the schedule of the refinement.
-
-    Attributes
-    ----------
-    init : str
-        Placement for ``init="auto"``.
-    solves : bool
-        Whether a solve finds the best colours for the shapes before refinement. Without a solve, a
-        start has its own colours, those of a model are projections on its components, and
-        placements draw them from [0, 1] on a black background.
-    schedule : Schedule
-        Schedule of the refinement.
-    mean : {"gaussians", "dense"}
-        With a model: "gaussians" if the Gaussians include the mean image, "dense" if the mean image
-        stays pixels.
-    """
-
-    init: str
-    solves: bool
-    schedule: Schedule
-    mean: str = "gaussians"
-
-
-# GaussianImage has one learning rate for all variables. It halves the rate after 20,000 steps,
-# which no fit here reaches.
-_ONE_RATE = Schedule(
-    optimizer="adan",
-    rates={"mean": 1e-3, "cholesky": 1e-3, "color": 1e-3},
-    parameterization="cholesky",
-    decay=1.0,
-    warm_up=0,
-    drift=4e-3,
-    redistribute_after=0,
-)
-
-PRESETS = {
-    "default": Preset(
-        init="adaptive",
-        solves=True,
-        schedule=Schedule(
-            optimizer="adam",
-            settings={"beta_1": 0.9, "beta_2": 0.9, "epsilon": 1e-12},
-            rates={"mean": 0.4, "factor": 0.22, "color": 0.0115},
-            decay=0.045,
-            drift=1.4,
-            relocate_every=45,
-            rate_exponent=0.8,
-        ),
-    ),
-    "gaussianimage": Preset(init="random", solves=False, schedule=_ONE_RATE),
-    # EigenGS's paper descends as GaussianImage does, from the projection on the eigenbasis.
-    "eigengs": Preset(init="", solves=False, schedule=_ONE_RATE, mean="dense"),
-}
-"""Presets by name."""

@@ -162,13 +162,13 @@ def residual(
     lists: TileLists,
     radius: float,
     target: Float,
-    weight: Float = None,
+    curvature: Float = None,
 ) -> tuple[Any, list]:
     """Sum the Gaussians of every tile, and compare them with an image, in one pass over memory.
 
-    With the error ``e = m (I - T)`` of a pixel, the results are ``m e``, which is half of the
-    derivative of ``sum e^2`` with respect to I, and the sums of ``e^2``. The factor m is the
-    weight inside the image, and 0 in parts of tiles outside it.
+    With the error ``e = I - T`` of a pixel and its curvature h, the results are ``h e``, which is
+    the derivative of ``1/2 sum h e^2`` with respect to I, and the sums of ``h e^2``. Parts of tiles
+    outside the image have the error 0.
 
     Parameters
     ----------
@@ -176,37 +176,38 @@ def residual(
         As for `forward`.
     target : Float or None
         Image T in tile layout; None for 0.
-    weight : Float, optional
-        Factor of the errors in tile layout; by default 1.
+    curvature : Float, optional
+        Factors h in tile layout, one for each pixel or for each of its channels; by default 1.
 
     Returns
     -------
     delta : Float, shape (tiles * pixels * channels,)
-        ``m e`` in tile layout.
+        ``h e`` in tile layout.
     squares : list of Float, shape (lanes,)
-        For each channel, the sums of ``e^2`` over the pixels of each lane; `sum_lanes` adds them.
+        For each channel, the sums of ``h e^2`` over the pixels of each lane; `sum_lanes` adds them.
     """
     types = types_of(packed)
     grid, channels = lists.grid, len(start)
     blocks = _blocks(types, lists)
     sums = _sum_blocks(packed, start, lists, blocks, radius)
-    length = blocks.pixels * channels
 
-    def load(image: Float) -> list:
-        return gather_run(types, image, blocks.run, length, True)
+    def load(image: Float, values: int) -> list:
+        return gather_run(types, image, blocks.run, blocks.pixels * values, True)
 
-    errors = sums if target is None else [s - t for s, t in zip(sums, load(target), strict=True)]
-    if weight is not None:
-        factors = load(weight)
-        errors = [e * m for e, m in zip(errors, factors, strict=True)]
+    errors = sums
+    if target is not None:
+        errors = [s - t for s, t in zip(sums, load(target, channels), strict=True)]
     inside = _inside(blocks, lists.sizes) if grid.overhangs else None
     if inside is not None:
         errors = [dr.select(inside[k // channels], e, 0) for k, e in enumerate(errors)]
-    squares = sum_channels([dr.square(e) for e in errors], channels)
-    if weight is not None:
-        errors = [e * m for e, m in zip(errors, factors, strict=True)]
+    deltas = errors
+    if curvature is not None:
+        values = dr.width(curvature) // (grid.tiles * grid.pixels)
+        factors = load(curvature, values)
+        deltas = [e * factors[k * values // channels] for k, e in enumerate(errors)]
+    squares = sum_channels([e * d for e, d in zip(errors, deltas, strict=True)], channels)
     delta = dr.empty(types.Float, grid.tiles * grid.pixels * channels)
-    dr.scatter(delta, types.FloatX(errors), blocks.run)
+    dr.scatter(delta, types.FloatX(deltas), blocks.run)
     return delta, squares
 
 

@@ -8,7 +8,7 @@ which every camera sees the texture at a given PSNR.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -19,15 +19,13 @@ from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
 from ..backend.arguments import takes_numbers
+from ..backend.arrays import types_in
 from ..backend.recording import exclusive
-from ..backend.selection import backend_of
-from ..fitting.density_control import DensityControl
-from ..fitting.descent import FitProblem, run
-from ..fitting.options import PRESETS
-from ..fitting.placement.adaptive import place_adaptive
-from ..fitting.search import DB_PER_DOUBLING
-from ..fitting.solvers.conjugate_gradient import solve
-from ..fitting.target import in_unit
+from ..backend.selection import backend_of, select
+from ..fitting.fewest import fewest
+from ..fitting.measure import Row
+from ..fitting.method import DEFAULT
+from ..fitting.objective import Affine, Data, Pixels, restored
 from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
@@ -46,12 +44,6 @@ COLORS = ("linear", "radiance", "data")
 
 PIXELS = 4
 """Pixels per Gaussian at the start of the search."""
-
-CLOSE = 1.1
-"""Ratio of a sufficient and an insufficient number of Gaussians at which the search ends."""
-
-LAST = 8
-"""Number of attempts from which on the search bisects: decibels say little if they have a step."""
 
 ENOUGH = 2.0
 """Smallest number of texels per pixel without an enlargement. With fewer texels the image is
@@ -182,17 +174,43 @@ def fit_for_scene(
     target = smoothest_target(values, fine, lambda t: min(seen(t)) >= target_psnr + MARGIN)
     weight = error_weights(fine, target, kind)
 
-    def attempt(count: int) -> tuple[Gaussians, tuple[float, ...]]:
-        gaussians = _fit(target, weight, fine.seen, count, iterations, kind)
-        return gaussians, seen(render(gaussians).numpy())
-
     max_gaussians = min(max_gaussians or int(found.seen.sum()), fine.seen.size)
     looks = np.minimum(PIXEL / found.footprint[found.seen], 1) ** 2  # pixels per texel, at most 1
-    start = max(1, int(looks.sum()) // PIXELS)
-    gaussians, reached, tried = _search_count(attempt, target_psnr, start, max_gaussians)
+    first = min(max(1, int(looks.sum()) // PIXELS), max_gaussians)
+    objective = _objective(target, weight, fine.seen, first, kind)
+    size = fine.seen.shape[1], fine.seen.shape[0]
+
+    def score(gaussians: Gaussians) -> list[Row]:
+        psnr = seen(render(_without_unseen(gaussians.scaled(*size), fine.seen)).numpy())
+        return [{"psnr_ycbcr": min(psnr), "psnr": psnr}]
+
+    start = DEFAULT.place_and_solve(objective, first)
+    search = fewest(
+        objective, DEFAULT, start, score, ("psnr_ycbcr", target_psnr), max_gaussians, iterations
+    )
+    if search.stopped != "met":
+        reached = search.row["psnr_ycbcr"]
+        raise Unsuitable(
+            f"{len(search.gaussians)} Gaussians reach {reached:.1f} dB, but the cameras shall see "
+            f"{target_psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
+        )
+    gaussians = _without_unseen(search.gaussians.scaled(*size), fine.seen)
     mean = gaussians.mean + type(gaussians.mean)(*corner)  # of the crop
     placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height, space=space)
-    return SceneFit(in_unit(placed.scaled(width, height), peak), reached, found, tried)
+    tried = [(row["gaussians"], row["psnr_ycbcr"]) for row in search.trace]
+    whole = restored(placed.scaled(width, height), Affine(peak))
+    return SceneFit(whole, search.row["psnr"], found, tried)
+
+
+def _objective(
+    target: Image, weight: Image, seen: NDArray[np.bool_], count: int, space: str
+) -> Pixels:
+    """Return the objective of a fit, at `DETAIL` texels a Gaussian; cameras judge all texels."""
+    times = 2 ** max(0, int(math.log2(max(1.0, seen.sum() / (DETAIL * count))) / 2))
+    target, weight = _shrunk(target, times), _shrunk(weight, times)
+    shown = to_coded(target) if space == "linear" else target
+    types = types_in(select(backend_of(mi.variant())))
+    return Pixels.of(Data(target, shown, weight), space, types)
 
 
 def _resized(values: Image, texels: float) -> Image:
@@ -220,35 +238,7 @@ def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, 
     return np.ascontiguousarray(values[part]), cut, (int(kept[1][0]), int(kept[0][0]))
 
 
-# --- The number ----------------------------------------------------------------------------------
-
-
-def _fit(
-    target: Image,
-    weight: Image,
-    seen: NDArray[np.bool_],
-    count: int,
-    iterations: int,
-    space: str,
-) -> Gaussians:
-    """Place `count` Gaussians, drop those that reach no seen texel, and fit the rest.
-
-    The fit sees the target at `DETAIL` texels a Gaussian, its judges see all.
-    """
-    height, width = seen.shape
-    times = 2 ** max(0, int(math.log2(seen.sum() / (DETAIL * count)) / 2))
-    target, weight = _shrunk(target, times), _shrunk(weight, times)
-    seen = _shrunk(seen[..., None].astype(np.float32), times)[..., 0] > 0
-    picture = to_coded(target) if space == "linear" else target
-    start = place_adaptive(picture, count, space, backend_of(mi.variant()))
-    start = solve(_seen_only(start, seen), target)
-    schedule = PRESETS["default"].schedule
-    control = DensityControl(target, weight, picture)
-    found = run(FitProblem(start, target, weight, control), schedule, iterations)
-    return _seen_only(found, seen).scaled(width, height)
-
-
-def _seen_only(gaussians: Gaussians, seen: NDArray[np.bool_]) -> Gaussians:
+def _without_unseen(gaussians: Gaussians, seen: NDArray[np.bool_]) -> Gaussians:
     """Keep the Gaussians that may reach a seen texel, by their longer axes; at least one."""
     arrays = gaussians.to_arrays()
     mean, factor = arrays["mean"], arrays["factor"]
@@ -257,49 +247,3 @@ def _seen_only(gaussians: Gaussians, seen: NDArray[np.bool_]) -> Gaussians:
     away = distance_transform_edt(~seen)[row, column]
     reaches = away <= np.maximum(CUTOFF * max_deviation(*factor.T), away.min())
     return gaussians[np.flatnonzero(reaches)]
-
-
-def _search_count(
-    attempt: Callable[[int], tuple[Gaussians, tuple[float, ...]]],
-    bound: float,
-    start: int,
-    most: int,
-) -> tuple[Gaussians, tuple[float, ...], list[tuple[int, float]]]:
-    """Search for the smallest sufficient number.
-
-    Until two numbers enclose it, the first step trusts `DB_PER_DOUBLING`, and others double or
-    halve. Then the decibels of both are interpolated over the logarithm of the number, a few times,
-    and at last their ratio is bisected.
-
-    Raises
-    ------
-    Unsuitable
-        If the number `most` does not suffice.
-    """
-    tried: list[tuple[int, float]] = []
-    low, high, best, missing = 0, most, None, dict[int, float]()
-    count = min(start, most)
-    while best is None or (high > CLOSE * low + 1 and high - low > 1):
-        gaussians, reached = attempt(count)
-        lowest = min(reached)
-        missing[count] = bound - lowest
-        tried.append((len(gaussians), lowest))
-        if lowest >= bound:
-            high, best = count, (gaussians, reached)
-        elif count == most:
-            raise Unsuitable(
-                f"{most} Gaussians reach {lowest:.1f} dB, but the cameras shall see {bound:g} dB; "
-                "lower the PSNR, or allow more Gaussians or iterations"
-            )
-        else:
-            low = count
-        if best is None or not low:
-            octaves = missing[count] / DB_PER_DOUBLING if len(tried) == 1 else 0
-            factor = 2 ** min(max(abs(octaves), 1), 3)
-            count = min(round(factor * count), most) if best is None else round(count / factor)
-        else:
-            share = missing[low] / (missing[low] - missing[high]) if len(tried) < LAST else 0.5
-            share = min(max(share, math.log(CLOSE, high / low)), 1 - math.log(CLOSE, high / low))
-            count = round(low * (high / low) ** share)
-        count = max(count, low + 1) if best is None else min(max(count, low + 1), high - 1)
-    return *best, tried

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 from scipy.sparse import csr_array
 
-from ..fitting.target import dark_weight
+from ..fitting.objective import dark_weight
 from ..image.color import to_coded
 from ..plugins.cone import PIXEL
 from .visibility import Visibility
@@ -212,20 +212,20 @@ def smoothest_target(values: Image, found: Visibility, is_close: Callable[[Image
 
 
 def error_weights(found: Visibility, target: Image, space: str) -> Image:
-    """Return factors of the errors: the square root of each texel's share of the pixels.
+    """Return factors of the squared errors: each texel's share of the pixels.
 
     Parameters
     ----------
     found : Visibility
     target : ndarray of float32, shape (H, W, C)
     space : {"linear", "data"}
-        In linear light dark texels weigh more, see `eigengs_dr.fitting.target.dark_weight`.
+        In linear light dark texels weigh more, see `eigengs_dr.fitting.objective.dark_weight`.
 
     Returns
     -------
     ndarray of float32, shape (H, W, C)
     """
     share = gaussian_filter(found.pixels, EVEN) * found.seen
-    weight = np.sqrt(share / share.max())[..., None]
+    weight = (share / share.max())[..., None]
     light = dark_weight(target) if space == "linear" else np.ones_like(target)
     return (weight * light).astype(np.float32)

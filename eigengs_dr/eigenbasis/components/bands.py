@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...fitting.start import place_grid
+from ...fitting.place import grid_of
 from ...gaussian.gaussians import Gaussians
 from ..pca.basis import Eigenbasis
 
@@ -81,9 +81,7 @@ def low_component_count(basis: Eigenbasis) -> int:
 
 def on_grid(band: FrequencyBand) -> State:
     """Return the state of a band before training: its Gaussians on a grid."""
-    width, height = band.size
-    generator = np.random.default_rng(0)
-    mean, factor = place_grid(np.empty((height, width, 1)), band.number, generator)
+    mean, factor = grid_of(band.size, band.number)
     return {"step": np.array(0), "mean": mean, "factor": factor}
 
 

@@ -17,12 +17,15 @@ import numpy as np
 
 from ...backend.arrays import types_of
 from ...backend.recording import freeze_program
-from ...fitting.descent import pack, rate_table, start_descent, step_program
-from ...fitting.schedule import Schedule, lr_factor
+from ...fitting.descent import begin, pack, rate_table, started, step_program
+from ...fitting.method import Method
+from ...fitting.objective import Pixels
+from ...fitting.optimizer import Adam
+from ...fitting.place import Grid
 from ...fitting.solvers.conjugate_gradient import solve
+from ...fitting.variables import Relative
 from ...gaussian.gaussians import Gaussians
-from ...raster.binning.tiles import Grid
-from ...raster.render import bin_gaussians, to_tiles
+from ...raster.render import bin_gaussians
 from .bands import FrequencyBand, Planes, State, on_grid, shapes_of
 
 ROUND = 25
@@ -33,17 +36,15 @@ SOLVE_STEPS = 30
 """Steps of conjugate gradients for the colours of a sample. With 8 steps, the derivative has an
 error of a third."""
 
-SCHEDULE = Schedule(
-    optimizer="adam",
-    settings={"beta_1": 0.9, "beta_2": 0.99, "epsilon": 1e-12},
+SHAPES = Method(
+    place=Grid(),
+    controls=(),
+    optimizer=Adam(0.9, 0.99, 1e-12),
     rates={"mean": 0.02, "factor": 0.02},
-    warm_up=0,
+    coordinates=Relative(),
 )
-"""Schedule of the descent. The learning rates are a sixth of those for one image, because each step
-has another sample."""
-
-WARM_UP = 5
-"""Steps of rising learning rates at the start of each round."""
+"""The method of the descent. The learning rates are a sixth of those for one image, because each
+step has another sample."""
 
 
 def train_shapes(
@@ -89,27 +90,26 @@ def _round(
 ) -> Gaussians:
     """Take the steps from `first` to before `last` of a span, with a new optimiser."""
     first, last, steps = span
-    types, grid = types_of(gaussians.mean), Grid(gaussians.width, gaussians.height)
-    state = start_descent(gaussians, SCHEDULE)
-    factors = [
-        lr_factor(SCHEDULE, step, steps) * min(1.0, (step - first + 1) / WARM_UP)
-        for step in range(first, last)
-    ]
-    rates = rate_table(types, SCHEDULE, factors)
-    with freeze_program(step_program(SCHEDULE, gaussians)) as take_step:
-        for index, image in enumerate(samples(band, seed, first, last)):
-            solved = solve(state.gaussians, image, SOLVE_STEPS)
+    state, types = started(begin(gaussians), SHAPES, first), types_of(gaussians.mean)
+    rates = rate_table(types, SHAPES, steps)
+    images = samples(band, seed, first, last)
+    with freeze_program(step_program(Pixels.plain(images[0], gaussians), SHAPES)) as take_step:
+        moving, current = state.moving, gaussians
+        assert moving is not None
+        for step, image in enumerate(images, first):
+            objective = Pixels.plain(image, gaussians)
+            solved = solve(current, objective, SOLVE_STEPS)
             fixed = replace(gaussians, color=solved.color, background=solved.background)
-            state = take_step(
-                replace(state, packed=pack(solved)),
+            moving, current = take_step(
+                len(gaussians),
+                moving._replace(packed=pack(solved)),
                 fixed,
-                to_tiles(types, image, grid),
-                None,
+                objective.model,
                 [bin_gaussians(solved)],
                 rates,
-                dr.opaque(types.UInt, index),
+                dr.opaque(types.UInt, step),
             )
-    return dr.detach(state.gaussians)
+    return dr.detach(current)
 
 
 def samples(band: FrequencyBand, seed: int, first: int, last: int) -> Planes:

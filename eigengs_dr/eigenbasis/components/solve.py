@@ -13,6 +13,7 @@ from ...backend.recording import exclusive
 from ...fitting.solvers.normal_equations import BATCH, NormalEquations, squared_norms
 from ...gaussian.gaussians import Gaussians, concatenate, with_colors
 from ...image.metrics import psnr_from_mse
+from ...paper.joint_training import joint_shapes, joint_weights, train_jointly
 from ..options import TrainOptions
 from ..pca.basis import Eigenbasis
 from .bands import (
@@ -22,7 +23,6 @@ from .bands import (
     low_component_count,
     shapes_of,
 )
-from .joint_training import joint_shapes, joint_weights, train_jointly
 from .shape_training import train_shapes
 
 

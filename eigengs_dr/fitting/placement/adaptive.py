@@ -31,24 +31,19 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import drjit as dr
-import numpy as np
-from numpy.typing import NDArray
 
-from ...backend.arrays import Float, release_memory, types_in, types_of
+from ...backend.arrays import Float, release_memory
 from ...backend.recording import record
-from ...backend.selection import select
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians, Rows
 from ...raster.binning.tiles import Grid
 from ...raster.kernels import sum_by_image
 from ...raster.parameters import gather_run
-from ...raster.render import batch_to_tiles, render
+from ..objective import Pixels
 from ..solvers.conjugate_gradient import solve, spread
 from .density import Owners, squared_error, target_density
 from .filters import PIXELS, Canvas, blur, shrunk, squared_hessian
 from .pieces import lloyd_step, pixel_of, stratify_along_hilbert
-
-Array = NDArray[np.floating]
 
 Density = Callable[[Canvas, Float, int], Float]
 """``density(canvas, default, times)`` returns the Gaussians per pixel, up to a factor, for the
@@ -82,12 +77,7 @@ the constants above were chosen near this spacing, and filters of large images t
 
 
 def place_adaptive(
-    image: Array,
-    count: int,
-    space: str,
-    backend: str | None = None,
-    cutoff: float = CUTOFF,
-    density: Density | None = None,
+    objective: Pixels, count: int, cutoff: float = CUTOFF, density: Density | None = None
 ) -> Gaussians:
     """Place and shape Gaussians by the second derivatives of an image, with the colour 0.
 
@@ -95,12 +85,12 @@ def place_adaptive(
 
     Parameters
     ----------
-    image : ndarray, shape (H, W, C) or (M, H, W, C)
-        In the space of the squared error. A batch gets the sets of all images, image after image.
+    objective : Pixels
+        A batch gets the sets of all images, image after image.
     count : int
-        Number of Gaussians of an image, from 1 to H W.
-    space, backend, cutoff
-        Those of the set, see `eigengs_dr.Gaussians`.
+        Number of Gaussians of an image, from 1 to W H.
+    cutoff : float, optional
+        That of the set, see `eigengs_dr.Gaussians`.
     density : callable, optional
         See `Density`.
 
@@ -109,17 +99,16 @@ def place_adaptive(
     Gaussians
         Neighbours in memory are close in space.
     """
-    types, (height, width, channels) = types_in(select(backend)), image.shape[-3:]
-    images = len(image) if image.ndim == 4 else 1
-    canvas = Canvas.of(types, Grid(width, height, images=images))
-    mean, factor = _place(canvas, batch_to_tiles(types, image), count, density)
-    color = [dr.zeros(types.Float, images * count) for _ in range(channels)]
-    background = [dr.zeros(types.Float, images) for _ in range(channels)]
+    types, grid, channels = objective.types, objective.grid, objective.channels
+    mean, factor = _place(Canvas.of(types, grid), objective.shown, count, density)
+    color = [dr.zeros(types.Float, grid.images * count) for _ in range(channels)]
+    background = [dr.zeros(types.Float, grid.images) for _ in range(channels)]
     dr.make_opaque(color, background)
     rows = types.FloatX(color), types.FloatX(background)
-    placed = Gaussians(mean, factor, *rows, width, height, space, float(cutoff)).bounded()
+    placed = Gaussians(mean, factor, *rows, *objective.size, objective.space, float(cutoff))
+    placed = placed.bounded()
     dr.eval(placed)
-    release_memory(image.size)  # nothing later asks for blocks of these sizes
+    release_memory(dr.width(objective.shown))  # nothing later asks for blocks of these sizes
     return placed
 
 
@@ -241,12 +230,7 @@ def shapes_from_hessian(
 
 
 def redistribute(
-    gaussians: Gaussians,
-    count: int,
-    image: Array,
-    target: NDArray[np.float32],
-    weight: Array | None = None,
-    solve_steps: int = 10,
+    gaussians: Gaussians, objective: Pixels, count: int, solve_steps: int = 10
 ) -> Gaussians:
     """Place a new set, denser where the old set left more error, and solve for its colours.
 
@@ -254,14 +238,9 @@ def redistribute(
     ----------
     gaussians : Gaussians
         The old set, after some steps of a fit. For a batch, the sets of all images.
+    objective : Pixels
     count : int
-        Number of Gaussians of the new set, or of the sets of all images together.
-    image : ndarray, shape (H, W, C) or (M, H, W, C)
-        The image that shapes the Gaussians, see `eigengs_dr.fitting.placement.adaptive`.
-    target : ndarray of float32, same shape
-        The image in the space of the set.
-    weight : ndarray, same shape, optional
-        Factor of the errors before squaring.
+        Number of Gaussians of the new set of each image.
     solve_steps : int, optional
         Steps of the colour solve, see `eigengs_dr.fitting.solvers.conjugate_gradient`.
 
@@ -270,10 +249,10 @@ def redistribute(
     Gaussians
         The new set. It keeps no Gaussian of the old set.
     """
-    images = len(target) if target.ndim == 4 else 1
+    images = objective.grid.images
     with dr.suspend_grad():
         owners = Owners.of(gaussians, images)
-        error = squared_error(gaussians, target, weight, owners.lists)
+        error = squared_error(gaussians, objective, owners.lists)
 
         def density(canvas: Canvas, default: Float, times: int) -> Float:
             if times == 1:
@@ -290,12 +269,5 @@ def redistribute(
             less = shrunk(owners.canvas, error, canvas, times)
             return target_density(Owners.of(small, images), less, default)
 
-        kind = gaussians.space, types_of(gaussians.mean).backend, gaussians.cutoff
-        placed = place_adaptive(image, count // images, *kind, density)
-    return solve(placed, target, solve_steps)
-
-
-def residual(gaussians: Gaussians, target: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the target minus the rendering of a set, both in its space: shape (H, W, C)."""
-    shown = render(replace(dr.detach(gaussians), space="data"))
-    return np.asarray(target - shown.numpy(), np.float32)
+        placed = place_adaptive(objective, count, gaussians.cutoff, density)
+    return solve(placed, objective, solve_steps)

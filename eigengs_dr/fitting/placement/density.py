@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import drjit as dr
-import numpy as np
-from numpy.typing import NDArray
 
 from ...backend.arrays import Float, rcp, types_of
 from ...backend.recording import record
 from ...gaussian.gaussians import Gaussians, whole
 from ...raster.binning.lists import TileLists
-from ...raster.kernels import forward, sum_by_image
+from ...raster.kernels import forward, sum_by_image, sum_lanes
 from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
-from ...raster.render import batch_to_tiles, bin_gaussians
-from ..solvers.conjugate_gradient import apply, correlate, spread
+from ...raster.render import bin_gaussians
+from ..objective import Pixels, Quadratic
+from ..solvers.conjugate_gradient import Unknowns, apply, by_channel, correlate, spread
 from .filters import Canvas
 
 ERROR_EXPONENT = 4 / 3
@@ -94,21 +93,32 @@ def _mean_by_image(values: Float, lists: TileLists) -> Float:
     return sum_by_image(values, lists.grid) / (dr.width(values) // lists.grid.images)
 
 
-def squared_error(
-    gaussians: Gaussians,
-    target: NDArray[np.float32],
-    weight: NDArray[np.floating] | None = None,
-    lists: TileLists | None = None,
-) -> Float:
-    """Return the squares of the errors of a set, added over the channels.
+@record
+def _squares(shape: list, x: Unknowns, model: Quadratic, lists: TileLists, cutoff: float) -> Float:
+    """Return ``h (p - t)^2`` of every pixel, added over the channels; evaluated."""
+    types, channels = types_of(model.target), len(x[0])
+    error, _ = apply(shape, x, lists, cutoff, Quadratic(model.target))
+    dr.eval(error)
+    curvature = model.curvatures(lists.grid)
+    pixel = dr.arange(types.UInt, lists.grid.tiles * lists.grid.pixels)
+    values = dr.width(curvature) // dr.width(pixel)
+
+    def read(image: Float, c: int, number: int) -> Float:
+        return dr.gather(types.Float, image, pixel * number + c)
+
+    factors = by_channel([read(curvature, c, values) for c in range(values)], channels)
+    squares = sum(f * dr.square(read(error, c, channels)) for c, f in enumerate(factors))
+    dr.eval(squares)
+    return squares
+
+
+def squared_error(gaussians: Gaussians, objective: Pixels, lists: TileLists | None = None) -> Float:
+    """Return ``sum h (p - t)^2`` over the channels of each pixel for a set.
 
     Parameters
     ----------
     gaussians : Gaussians
-    target : ndarray of float32, shape (H, W, C) or (M, H, W, C)
-        The image, or a batch, in the space of the set.
-    weight : ndarray, same shape, optional
-        Factor of the errors before squaring.
+    objective : Pixels
     lists : TileLists, optional
         Those of the set, if they are there.
 
@@ -117,26 +127,20 @@ def squared_error(
     Float, shape (pixels,)
         In tile layout, 0 outside the image.
     """
-    types, channels = types_of(gaussians.mean), gaussians.channels
     if lists is None:
-        images = len(target) if target.ndim == 4 else 1
-        lists = bin_gaussians(gaussians, adjoint=False, images=images)
+        lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
     colors = whole(dr.detach(gaussians.color), gaussians), list(dr.detach(gaussians.background))
-    shape, image = detached_shape(gaussians), batch_to_tiles(types, target)
-    error, _ = apply(shape, colors, lists, gaussians.cutoff, image)
-    factors = None if weight is None else batch_to_tiles(types, weight)
-    dr.eval(error)
-    pixel = dr.arange(types.UInt, dr.width(error) // channels)
+    return _squares(detached_shape(gaussians), colors, objective.model, lists, gaussians.cutoff)
 
-    def read(values: Float) -> list:
-        return [dr.gather(types.Float, values, pixel * channels + c) for c in range(channels)]
 
-    parts = read(error)
-    if factors is not None:
-        parts = [e * f for e, f in zip(parts, read(factors), strict=True)]
-    squares = sum(dr.square(e) for e in parts)
-    dr.eval(squares)
-    return squares
+def squares_by_channel(gaussians: Gaussians, objective: Pixels) -> list:
+    """Return ``sum h (p - t)^2`` over the pixels for each channel, a Float (images,)."""
+    lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
+    colors = whole(gaussians.color, gaussians), list(gaussians.background)
+    shape, cutoff = detached_shape(gaussians), gaussians.cutoff
+    with dr.suspend_grad():
+        _, lanes = apply(shape, colors, lists, cutoff, objective.model)
+        return sum_lanes(lanes, lists)
 
 
 def density_ratio(owners: Owners, error: Float, bending: Float) -> Float:

@@ -1,8 +1,9 @@
 """The peaks of an error: where an added Gaussian would reduce it most, in kernels that own tiles.
 
-A round Gaussian with the weights w and the colour ``c = <w, r> / <w, w>`` reduces the squared error
-of the residual r by ``c^2 <w, w>``. Added Gaussians have one size, and ``<w, w>`` is then a number:
-c is a blur of r, and the largest reduction is where ``c^2`` is largest.
+A round Gaussian with the weights w and the colour ``c = -<w, g> / <w, h w>`` reduces a loss with
+the derivative g by the picture and the curvature h by ``c^2 <w, h w> / 2``. Added Gaussians have
+one size, and h hardly changes below them: with h of the pixel, ``<w, h w> = h <w, w>``, c is a blur
+of g over h, and the largest reduction is where ``h c^2`` is largest.
 
 Images are in tile layout. A batch of images takes one launch of each kernel, and each image has
 peaks of its own.
@@ -54,8 +55,8 @@ class Peaks(NamedTuple):
     rank: UInt
 
 
-def residual_peaks(canvas: Canvas, missed: Float, count: int, squares: Float = None) -> Peaks:
-    """Find where added round Gaussians of the size `SIZE` would reduce the error most.
+def residual_peaks(canvas: Canvas, slope: Float, curvature: Float, count: int) -> Peaks:
+    """Find where added round Gaussians of the size `SIZE` would reduce a loss most.
 
     These are the pixels whose reduction is the largest of 3x3 pixels, and the best of them.
 
@@ -65,19 +66,20 @@ def residual_peaks(canvas: Canvas, missed: Float, count: int, squares: Float = N
     Parameters
     ----------
     canvas : Canvas
-    missed : Float, shape (pixels * channels,)
-        Residual r in tile layout, 0 outside the image.
+    slope : Float, shape (pixels * channels,)
+        Minus the derivative of the loss by the picture in tile layout, 0 outside the image.
+    curvature : Float, shape (pixels,) or (pixels * channels,)
+        The curvature in tile layout, 0 outside the image, of pixels or of their channels. Where it
+        is 0, nothing is added.
     count : int
         Largest number of peaks of an image.
-    squares : Float, optional
-        Factors of the squares of the errors in tile layout, by default 1.
 
     Returns
     -------
     Peaks
     """
-    types, channels = canvas.types, canvas.channels(missed)
-    colors, maxima = _maxima(canvas, missed, squares)
+    types, channels = canvas.types, canvas.channels(slope)
+    colors, maxima = _maxima(canvas, slope, curvature)
     place = dr.compress(maxima > 0)
     place, image, rank = _ranked(place, maxima, canvas, count)
     if not dr.width(place):  # Dr.Jit does not compute with no elements
@@ -91,23 +93,18 @@ def residual_peaks(canvas: Canvas, missed: Float, count: int, squares: Float = N
 
 
 @record
-def _maxima(canvas: Canvas, missed: Float, squares: Float) -> tuple[Float, Float]:
+def _maxima(canvas: Canvas, slope: Float, curvature: Float) -> tuple[Float, Float]:
     """Return the best colour of a Gaussian at each pixel, and the reduction where it is a maximum.
 
-    It is 0 at all other pixels, and without its factor ``<w, w>``.
+    It is 0 at all other pixels, and without its factor ``<w, w> / 2``.
     """
-    channels = canvas.channels(missed)
-    colors = _best_colors(neighbourhood(canvas, missed, RADIUS), channels)
-    terms = [dr.square(c) for c in colors]
-    if squares is not None:
-        factors = gather_run(canvas.types, squares, canvas.tile, PIXELS * channels, True)
-        terms = [t * f for t, f in zip(terms, factors, strict=True)]
-    x, y = canvas.corner(canvas.tile)
-    width, height = canvas.sides()
-    gains = []
-    for n in range(PIXELS):
-        inside = (x + n % SIDE < width) & (y + n // SIDE < height)
-        gains.append(dr.select(inside, sum(terms[n * channels : (n + 1) * channels]), 0))
+    channels, values = canvas.channels(slope), canvas.channels(curvature)
+    blurred = _blurred(neighbourhood(canvas, slope, RADIUS), channels)
+    factors = gather_run(canvas.types, curvature, canvas.tile, PIXELS * values, True)
+    factors = [factors[k * values // channels] for k in range(PIXELS * channels)]
+    colors = [dr.select(h > 0, b / h, 0) for b, h in zip(blurred, factors, strict=True)]
+    terms = [c * b for c, b in zip(colors, blurred, strict=True)]
+    gains = [sum(terms[n * channels : (n + 1) * channels]) for n in range(PIXELS)]
     found = canvas.store(colors), canvas.store(gains)
     dr.eval(found)
     rows = neighbourhood(canvas, found[1], 1)
@@ -116,7 +113,7 @@ def _maxima(canvas: Canvas, missed: Float, squares: Float) -> tuple[Float, Float
     return found[0], maxima
 
 
-def _best_colors(rows: list, channels: int) -> list:
+def _blurred(rows: list, channels: int) -> list:
     """Return the weighted sums around the pixels of a tile: along rows, then along columns."""
 
     def weighted(values: list) -> Float:

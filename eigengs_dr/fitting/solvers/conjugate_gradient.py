@@ -1,33 +1,34 @@
 """The best colours for fixed shapes: linear least squares by preconditioned conjugate gradients.
 
 A rendering is linear in colours and background. Column n of the matrix ``A`` holds the weights of
-Gaussian n at all pixels; the last column is 1. The best colours c minimise ``|A c - D|^2`` for the
-image D. A rendering computes a product with A, an adjoint a product with its transpose; A is never
-stored.
+Gaussian n at all pixels; the last column is 1. The best colours c minimise ``sum h (A c - D)^2``
+for the image D and the curvature h of an objective, see `eigengs_dr.fitting.objective.Quadratic`. A
+rendering computes a product with A, an adjoint a product with its transpose; A is never stored.
+With the diagonal matrix H of the curvature, the normal equations are ``A^T H A c = A^T H D``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import drjit as dr
-import numpy as np
-from numpy.typing import NDArray
 
-from ...backend.arrays import Float, UInt, rcp, release_memory, types_of, upload
+from ...backend.arrays import Float, UInt, rcp, release_memory, types_of
 from ...backend.recording import record
 from ...gaussian.gaussians import Gaussians, whole
 from ...raster.adjoint import adjoint
 from ...raster.binning.lists import TileLists
 from ...raster.binning.tiles import Grid
-from ...raster.kernels import channel_sums, residual, sum_by_image, sum_lanes
+from ...raster.kernels import channel_sums, sum_by_image, sum_lanes
 from ...raster.parameters import (
     detached_shape,
     gather_run,
     kernel_radius,
     pack_parameters,
 )
-from ...raster.render import batch_to_tiles, bin_gaussians, pixels_inside
+from ...raster.render import bin_gaussians
+from ..objective import Pixels, Quadratic
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
 """Tolerance by the bits of a float: a channel stops if ``r^T z``, relative to its first value, is
@@ -48,104 +49,95 @@ preconditioner."""
 
 def solve(
     gaussians: Gaussians,
-    image: NDArray[np.floating],
+    objective: Pixels,
     steps: int = 10,
     warm_start: bool = False,
-    background: NDArray[np.floating] | None = None,
+    background: Sequence[float] | None = None,
 ) -> Gaussians:
     """Find the colours and the background that fit an image best on fixed shapes.
 
     The method is conjugate gradients on the normal equations, for each channel separately, with
-    their diagonal ``sum_x w_n(x)^2`` as preconditioner. A step costs one rendering and one adjoint
-    with respect to colours.
+    their diagonal ``sum_x h(x) w_n(x)^2`` as preconditioner. A step costs one rendering and one
+    adjoint with respect to colours.
 
     Parameters
     ----------
     gaussians : Gaussians
-    image : ndarray, shape (H, W, C) or (M, H, W, C)
-        Image of the native size, in the space of the set. A batch of images has step lengths for
-        each: the set holds the Gaussians of all, image after image, equally many for each.
+        Of a batch, those of all images, image after image, equally many for each.
+    objective : Pixels
+        The image and its weights. A batch of images has step lengths for each.
     steps : int, optional
         Number of steps. Few steps regularise the colours of Gaussians that overlap much.
     warm_start : bool, optional
         Start from the colours and background of the set instead of zero and the mean of the image.
-    background : ndarray, shape (C,), optional
+    background : sequence of C floats, optional
         The background of the result. By default the best one is found.
 
     Returns
     -------
     Gaussians
         The set with the new colours and background; that of a batch has a value for each image. A
-        step never adds to the error ``|A c - D|^2``, except by rounding.
+        step never adds to the error ``sum h (A c - D)^2``, except by rounding.
 
     Raises
     ------
     ValueError
         If image and set differ in shape, or steps is negative.
     """
-    expected = (gaussians.height, gaussians.width, gaussians.channels)
-    if image.shape[-3:] != expected:
-        raise ValueError(f"solve: image has shape {image.shape}, the set needs {expected}")
+    needed = (gaussians.width, gaussians.height, gaussians.channels)
+    if (*objective.size, objective.channels) != needed:
+        shape = (*objective.size, objective.channels)
+        raise ValueError(f"solve: the image has width, height, channels {shape}, the set {needed}")
     if steps < 0:
         raise ValueError(f"solve: steps is {steps}; it must be at least 0")
     with dr.suspend_grad():
-        cutoff = gaussians.cutoff
-        lists = bin_gaussians(gaussians, images=len(image) if image.ndim == 4 else 1)
+        cutoff, model, values = gaussians.cutoff, objective.model, dr.width(objective.model.target)
+        lists = bin_gaussians(gaussians, images=objective.grid.images)
         shape = detached_shape(gaussians)
-        inverse, enough, state = _start(gaussians, shape, image, lists, warm_start, background)
-        release_memory(image.size)  # what the lists and the start took would stay reserved
+        x = _first(gaussians, objective, warm_start, background)
+        dr.make_opaque(shape, x)
+        held = background is not None
+        inverse, enough, state = _begin(shape, x, model, held, lists, cutoff)
+        release_memory(values)  # what the lists and the start took would stay reserved
         for _ in range(steps):
-            state = _step(shape, state, enough, inverse, lists, cutoff)
+            state = _step(shape, state, model.curvature, enough, inverse, lists, cutoff)
         (color, free), FloatX = state[0], types_of(gaussians.mean).FloatX
         solved = replace(gaussians, color=FloatX(color), background=FloatX(free))
         dr.eval(solved)
         del lists
-    release_memory(image.size)
+    release_memory(values)
     return solved
 
 
-def _start(
-    gaussians: Gaussians,
-    shape: list,
-    image: NDArray[np.floating],
-    lists: TileLists,
-    warm: bool,
-    background: NDArray[np.floating] | None,
-) -> tuple[Unknowns, list, State]:
-    """Return the preconditioner, where to stop, and the first state: see `_begin`.
-
-    The first unknowns are those of the set, or zero and the mean of each image.
-    """
-    types, grid = types_of(gaussians.mean), lists.grid
-    target = batch_to_tiles(types, np.asarray(image, np.float32))
+def _first(
+    gaussians: Gaussians, objective: Pixels, warm: bool, background: Sequence[float] | None
+) -> Unknowns:
+    """Return the first unknowns: those of the set, or zero and the mean of each image."""
+    types = types_of(gaussians.mean)
     if warm:
         color, free = whole(gaussians.color, gaussians), list(gaussians.background)
     else:
         color = [dr.zeros(types.Float, len(gaussians)) for _ in range(gaussians.channels)]
-        sums = channel_sums(target, gaussians.channels, grid)
-        free = [s * dr.opaque(types.Float, 1 / (grid.width * grid.height)) for s in sums]
+        free = objective.model.mean_target(objective.grid, gaussians.channels)
     if background is not None:
-        free = [upload(types.Float, row) for row in np.asarray(background)[:, None]]
-    x = color, free
-    dr.make_opaque(shape, x)
-    return _begin(shape, x, target, background is not None, lists, gaussians.cutoff)
+        free = [dr.opaque(types.Float, float(value)) for value in background]
+    return color, free
 
 
 @record
 def _begin(
-    shape: list, x: Unknowns, target: Float, held: bool, lists: TileLists, cutoff: float
+    shape: list, x: Unknowns, model: Quadratic, held: bool, lists: TileLists, cutoff: float
 ) -> tuple[Unknowns, list, State]:
     """Return the preconditioner, the ``r^T z`` at which channels stop, and the first state.
 
     A held background keeps its value.
     """
-    channels, grid, types = len(x[0]), lists.grid, types_of(target)
-    error, lanes = apply(shape, x, lists, cutoff, target)
+    channels, grid, types = len(x[0]), lists.grid, types_of(model.target)
+    error, lanes = apply(shape, x, lists, cutoff, model)
     squares = sum_lanes(lanes, lists)
     dr.eval(error, squares)  # together: later, the sums would render again
-    color, diagonal = weigh(shape, error, channels, lists, cutoff, pixels_inside(types, grid))
-    # All channels have the same diagonal.
-    inverse = invert(diagonal[0]) * channels, invert(diagonal[1]) * channels
+    color, diagonal = weigh(shape, error, channels, lists, cutoff, model.curvatures(grid))
+    inverse = by_channel(invert(diagonal[0]), channels), by_channel(invert(diagonal[1]), channels)
     inverse = held_background(inverse) if held else inverse
     r = negate((color, channel_sums(error, channels, grid)))
     p = multiply(r, inverse)
@@ -161,7 +153,13 @@ def _begin(
 
 @record
 def _step(
-    shape: list, state: State, enough: list, inverse: Unknowns, lists: TileLists, cutoff: float
+    shape: list,
+    state: State,
+    curvature: Float,
+    enough: list,
+    inverse: Unknowns,
+    lists: TileLists,
+    cutoff: float,
 ) -> State:
     """Take a step of conjugate gradients.
 
@@ -169,7 +167,7 @@ def _step(
     """
     x, p, r, rz = state
     Float, grid, channels = type(shape[0]), lists.grid, len(rz)
-    x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
+    x, q, alpha = _advance(shape, x, p, rz, curvature, lists, cutoff)
     change = apply_transposed(shape, q, channels, lists, cutoff)
     r = add_multiple(r, [-a for a in alpha], change, lists.image)
     z = multiply(r, inverse)
@@ -188,7 +186,13 @@ def _step(
 
 
 def take_step(
-    shape: list, x: Unknowns, error: Float, inverse: Unknowns, lists: TileLists, cutoff: float
+    shape: list,
+    x: Unknowns,
+    error: Float,
+    curvature: Float,
+    inverse: Unknowns,
+    lists: TileLists,
+    cutoff: float,
 ) -> Unknowns:
     """Take one step of steepest descent from the unknowns x.
 
@@ -200,7 +204,9 @@ def take_step(
         See `detached_shape`.
     x : Unknowns
     error : Float
-        ``A x - D`` in tile layout, evaluated. It becomes that of the result, in place.
+        ``H (A x - D)`` in tile layout, evaluated. It becomes that of the result, in place.
+    curvature : Float or None
+        The diagonal H, see `eigengs_dr.fitting.objective.Quadratic`.
     inverse : Unknowns
         The preconditioner: one over the diagonal. Unknowns where it is 0 keep their values.
     lists : TileLists
@@ -209,16 +215,25 @@ def take_step(
     r = negate(apply_transposed(shape, error, len(inverse[0]), lists, cutoff))
     p = multiply(r, inverse)
     rz = dots(r, p, lists.grid)
-    x, q, alpha = _advance(shape, x, p, rz, lists, cutoff)
+    x, q, alpha = _advance(shape, x, p, rz, curvature, lists, cutoff)
     _add_in_place(error, q, alpha, lists)
     return x
 
 
 def _advance(
-    shape: list, x: Unknowns, p: Unknowns, rz: list, lists: TileLists, cutoff: float
+    shape: list,
+    x: Unknowns,
+    p: Unknowns,
+    rz: list,
+    curvature: Float,
+    lists: TileLists,
+    cutoff: float,
 ) -> tuple[Unknowns, Float, list]:
-    """Move x along p to the least error; return x, ``q = A p``, and ``alpha = rz / |q|^2``."""
-    q, lanes = apply(shape, p, lists, cutoff)
+    """Move x along p to the least error.
+
+    Return x, ``q = H A p``, and ``alpha = rz / <A p, q>``.
+    """
+    q, lanes = apply(shape, p, lists, cutoff, Quadratic(None, curvature))
     curvature = sum_lanes(lanes, lists)
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
@@ -244,11 +259,14 @@ def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) ->
 
 
 def apply(
-    shape: list, x: Unknowns, lists: TileLists, cutoff: float, target: Float = None
+    shape: list, x: Unknowns, lists: TileLists, cutoff: float, model: Quadratic
 ) -> tuple[Float, list]:
-    """Return ``A x - D``, and for each lane the sums of its squares."""
+    """Return ``H (A x - D)``, and for each lane the sums of ``h (A x - D)^2``.
+
+    A model without a target has ``D = 0``.
+    """
     packed = pack_parameters([*shape, *x[0]])
-    return residual(packed, x[1], lists, kernel_radius(cutoff), target)
+    return model.compare(packed, x[1], lists, kernel_radius(cutoff))
 
 
 def apply_transposed(
@@ -286,6 +304,11 @@ def weigh(
     found = correlate(shape, delta, channels, lists, cutoff, factors)
     diagonal = found[channels:]
     return found[:channels], (diagonal, channel_sums(factors, len(diagonal), lists.grid))
+
+
+def by_channel(values: list, channels: int) -> list:
+    """Return a value for each channel, where there is one for all or one for each."""
+    return values * (channels // len(values))
 
 
 def invert(diagonal: list) -> list:

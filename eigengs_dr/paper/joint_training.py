@@ -8,34 +8,59 @@ is the mean squared error of the rendered components, with each channel scaled t
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Protocol
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
-from ...backend.arrays import ArrayTypes, Float, types_in, types_of, upload
-from ...backend.recording import freeze_program
-from ...backend.selection import select
-from ...fitting.parameterization import CHOLESKY, Adan
-from ...fitting.start import place_random
-from ...gaussian.file import CUTOFF
-from ...gaussian.gaussians import Gaussians
-from ...raster.adjoint import adjoint
-from ...raster.binning.lists import TileLists
-from ...raster.binning.tiles import Grid
-from ...raster.kernels import residual
-from ...raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
-from ...raster.render import bin_gaussians, to_tiles
-from .bands import FrequencyBand, Planes, State
+from ..backend.arrays import ArrayTypes, Float, types_in, types_of, upload
+from ..backend.recording import freeze_program
+from ..backend.selection import select
+from ..fitting.place import random_shapes
+from ..gaussian.file import CUTOFF
+from ..gaussian.gaussians import Gaussians
+from ..raster.adjoint import adjoint
+from ..raster.binning.lists import TileLists
+from ..raster.binning.tiles import Grid
+from ..raster.kernels import residual
+from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
+from ..raster.render import bin_gaussians, to_tiles
+from .adan import Adan
+from .cholesky import Cholesky
+
+Planes = NDArray[np.float32]
+
+State = dict[str, NDArray]
+"""What a training keeps: plain arrays, for a checkpoint."""
+
+CHOLESKY = Cholesky()
 
 
-def joint_shapes(state: State, band: FrequencyBand, backend: str | None = None) -> Gaussians:
+class Components(Protocol):
+    """Components that some Gaussians serve, as `eigengs_dr.eigenbasis` divides them."""
+
+    @property
+    def number(self) -> int:
+        """Number of Gaussians."""
+
+    @property
+    def components(self) -> tuple[Planes, ...]:
+        """Components of each channel, (k_c, H, W)."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+
+
+def joint_shapes(state: State, band: Components, backend: str | None = None) -> Gaussians:
     """Return the Gaussians of a state, with one channel of zeros, in the space "data"."""
     types = types_in(select(backend))
     rows = [upload(types.Float, row) for row in state["rows"][0, :NUM_SHAPE_PARAMS]]
     return decode_shapes(rows, band.size)
 
 
-def joint_weights(state: State, band: FrequencyBand) -> list[Planes]:
+def joint_weights(state: State, band: Components) -> list[Planes]:
     """Return the weights of the components of a state without the scaling.
 
     The scaled weight ``w_nj`` of Gaussian n in component j and the bounds of the channel give
@@ -54,7 +79,7 @@ def joint_weights(state: State, band: FrequencyBand) -> list[Planes]:
     ]
 
 
-def _bounds(band: FrequencyBand) -> list[tuple[np.float32, np.float32]]:
+def _bounds(band: Components) -> list[tuple[np.float32, np.float32]]:
     """Return the smallest and largest value of all components of each channel."""
     none = np.zeros(1, np.float32)
     return [(p.min(), p.max()) for p in (c if len(c) else none for c in band.components)]
@@ -66,7 +91,7 @@ def decode_shapes(rows: Sequence[Float], size: tuple[int, int]) -> Gaussians:
     Parameters
     ----------
     rows : sequence of 5 Float, shape (N,)
-        Mean and factor in the coordinates `CHOLESKY`.
+        Mean and factor in the coordinates `Cholesky`.
     size : (int, int)
         Width and height in pixels.
     """
@@ -95,7 +120,7 @@ OPTIMIZER = Adan()
 
 
 def train_jointly(
-    band: FrequencyBand,
+    band: Components,
     seed: int,
     steps: int,
     backend: str | None = None,
@@ -114,7 +139,7 @@ def train_jointly(
 
     Parameters
     ----------
-    band : FrequencyBand
+    band : Components
     seed : int
         Seed of the random start.
     steps : int
@@ -130,8 +155,8 @@ def train_jointly(
         steps. Between two states, `KeyboardInterrupt` may become another error, see
         `eigengs_dr.backend.feedback.defer_interrupts`. "step" is the number of finished steps;
         "rows", shape (5, 5 + P, N) for P components, the variables, then m, v, n and the last
-        gradient of `eigengs_dr.fitting.parameterization.Adan`. The first 5 rows of each are the
-        mean and the factor in `CHOLESKY` coordinates, each other row the scaled weights of one
+        gradient of `eigengs_dr.paper.adan.Adan`. The first 5 rows of each are the
+        mean and the factor in `Cholesky` coordinates, each other row the scaled weights of one
         component.
 
     Raises
@@ -149,11 +174,11 @@ def train_jointly(
     return _train(band, state or _start(band, seed, backend), steps, backend)
 
 
-def _start(band: FrequencyBand, seed: int, backend: str | None) -> State:
+def _start(band: Components, seed: int, backend: str | None) -> State:
     """Draw an initial state, with moments of 0."""
     generator = np.random.default_rng(seed)
-    (width, height), count = band.size, band.number
-    mean, factor = place_random(np.empty((height, width, 1)), count, generator)
+    count = band.number
+    mean, factor = random_shapes(band.size, count, generator)
     gaussians = Gaussians.from_arrays(
         mean, factor, np.zeros((count, 1)), size=band.size, space="data", backend=backend
     )
@@ -165,7 +190,7 @@ def _start(band: FrequencyBand, seed: int, backend: str | None) -> State:
     return {"step": np.array(0), "rows": rows}
 
 
-def _train(band: FrequencyBand, state: State, steps: int, backend: str | None) -> Iterator[State]:
+def _train(band: Components, state: State, steps: int, backend: str | None) -> Iterator[State]:
     """Take the remaining steps."""
     types, size, start = types_in(select(backend)), band.size, state["rows"]
     shape = _upload(types, start[:, :NUM_SHAPE_PARAMS])

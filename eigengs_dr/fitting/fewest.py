@@ -3,15 +3,15 @@
 The search has three stages. *Estimate*: short descents with few Gaussians ("tries") estimate the
 number. Two tries measure the gain per doubling; each try shows where to place the Gaussians of the
 next one (`eigengs_dr.fitting.placement.adaptive`). *Fit*: a longer descent with the estimate.
-*Polish*: density control (`eigengs_dr.fitting.density_control`) drops Gaussians while the set meets
-the goal and adds Gaussians while it does not; each change ends with a short descent.
+*Polish*: Gaussians are dropped (`eigengs_dr.fitting.exchange`) while the set meets the goal, and
+added while it does not; each change ends with a short descent.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -19,11 +19,14 @@ import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR
-from .density_control import densify, prune
-from .descent import FitProblem, run
+from .control import Perturb, Redistribute, Relocate, Surplus
+from .descent import begin, descend
+from .exchange import densify, prune
+from .loop import FitProgress, Refinement, Score
 from .measure import Row
-from .refine import FitProgress, Refinement
-from .schedule import Schedule, surplus_for
+from .method import Method
+from .objective import Pixels
+from .placement.adaptive import redistribute
 
 # The constants of a search, chosen on training photos of ImageNet classes. With a surplus in the
 # fit, a fit of 1.0 and a margin of 1.1 take 4.6 and 1.6 % fewer Gaussians for 32 and 36 dB on 9
@@ -95,14 +98,15 @@ ENOUGH = 0.02
 """Decibels above the goal that do not justify another polish."""
 
 
-def search_count(
-    start: FitProblem,
-    measure: Callable[[Gaussians], Row],
-    figure: str,
-    goal: float,
+def fewest(
+    objective: Pixels,
+    method: Method,
+    start: Gaussians,
+    score: Score,
+    goal: tuple[str, float],
     most: int,
-    schedule: Schedule,
     iterations: int = 1000,
+    key: int = 0,
     progress: FitProgress | None = None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Refinement:
@@ -110,33 +114,31 @@ def search_count(
 
     Parameters
     ----------
-    start : FitProblem
-        A first guess by the placement "adaptive", which can redistribute.
-    measure : callable
-        ``measure(gaussians)`` returns a dict with a value in dB under the key `figure`.
-    figure : str
-        Key of the value that shall reach the goal.
-    goal : float
-        The goal in dB.
+    objective : Pixels
+    method : Method
+    start : Gaussians
+        A first guess by the placement `Adaptive`, which can be redistributed.
+    score : Score
+    goal : (str, float)
+        Key of the value in the rows of `score` that shall reach the goal, and the goal in dB.
     most : int
         Largest number of Gaussians.
-    schedule : Schedule
     iterations : int, optional
         Steps of a fit with a known number; the search takes up to about twice as many.
-    progress, interrupted : callable, optional
-        See `eigengs_dr.fitting.refine.refine`.
+    key, progress, interrupted : optional
+        See `eigengs_dr.fitting.loop.refine`.
 
     Returns
     -------
     Refinement
         The smallest set that meets the goal, or else the best set. The trace has a row for every
-        measured set, with iteration, gaussians and the values of `measure`. `stopped` is "met",
+        measured set, with iteration, gaussians and the values of `score`. `stopped` is "met",
         "out of reach" or "interrupted".
     """
     shares = (TRY_SHARE, FIT_SHARE, POLISH_SHARE)
     tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
     planned = MAX_TRIES * tries + fit + MAX_POLISHES * polish
-    run = _Run(start, measure, figure, goal, schedule, progress, interrupted, planned)
+    run = _Run(objective, method, start, score, goal, key, progress, interrupted, planned)
     try:
         estimate = _estimate(run, most, tries)
         if not interrupted() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
@@ -170,11 +172,12 @@ class _Trial(NamedTuple):
 class _Run:
     """The state of one search."""
 
-    start: FitProblem
-    measure: Callable[[Gaussians], Row]
-    figure: str
-    goal: float
-    schedule: Schedule
+    objective: Pixels
+    method: Method
+    start: Gaussians
+    measure: Score
+    goal: tuple[str, float]
+    key: int
     progress: FitProgress | None
     interrupted: Callable[[], bool]
     planned: int
@@ -184,37 +187,40 @@ class _Run:
     best: _Trial = field(init=False)
 
     def __post_init__(self) -> None:
-        self.best = self.score(self.start.gaussians)
+        self.best = self.score(self.start)
 
     def descend(
         self, gaussians: Gaussians, steps: int, share: float = 1.0, surplus: int = 0
     ) -> _Trial:
         """Take some steps at a fraction of the learning rates, and score what is left then."""
-        rates = {name: share * rate for name, rate in self.schedule.rates.items()}
-        schedule = replace(self.schedule, rates=rates, redistribute_after=0)
+        method = self.method.at_rates(share).without(Surplus, Redistribute)
         if share < 1:  # a polish moves Gaussians by itself
-            schedule = replace(schedule, relocate_every=0)
+            method = method.without(Relocate, Perturb)
         self.planned, before = max(self.planned, self.step + steps), self.step
-
-        def after(step: int, found: Gaussians) -> bool:
-            self.step = before + step
-            if self.progress and step and self.step % 10 == 0:
-                dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
-                self.progress(self.step, self.planned, self.trace[-1])
-            return self.interrupted()
-
-        problem = self.start._replace(gaussians=gaussians)
-        current = run(problem, schedule, steps, after, surplus=surplus)
+        current = replace(begin(gaussians), count=len(gaussians) - surplus)
+        states = descend(self.objective, method, current, steps, self.key + before)
+        with closing(states):
+            for step, current in enumerate(states, 1):  # noqa: B007
+                self.step = before + step
+                if self.progress and self.step % 10 == 0:
+                    dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
+                    self.progress(self.step, self.planned, self.trace[-1])
+                if self.interrupted():
+                    break
         # An interrupt may come before the last relocation.
-        wanted, start = len(gaussians) - surplus, self.start
-        return self.score(prune(current, start.target, wanted, start.weight))
+        return self.score(prune(dr.detach(current.gaussians), self.objective, current.count))
+
+    def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
+        """Place `count` Gaussians anew, denser where a set leaves more error."""
+        return redistribute(gaussians, self.objective, count, self.method.solve_steps)
 
     def score(self, gaussians: Gaussians) -> _Trial:
-        figures = self.measure(gaussians)
+        figure, goal = self.goal
+        [figures] = self.measure(gaussians)
         row = {"iteration": self.step, "gaussians": len(gaussians), **figures}
         self.trace.append(row)
         # The PSNR of a set without error is infinite, and differences of two such are no numbers.
-        trial = _Trial(gaussians, self.goal - min(figures[self.figure], MAX_PSNR), row)
+        trial = _Trial(gaussians, goal - min(figures[figure], MAX_PSNR), row)
         if len(self.trace) == 1 or _better(trial, self.best):
             self.best = trial
         if self.progress:
@@ -241,8 +247,7 @@ class _Estimate(NamedTuple):
 
 def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
     """Estimate the number of Gaussians by tries, each placed where the one before left error."""
-    assert run.start.control
-    placed, before, last = run.start.gaussians, run.best, None
+    placed, before, last = run.start, run.best, None
     for _ in range(MAX_TRIES):
         trial = run.descend(placed, steps)
         _update_slope(run, last, trial)
@@ -253,7 +258,7 @@ def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
         )
         # The first try was placed by the image, without errors: it does not count as close.
         close = last is not None and abs(count - len(placed)) <= TRY_TOLERANCE * len(placed)
-        placed = run.start.control.redistribute(trial.gaussians, count)
+        placed = run.redistribute(trial.gaussians, count)
         last, before = trial, run.score(placed)
         if close or run.interrupted():
             break
@@ -266,18 +271,20 @@ def _fit_estimate(run: _Run, estimate: _Estimate, most: int, steps: int, most_st
     count = _count_for_gain(run, number, trial.missing, most)
     if run.interrupted() or count - number <= FIT_TOLERANCE * number:
         return trial
-    assert run.start.control
-    again = _Estimate(trial.gaussians, run.start.control.redistribute(trial.gaussians, count))
+    again = _Estimate(trial.gaussians, run.redistribute(trial.gaussians, count))
     return _fit(run, again, max(1, min(steps, most_steps - run.step)))
 
 
 def _fit(run: _Run, estimate: _Estimate, steps: int) -> _Trial:
     """Fit the estimated number, with a surplus that is placed as well and leaves."""
     tried, placed = estimate
-    more = surplus_for(run.schedule, len(placed), placed.width * placed.height, steps)
+    control = run.method.control(Surplus)
+    if isinstance(control, Surplus):
+        more = control.number(len(placed), placed.width * placed.height, steps)
+    else:
+        more = 0
     if more:
-        assert run.start.control
-        placed = run.start.control.redistribute(tried, len(placed) + more)
+        placed = run.redistribute(tried, len(placed) + more)
     return run.descend(placed, steps, surplus=more)
 
 
@@ -302,7 +309,6 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
 
     `most_steps` limits the steps of the search: if `densify` finds few places, it would not end.
     """
-    target, weight = run.start.target, run.start.weight
     least_growth, rounds, gain = 1.02, 0, POLISH_GAIN
     while run.step + steps <= most_steps and not run.interrupted():
         count, found = len(trial.gaussians), run.best
@@ -317,18 +323,18 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
             )
             if wanted == count or -missing < ENOUGH:
                 return
-            changed = prune(trial.gaussians, target, wanted, weight)
+            changed = prune(trial.gaussians, run.objective, wanted)
         elif found.missing <= 0 and len(found.gaussians) <= FAR * count:
             # The best number lies between this one and that of the best set; or a polish suffices.
             wanted = max(
                 count, _count_for_gain(run, count, missing, (count + len(found.gaussians)) // 2)
             )
-            changed = densify(trial.gaussians, target, wanted, weight)
+            changed = densify(trial.gaussians, run.objective, wanted)
         else:
             wanted = max(
                 _count_for_gain(run, count, missing, most), math.ceil(least_growth * count)
             )
-            changed = densify(trial.gaussians, target, min(wanted, most), weight)
+            changed = densify(trial.gaussians, run.objective, min(wanted, most))
             if len(changed) == count:  # `most` is reached, or no Gaussian would reduce the error
                 return
             least_growth = 2 * least_growth - 1
@@ -344,7 +350,7 @@ TRIMS = 5
 
 def _trim(run: _Run) -> None:
     """Drop Gaussians of a set above the goal without a step, by bisection; `run` keeps the best."""
-    target, weight, above = run.start.target, run.start.weight, run.best
+    above = run.best
     if above.missing > 0:
         return
     too_few = _count_for_gain(run, len(above.gaussians), above.missing, len(above.gaussians))
@@ -352,5 +358,5 @@ def _trim(run: _Run) -> None:
         wanted = (too_few + len(above.gaussians)) // 2
         if wanted in (too_few, len(above.gaussians)):
             return
-        trial = run.score(prune(above.gaussians, target, wanted, weight))
+        trial = run.score(prune(above.gaussians, run.objective, wanted))
         above, too_few = (trial, too_few) if trial.missing <= 0 else (above, wanted)

@@ -1,0 +1,315 @@
+"""Controls: what adds, moves and removes Gaussians between the steps of a descent.
+
+`Surplus` asks for more Gaussians than wanted, `Redistribute` places all anew after the first steps,
+`Relocate` moves those of least use, and lets the surplus go, and `Perturb` shakes all. Each acts
+before steps of its own, and with it the optimiser starts anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import numpy as np
+
+from ..backend.arrays import Float, make_divisor, types_of
+from ..raster.kernels import sum_by_image
+from .exchange import among, exchange, exchange_levels
+from .placement.adaptive import redistribute
+from .placement.density import squared_error
+
+if TYPE_CHECKING:
+    from .descent import State
+    from .objective import Pixels
+
+EVERY = 45
+"""Steps between two rounds of relocation."""
+
+UNTIL, MIN_ROUNDS, MAX_ROUNDS = 0.65, 2, 72
+"""The share of a descent that has rounds, and their numbers. In 100 steps more steps gain more than
+rounds would, for the same time. With 5,000 steps, 72 rounds gain 0.07 and 0.1 dB over 40 (4
+training photos, 0.0127 and 0.0254 Gaussians a pixel)."""
+
+FULL_ROUNDS = 10
+"""Number of rounds from which on noise and surplus have their full strength. A short descent does
+not recover from more: with 300 steps and 0.076 Gaussians a pixel, a noise of 4 costs 0.8
+dB. With 0.0127 Gaussians a pixel, a surplus of 0.5 gains 0.24 dB there, and one of 1 0.18 dB."""
+
+
+def rounds(every: int, iterations: int) -> list[int]:
+    """Return the steps before which rounds come: evenly up to `UNTIL`.
+
+    Examples
+    --------
+    >>> rounds(65, 1000)[:3], rounds(45, 100)
+    ([65, 130, 195], [])
+    """
+    until = UNTIL * iterations
+    number = min(MAX_ROUNDS, int(until / every)) if every else 0
+    if number < MIN_ROUNDS:
+        return []
+    return [round(until * (k + 1) / number) for k in range(number)]
+
+
+def _strength(number: int) -> float:
+    """Return the share of the full strength in a descent of so many rounds."""
+    return min(1, number / FULL_ROUNDS)
+
+
+@dataclass(frozen=True)
+class Surplus:
+    """Lets a redistribution place more Gaussians than asked for; relocations let them go again.
+
+    Attributes
+    ----------
+    share : float
+        Surplus of a long descent, relative to the number asked for. With 0.0127 Gaussians a pixel,
+        1,000 steps and 9 training photos, 0.5, 1 and 2 gain 0.23, 0.24 and 0.12 dB.
+    max_density : float
+        Most Gaussians a pixel of a set with a surplus. Denser sets do not converge in 1,000 steps.
+        On 9 training photos, surpluses up to this density gain 0.24, 0.22 and 0.10 dB with 0.0127,
+        0.0254 and 0.045 Gaussians a pixel. With 0.076 Gaussians a pixel, a surplus of 0.3 costs
+        0.09 dB.
+    every : int
+        Steps between the rounds of relocation.
+    """
+
+    share: float = 1.0
+    max_density: float = 1 / 16
+    every: int = EVERY
+
+    def steps(self, iterations: int) -> tuple[int, ...]:
+        """Return the first step."""
+        return (0,)
+
+    def __call__(
+        self, state: State, objective: Pixels, step: int, iterations: int, key: int
+    ) -> State:
+        """Return the state with the surplus that a redistribution may place."""
+        width, height = objective.size
+        return replace(state, surplus=self.number(state.count, width * height, iterations))
+
+    def number(self, count: int, pixels: int, iterations: int) -> int:
+        """Return how many Gaussians more than `count` an image of so many pixels may have.
+
+        Examples
+        --------
+        >>> [Surplus().number(count, 256 * 256, 1000) for count in (1000, 3000, 5000)]
+        [1000, 1096, 0]
+        """
+        share = self.share * _strength(len(rounds(self.every, iterations)))
+        return max(0, min(int(share * count), int(self.max_density * pixels) - count))
+
+
+@dataclass(frozen=True)
+class Redistribute:
+    """Places all Gaussians anew after the first steps, denser where these left more error.
+
+    Gaussians that the user chose are replaced if the error is then smaller: where a start is
+    useless.
+
+    Attributes
+    ----------
+    after : int
+        Most steps before it.
+    solve_steps : int
+        Steps of the colour solve after it.
+    """
+
+    after: int = 20
+    solve_steps: int = 10
+
+    MIN_RATIO = 10
+    """Smallest ratio of the steps of a descent to those before a redistribution."""
+
+    MIN_STEPS = 10
+    """Fewest steps before it. With 0.013 and 0.076 Gaussians a pixel, redistribution gains 0.07
+    and 0.6 dB in 100 steps (5 photos); in 60 steps, after 6 of them, it gains 0 and 0.3 dB, less
+    than more steps would in the same time."""
+
+    def steps(self, iterations: int) -> tuple[int, ...]:
+        """Return the step before which it comes; none in a short descent.
+
+        Examples
+        --------
+        >>> [Redistribute().steps(steps) for steps in (99, 100, 150, 1000)]
+        [(), (10,), (15,), (20,)]
+        """
+        first = min(self.after, iterations // self.MIN_RATIO)
+        return (first,) if first >= min(self.MIN_STEPS, self.after) and first else ()
+
+    def __call__(
+        self, state: State, objective: Pixels, step: int, iterations: int, key: int
+    ) -> State:
+        """Return the state with a new set and its surplus."""
+        if objective.levels or objective.part:
+            return state
+        current, count = dr.detach(state.gaussians), state.count + state.surplus
+        anew = redistribute(current, objective, count, self.solve_steps)
+        if state.chosen:
+            before, after = (dr.sum(squared_error(g, objective))[0] for g in (current, anew))
+            if not after < before:
+                return state
+        return state.replaced(anew)
+
+
+@dataclass(frozen=True)
+class Relocate:
+    """Moves the Gaussians of least use to where they reduce the error most, again and again.
+
+    What is more than asked for leaves, about as many in each round. With levels, the Gaussians of
+    each level move inside of it.
+
+    Attributes
+    ----------
+    every : int
+        Steps between two rounds.
+    share : float
+        Share of the Gaussians that leave their places in a round, in [0, 1].
+    """
+
+    every: int = EVERY
+    share: float = 0.1
+
+    def steps(self, iterations: int) -> list[int]:
+        """Return the steps of the rounds, see `rounds`."""
+        return rounds(self.every, iterations)
+
+    def __call__(
+        self, state: State, objective: Pixels, step: int, iterations: int, key: int
+    ) -> State:
+        """Return the state with moved Gaussians."""
+        current = dr.detach(state.gaussians)
+        if objective.levels:
+            return state.replaced(exchange_levels(current, objective, self.share))
+        steps = self.steps(iterations)
+        left = len(steps) - steps.index(step)
+        excess = state.total - state.count
+        dropped = excess - excess * (left - 1) // left
+        lists = state.lists[-1] if state.lists else None
+        moved, squares = exchange(current, objective, self.share, dropped, lists)
+        return replace(state.replaced(moved), squares=squares)
+
+
+@dataclass(frozen=True)
+class Perturb:
+    """Adds noise to means and shapes, less from round to round, so that a poor minimum is left.
+
+    Kheradmand et al. ("3D Gaussian splatting as Markov chain Monte Carlo", NeurIPS 2024) add noise
+    to means. Here shapes get noise too, and each Gaussian gets as much as the image can bear, see
+    `perturb`. With levels there is none: what the first level can bear costs the third one 0.5 to
+    0.9 dB.
+
+    Attributes
+    ----------
+    strength : float
+        Noise of the first round.
+    every : int
+        Steps between two rounds.
+    """
+
+    strength: float = 2.5
+    every: int = EVERY
+
+    def steps(self, iterations: int) -> list[int]:
+        """Return the steps of the rounds, see `rounds`."""
+        return rounds(self.every, iterations)
+
+    def __call__(
+        self, state: State, objective: Pixels, step: int, iterations: int, key: int
+    ) -> State:
+        """Return the state with moved means and shapes."""
+        if objective.levels:
+            return state
+        steps, gaussians = self.steps(iterations), dr.detach(state.gaussians)
+        done = steps.index(step) / len(steps)
+        strength = self.strength * _strength(len(steps)) * (1 - done)
+        squares, images = state.squares, objective.grid.images
+        if squares is None:
+            squares = sum_by_image(squared_error(gaussians, objective), objective.grid)
+        own = range(state.total) if objective.part is None else range(*_ends(objective.part.own))
+        curvature = objective.model.mean_curvature(objective.grid, objective.channels)
+        error = squares / (curvature * dr.opaque(type(squares), max(1, len(own))))
+        seed = int(np.random.SeedSequence([key, step]).generate_state(1)[0])
+        color = [row + dr.zeros(type(squares), len(gaussians)) for row in gaussians.color]
+        mean, factor = perturb(
+            gaussians.mean, gaussians.factor, color, own, error, strength, seed, images
+        )
+        return state.replaced(replace(gaussians, mean=mean, factor=factor).bounded())
+
+
+def _ends(own: slice) -> tuple[int, int]:
+    return own.start, own.stop
+
+
+SHAPE_SHARE = 0.5
+"""Noise of the logarithms of the sizes, relative to that of the mean in standard deviations."""
+
+MAX_NOISE = 1.0
+"""Largest noise of a mean, in standard deviations of its Gaussian."""
+
+
+def perturb(
+    mean: Float,
+    factor: Float,
+    color: list,
+    own: range,
+    error: Float,
+    strength: float,
+    seed: int,
+    images: int = 1,
+) -> tuple[Float, Float]:
+    """Add noise to the means and the factors of some Gaussians.
+
+    A Gaussian with the factor F, the size s (the geometric mean of its standard deviations) and the
+    amplitude ``A = color s`` adds the squared error ``pi/2 |A|^2 |F dm|^2`` if its mean moves by
+    dm. So faint Gaussians move far, and those that carry the image stay near their places; the
+    nearer a fit is to its image, the smaller are the moves.
+
+    The noise is normal: ``F dm = e z`` for the mean, with two numbers z, and
+    ``F' = [[exp(e u), e v], [0, exp(e w)]] F`` for the factor, with `SHAPE_SHARE` times such
+    numbers u, v and w. Each mean alone adds about ``strength^2`` times the mean error:
+    ``e = strength (error / (pi |A|^2))^(1/2)``, at most `MAX_NOISE`.
+
+    Parameters
+    ----------
+    mean : Array2f, shape (N, 2)
+    factor : Array3f, shape (N, 3)
+    color : list of Float, shape (N,)
+        By channels.
+    own : range
+        The Gaussians of one image that move; the images of a batch have equal noise.
+    error : Float, shape (images,)
+        Squared error of each image divided by the number of its Gaussians.
+    strength : float
+    seed : int
+        Equal seeds give equal noise.
+    images : int, optional
+
+    Returns
+    -------
+    mean : Array2f, shape (N, 2)
+        Perturbed means may lie outside the image.
+    factor : Array3f, shape (N, 3)
+    """
+    types, total = types_of(mean), dr.width(color[0])
+    count = total // images
+    image, lane = make_divisor(types, count).divmod(dr.arange(types.UInt, total))
+    error = dr.gather(types.Float, error, image)
+    a, b, c = factor
+    amplitude = sum(dr.square(row) for row in color) / (a * c)
+    size = dr.opaque(types.Float, strength) * dr.sqrt(error / (dr.pi * amplitude))
+    # The comparison is false where the amplitude is 0.
+    size = dr.select(size < MAX_NOISE, size, types.Float(MAX_NOISE))
+    moves = among(lane, own)
+    size = dr.select(moves, size, 0)
+    normal, first = dr.rng(seed).normal(types.Float, 5 * count), dr.opaque(types.UInt, count)
+    x, y, u, v, w = (dr.gather(types.Float, normal, lane + k * first) * size for k in range(5))
+    y /= c
+    u, v, w = (SHAPE_SHARE * z for z in (u, v, w))
+    wider = dr.exp(u)
+    return (
+        mean + dr.select(moves, types.Float2((x - b * y) / a, y), 0),
+        dr.select(moves, types.Float3(wider * a, dr.fma(wider, b, v * c), dr.exp(w) * c), factor),
+    )

@@ -1,0 +1,205 @@
+"""A descent with a trace: the best sets, their PSNRs on the way, and when it ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import numpy as np
+
+from ..gaussian.gaussians import Gaussians, like
+from ..image.metrics import MAX_PSNR
+from .descent import State, descend
+from .exchange import prune
+from .measure import Row
+from .method import Method
+from .objective import Pixels
+
+FitProgress = Callable[[int, int, Row], None]
+
+Score = Callable[[Gaussians], list[Row]]
+"""``score(gaussians)`` returns a row for each image of a batch; its psnr_ycbcr decides which set is
+the best."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Result of a descent for one image.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+        The set with the highest psnr_ycbcr in the trace; of a batch, the sets of all images.
+    trace : list of dict
+        Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb, for sets with as many
+        Gaussians as asked for.
+    iterations : int
+        Number of steps.
+    stopped : str
+        "iterations", "exact" or "interrupted"; see also `eigengs_dr.fitting.fewest.fewest`.
+    row : dict
+        The row of the trace that measures the set.
+    """
+
+    gaussians: Gaussians
+    trace: list[Row] = field(default_factory=list)
+    iterations: int = 0
+    stopped: str = "iterations"
+    row: Row = field(default_factory=Row)
+
+    def judged(self, gaussians: Gaussians, row: Row) -> Refinement:
+        """Return the result with another row of its trace, and the set if it is the best."""
+        self.trace.append(row)
+        best = row["psnr_ycbcr"] > self.row.get("psnr_ycbcr", -math.inf)
+        stopped = "exact" if row["psnr_ycbcr"] > MAX_PSNR else self.stopped
+        step = row["iteration"]
+        if best:
+            return replace(self, gaussians=gaussians, row=row, stopped=stopped, iterations=step)
+        return replace(self, stopped=stopped, iterations=step)
+
+
+class Best:
+    """The best set of every image of a descent so far.
+
+    Parameters
+    ----------
+    state : State
+        Before the first step.
+    images, iterations : int
+    score : Score
+    progress : callable, optional
+        See `refine`.
+    """
+
+    def __init__(
+        self,
+        state: State,
+        images: int,
+        iterations: int,
+        score: Score,
+        progress: FitProgress | None = None,
+    ) -> None:
+        self.found = [Refinement(state.gaussians) for _ in range(images)]
+        self.iterations, self.score, self.progress = iterations, score, progress
+        self.marks, self.step, self.state = trace_steps(iterations), 0, state
+        self.row = Row()
+        self.larger: tuple[float, int, Gaussians] | None = None
+
+    def offer(self, step: int, state: State) -> bool:
+        """Take the set after a step; return whether all images are exact."""
+        self.step, self.state = step, state
+        if step in self.marks:
+            self.judge(step, state.gaussians)
+        if self.progress and (step in self.marks or step % 10 == 0):
+            dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
+            self.progress(step, self.iterations, self.row)
+        return all(one.stopped == "exact" for one in self.found)
+
+    def judge(self, step: int, gaussians: Gaussians) -> None:
+        """Measure a set. One with more Gaussians than asked for does not compare."""
+        rows = self.score(gaussians)
+        self.row = {"iteration": step, **rows[0]}
+        if len(gaussians) > len(self.found) * self.state.count:
+            figure = self.row["psnr_ycbcr"]
+            if self.larger is None or figure > self.larger[0]:
+                self.larger = figure, step, gaussians
+            return
+        self.larger = None
+        self.found = [
+            one if one.stopped == "exact" else one.judged(gaussians, {"iteration": step, **row})
+            for one, row in zip(self.found, rows, strict=True)
+        ]
+
+    def interrupted(self, objective: Pixels) -> None:
+        """Measure what the last step reached, without the Gaussians that are not asked for."""
+        if len(self.found) > 1:
+            raise KeyboardInterrupt
+        larger = [self.larger] if self.larger else []
+        for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
+            if step not in [row["iteration"] for row in self.found[0].trace]:
+                self.judge(step, prune(dr.detach(gaussians), objective, self.state.count))
+        self.found = [
+            replace(one, stopped="interrupted", iterations=self.step) for one in self.found
+        ]
+
+
+def refine(
+    objective: Pixels,
+    method: Method,
+    state: State,
+    iterations: int,
+    score: Score,
+    key: int = 0,
+    progress: FitProgress | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> list[Refinement]:
+    """Descend, and keep the best set of every image.
+
+    Parameters
+    ----------
+    objective : Pixels
+    method : Method
+    state : State
+    iterations : int
+        Largest number of steps.
+    score : Score
+    key : int, optional
+        See `eigengs_dr.fitting.descent.descend`.
+    progress : callable, optional
+        Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
+        trace, or that of a set with more Gaussians than asked for. It may raise `KeyboardInterrupt`
+        to end the refinement.
+    interrupted : callable, optional
+        Called before every step; True ends the refinement. See
+        `eigengs_dr.backend.feedback.defer_interrupts`.
+
+    Returns
+    -------
+    list of Refinement
+        For each image, a set never worse than the start, with as many Gaussians as asked for. After
+        an interrupt, the last row of the trace measures the last step.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If the refinement of a batch is interrupted.
+    """
+    best = Best(state, objective.grid.images, iterations, score, progress)
+    try:
+        ended = best.offer(0, state)
+        with closing(descend(objective, method, state, iterations, key)) as states:
+            while not (ended or interrupted()) and best.step < iterations:
+                ended = best.offer(best.step + 1, next(states))
+        stopped = interrupted()
+    except KeyboardInterrupt:
+        stopped = True
+    if stopped:
+        best.interrupted(objective)
+    return [replace(one, gaussians=dr.detach(one.gaussians)) for one in best.found]
+
+
+def trace_steps(iterations: int) -> set[int]:
+    """Return the steps with a row in the trace: 0, 10, 20, 50, every 100, and the last step."""
+    marks = {0, 10, 20, 50, iterations} | set(range(100, iterations, 100))
+    return {m for m in marks if m <= iterations}
+
+
+def split(batch: Gaussians) -> list[Gaussians]:
+    """Return the sets of all images of a batch."""
+    if dr.width(batch.background[0]) == 1:
+        return [batch]
+    backgrounds = np.stack([row.numpy() for row in batch.background], axis=1)
+    parts = (
+        np.split(np.stack([row.numpy() for row in getattr(batch, name)], axis=1), len(backgrounds))
+        for name in ("mean", "factor", "color")
+    )
+    return [like(batch, *arrays) for arrays in zip(*parts, backgrounds, strict=True)]
+
+
+def sets_of(found: Sequence[Refinement]) -> list[Gaussians]:
+    """Return the best set of each image of a batch."""
+    batches = {id(one.gaussians): split(one.gaussians) for one in found}
+    return [batches[id(one.gaussians)][k] for k, one in enumerate(found)]

@@ -1,0 +1,175 @@
+"""A method of fitting as a value: where Gaussians start, what moves them, and by which rates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gaussian.file import CUTOFF, MAX_CUTOFF
+from .control import Perturb, Redistribute, Relocate, Surplus
+from .optimizer import Adam, Optimizer
+from .place import Adaptive, Placement
+from .solvers.conjugate_gradient import solve
+from .variables import Coordinates, Relative
+
+if TYPE_CHECKING:
+    from ..gaussian.gaussians import Gaussians
+    from .descent import State
+    from .objective import Pixels
+
+
+class Control(Protocol):
+    """What changes the Gaussians between steps of a descent: they are added, moved, or leave."""
+
+    def steps(self, iterations: int) -> Collection[int]:
+        """Return the steps of a descent before which the control acts."""
+
+    def __call__(
+        self, state: State, objective: Pixels, step: int, iterations: int, key: int
+    ) -> State:
+        """Return the state with other Gaussians, by `eigengs_dr.fitting.descent.State.replaced`.
+
+        All random numbers depend on `key` and `step`.
+        """
+
+
+@runtime_checkable
+class Model(Protocol):
+    """What makes a set of an image at once, as `eigengs_dr.EigenGS` does."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Gaussians at the native size of the model."""
+
+    def encode(self, image: NDArray[np.float32], colors: str = "exact") -> Gaussians:
+        """Return the set of an image at the size of the image."""
+
+    def dense_mean(self, width: int, height: int) -> NDArray[np.float32]:
+        """Return the pixels (height, width, C) of the mean image, in the space of the set."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """How `eigengs_dr.fit` fits; change it by `dataclasses.replace`.
+
+    Attributes
+    ----------
+    place : Placement
+        Where Gaussians start that have no other start.
+    controls : tuple of Control
+        What adds, moves and removes Gaussians, in this order.
+    optimizer : Optimizer
+    rates : mapping of str to float
+        Largest learning rate of every variable. With the coordinates `Relative`, the rates of mean
+        and factor are relative to the size of the Gaussian, and the unit of color is white, or the
+        range of data.
+    coordinates : Coordinates
+        The variables.
+    warm_up : int
+        Steps over which the rates rise after each start of the optimiser: at the first step, and
+        after a control has changed Gaussians. The moments start at 0 there, and the first steps of
+        Adam have full length whatever the gradient.
+    decay : float
+        Fraction of the rates at the end, after half a cosine.
+    drift : float
+        Sum of the largest rates after which the tile lists are built again. A build enlarges the
+        Gaussians by what they may move until the next build, see `Coordinates.reach`.
+    rate_exponent : float
+        Exponent by which the rates of means and shapes fall with the colour, see
+        `eigengs_dr.fitting.descent.rate_scale_of`.
+    solve_steps : int
+        Steps of conjugate gradients in the colour solve before the first step.
+    cutoff : float
+        Radius of a Gaussian in standard deviations, in (0, 12]; the set keeps it.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import eigengs_dr as eg
+    >>> eg.fit(eg.sample("coffee")[:32, :32], 50, 10, method=replace(eg.DEFAULT, cutoff=4.0))
+    Fit(50 Gaussians, 32x32 pixels, 10 iterations, ...)
+    """
+
+    place: Placement
+    controls: tuple[Control, ...]
+    optimizer: Optimizer
+    rates: Mapping[str, float]
+    coordinates: Coordinates
+    warm_up: int = 5
+    decay: float = 0.03
+    drift: float = 1.0
+    rate_exponent: float = 0.0
+    solve_steps: int = 10
+    cutoff: float = CUTOFF
+
+    def __post_init__(self) -> None:
+        if not 0 < self.cutoff <= MAX_CUTOFF:
+            raise ValueError(
+                f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
+            )
+        if self.solve_steps < 0:
+            raise ValueError(f"solve_steps is {self.solve_steps!r}; it must be at least 0")
+        if not self.rates or not all(rate > 0 for rate in self.rates.values()):
+            raise ValueError(f"rates are {dict(self.rates)}; each must be above 0")
+
+    def __repr__(self) -> str:
+        lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
+        return "\n".join([f"{type(self).__name__}(", *lines, ")"])
+
+    def rate_factor(self, step: int, iterations: int) -> float:
+        """Return the factor of the learning rates at a step: half a cosine down to `decay`."""
+        along = 0.5 * (1 + math.cos(math.pi * step / iterations))
+        return self.decay + (1 - self.decay) * along
+
+    def control(self, kind: type) -> Control | None:
+        """Return the first control of a type, if there is one."""
+        return next((c for c in self.controls if isinstance(c, kind)), None)
+
+    def without(self, *kinds: type) -> Method:
+        """Return the method without the controls of some types."""
+        return replace(self, controls=tuple(c for c in self.controls if not isinstance(c, kinds)))
+
+    def at_rates(self, factor: float) -> Method:
+        """Return the method with all learning rates times a factor."""
+        return replace(self, rates={name: factor * rate for name, rate in self.rates.items()})
+
+    def place_and_solve(self, objective: Pixels, count: int, seed: int = 0) -> Gaussians:
+        """Return Gaussians where the placement puts them, with the best colours for the image."""
+        placed = self.place(objective, count, self.cutoff, seed)
+        return placed if self.place.has_colors else solve(placed, objective, self.solve_steps)
+
+    def start_from(self, objective: Pixels, gaussians: Gaussians) -> Gaussians:
+        """Return a set with better colours for the image: the solve goes on from its own."""
+        return solve(gaussians, objective, self.solve_steps, warm_start=True)
+
+    needs_model = False
+    """Whether the start must be a model."""
+
+    def start_from_model(
+        self, objective: Pixels, model: Model, pixels: NDArray[np.float32]
+    ) -> tuple[Pixels, Gaussians]:
+        """Return the objective, and the Gaussians of a model with the best colours for the image.
+
+        At another size or cutoff the exact colours of the model are not the best.
+        """
+        found, native = replace(model.encode(pixels), cutoff=float(self.cutoff)), model.gaussians
+        same = (native.width, native.height, native.cutoff) == (*objective.size, self.cutoff)
+        return objective, found if same else self.start_from(objective, found)
+
+
+DEFAULT = Method(
+    place=Adaptive(),
+    controls=(Surplus(), Redistribute(), Relocate(), Perturb()),
+    optimizer=Adam(0.9, 0.9, 1e-12),
+    rates={"mean": 0.4, "factor": 0.22, "color": 0.0115},
+    coordinates=Relative(),
+    decay=0.045,
+    drift=1.4,
+    rate_exponent=0.8,
+)
+"""The method of this package."""

@@ -1,0 +1,432 @@
+"""The objective of a fit: what a picture of Gaussians shall come near to, on the device.
+
+An objective gives a quadratic model around a picture p: ``1/2 sum_x h(x) (p(x) - t(x))^2`` up to a
+constant, with a curvature ``h >= 0`` for every pixel. The derivative by the picture, the colour
+solve, the cost of a removal, the gain of an added Gaussian and the noise follow from the model, and
+none of them asks whether there are weights. For the squared error with weights, `Pixels`, the
+model is exact: t is the image and h the weight, once for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..backend.arrays import ArrayTypes, Float, types_of, upload
+from ..gaussian.gaussians import Gaussians, whole
+from ..image.color import LIGHT, rgb_to_ycbcr, to_linear, to_log
+from ..image.pixels import MAX_PIXEL
+from ..image.strips import by_strips
+from ..raster.binning.lists import TileLists
+from ..raster.binning.tiles import Grid
+from ..raster.kernels import channel_sums, forward, residual
+from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
+from ..raster.render import batch_to_tiles, bin_gaussians, pixels_inside, to_tensor
+
+Image = NDArray[np.float32]
+
+
+class Quadratic(NamedTuple):
+    """A quadratic model of a loss: ``1/2 sum_x h (p - t)^2`` for a picture p.
+
+    Attributes
+    ----------
+    target : Float, shape (pixels * channels,), or None
+        The picture t at which the model is least, in the tile layout of
+        `eigengs_dr.raster.kernels`; None for 0.
+    curvature : Float, shape (pixels,) or (pixels * channels,), or None
+        h for all channels of a pixel, or for each; None is 1 for all pixels of the image.
+    """
+
+    target: Float
+    curvature: Float | None = None
+
+    def compare(
+        self, packed: Float, background: list, lists: TileLists, radius: float
+    ) -> tuple[Float, list]:
+        """Return the derivative ``h (p - t)`` for a set, and the sums of ``h (p - t)^2``.
+
+        They come from one pass, `eigengs_dr.raster.kernels.residual`.
+        """
+        return residual(packed, background, lists, radius, self.target, self.curvature)
+
+    def curvatures(self, grid: Grid) -> Float:
+        """Return the curvature of every pixel, 0 outside the image: one value, or one a channel."""
+        if self.curvature is None:
+            return pixels_inside(types_of(self.target), grid)
+        return self.curvature
+
+    def mean_target(self, grid: Grid, channels: int) -> list:
+        """Return the mean of the target weighed by the curvature: a Float (images,) a channel."""
+        types = types_of(self.target)
+        if self.curvature is None:
+            area = dr.opaque(types.Float, 1 / (grid.width * grid.height))
+            return [s * area for s in channel_sums(self.target, channels, grid)]
+        index = dr.arange(types.UInt, dr.width(self.target))
+        own = dr.width(self.curvature) // (grid.tiles * grid.pixels)
+        h = dr.gather(types.Float, self.curvature, index // (channels // own))
+        weights, sums = (channel_sums(v, channels, grid) for v in (h, h * self.target))
+        return [dr.select(w > 0, s / w, 0) for s, w in zip(sums, weights, strict=True)]
+
+    def mean_curvature(self, grid: Grid, channels: int) -> Float:
+        """Return the mean of the curvature over the pixels and channels, a Float (images,)."""
+        types = types_of(self.target)
+        if self.curvature is None:
+            return dr.full(types.Float, 1, grid.images)
+        own = dr.width(self.curvature) // (grid.tiles * grid.pixels)
+        sums = channel_sums(self.curvature, own, grid)
+        return sum(sums) * dr.opaque(types.Float, 1 / (own * grid.width * grid.height))
+
+
+class Picture(NamedTuple):
+    """What some channels of a set show, for a PSNR.
+
+    Attributes
+    ----------
+    space : str
+        Space of the channels, one of `eigengs_dr.image.color.SPACES`.
+    image : Float
+        In tile layout: sRGB; or the data as they are fitted.
+    channels : slice
+        The channels of the set.
+    scale, offset : Float, shape (images,)
+        ``scale s + offset`` of a fitted value s is in units of the space; of data, with the peak 1.
+    weight : Float, shape (pixels,), or None
+        Factor of the squared errors, in tile layout.
+    base : Float or None
+        RGB that comes on top of the rendering, in tile layout.
+    has_codes : bool
+        Whether the values are shown as 8 bits: colours, normals, and data between 0 and 1.
+    """
+
+    space: str
+    image: Float
+    channels: slice
+    scale: Float
+    offset: Float
+    weight: Float | None = None
+    base: Float | None = None
+    has_codes: bool = True
+
+
+class Part(NamedTuple):
+    """A part of a picture, and of its Gaussians.
+
+    Attributes
+    ----------
+    own : slice
+        The Gaussians that may move.
+    core : (slice, slice)
+        The rows and columns to which they may move.
+    """
+
+    own: slice
+    core: tuple[slice, slice]
+
+
+class Affine(NamedTuple):
+    """The map from fitted values to those of the image: ``image = scale fitted + offset``."""
+
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+class Data(NamedTuple):
+    """An image in the space of its colours, before it is uploaded.
+
+    Attributes
+    ----------
+    values : ndarray of float32, shape (H, W, C)
+        As they are fitted.
+    shown : ndarray of float32, shape (H, W, C)
+        What places Gaussians: linear light would put too few of them into dark parts.
+    curvature : ndarray of float32, shape (H, W) or (H, W, C), or None
+    affine : Affine
+    """
+
+    values: Image
+    shown: Image
+    curvature: Image | None = None
+    affine: Affine = Affine()
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """The squared error of an image in the space of the colours, with weights.
+
+    One image, a batch of images, or several maps as the channels of one image.
+
+    Attributes
+    ----------
+    grid : Grid
+    channels : int
+    space : str
+        Space of the sets; "data" for maps, whose own spaces their pictures know.
+    model : Quadratic
+        ``h (p - t)^2`` with the image t and the weight h.
+    shown : Float
+        The image whose second derivatives place Gaussians, in tile layout.
+    pictures : tuple of Picture
+        What people look at, for the PSNRs of a trace.
+    levels : tuple of int
+        Numbers n: the first n Gaussians shall form the image too.
+    part : Part or None
+        What may move, where not all does.
+    """
+
+    grid: Grid
+    channels: int
+    space: str
+    model: Quadratic
+    shown: Float
+    pictures: tuple[Picture, ...] = ()
+    levels: tuple[int, ...] = ()
+    part: Part | None = None
+
+    @classmethod
+    def of(cls, data: Data | Sequence[Data], space: str, types: ArrayTypes) -> Pixels:
+        """Upload an image, or a batch of images of one size.
+
+        Parameters
+        ----------
+        data : Data, or sequence of Data
+        space : str
+        types : ArrayTypes
+            Backend and precision of the sets.
+        """
+        batch = [data] if isinstance(data, Data) else list(data)
+        height, width, channels = batch[0].values.shape
+
+        def upload(images: list[Image]) -> Float:
+            stacked = images[0] if len(images) == 1 else np.stack(images)
+            return batch_to_tiles(types, stacked if stacked.ndim > 2 else stacked[..., None])
+
+        values = upload([d.values for d in batch])
+        same = all(d.shown is d.values for d in batch)
+        shown = values if same else upload([d.shown for d in batch])
+        curvature = None
+        if batch[0].curvature is not None:
+            # 2-D weights are one for all channels
+            layers = [np.atleast_3d(d.curvature) for d in batch if d.curvature is not None]
+            curvature = upload(layers)
+        grid = Grid(width, height, images=len(batch))
+        return cls(grid, channels, space, Quadratic(values, curvature), shown)
+
+    @classmethod
+    def plain(cls, values: Image, gaussians: Gaussians) -> Pixels:
+        """Return the squared error of an image (H, W, C) in the space of some Gaussians."""
+        values = np.asarray(values, np.float32)
+        return cls.of(Data(values, values), gaussians.space, types_of(gaussians.mean))
+
+    @property
+    def types(self) -> ArrayTypes:
+        """Backend and precision."""
+        return types_of(self.model.target)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.grid.width, self.grid.height
+
+    def minus(self, gaussians: Gaussians) -> Pixels:
+        """Return the objective for Gaussians that are added to these, which stay as they are."""
+        lists = bin_gaussians(gaussians, adjoint=False)
+        packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
+        radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
+        left = self.model.target - forward(packed, background, lists, radius)
+        dr.eval(left)
+        return replace(self, model=self.model._replace(target=left), shown=left)
+
+    def picture(self, values: Float) -> Any:
+        """Return an image in tile layout as a tensor (H, W, C)."""
+        return to_tensor(values, self.grid, self.channels)
+
+
+# ---------------------------------------------------------------------------------------------
+#  From pixels to values: the space of the colours, units and weights
+# ---------------------------------------------------------------------------------------------
+
+DARKNESS, BLACK = 0.3, 0.003
+"""Exponent and smallest light I, with 1 for white, of the weight ``max(I, BLACK)^-(2 DARKNESS)`` of
+squared errors in linear light. It is about the slope of the sRGB curve,
+between errors of light, which neglect the dark, and errors of sRGB codes. With 5,000 Gaussians and
+300 steps it gains 0.7 dB of psnr_rgb over no weight, on 12 training images of ImageNet classes. It
+suits light above 1 too. Three made-up environments of 512x256 pixels, with a sun of 5,000, end at
+31.2 dB in PU21, at 29.6 without weights, at 31.5 with ``(I + 0.01)^-1``, at 29.9 and 25.5 dB
+with relative errors (0.1 and 0.01 added to I), and at 27.0 dB with the slope of PU21. Steep weights
+let bright spots vanish, which costs at most 1 a pixel, rather than spill on dark pixels."""
+
+GREY = 0.18
+"""Mean of light as it is fitted where it may exceed 1: the grey of photographers."""
+
+
+def values_in(pixels: Image, space: str) -> Image:
+    """Convert pixels (H, W, C), sRGB or data, to the space of the colours, without copies of data.
+
+    Cost: a pass in strips over the image.
+    """
+    if space == "ycbcr":
+        return by_strips(rgb_to_ycbcr, pixels)
+    if space in LIGHT:
+        return by_strips(to_linear, pixels)
+    if space == "log":
+        return by_strips(lambda part: to_log(to_linear(part)), pixels)
+    return pixels
+
+
+def data_of(
+    pixels: Image, space: str, weight: Image | None = None, affine: Affine | None = None
+) -> Data:
+    """Convert pixels (H, W, C) to the space of the colours, in units in which all images are alike.
+
+    Errors of light weigh more in the dark.
+
+    Parameters
+    ----------
+    pixels : ndarray of float32, shape (H, W, C)
+        sRGB, above 1 for light above 1; or data.
+    space : str
+    weight : ndarray of float32, shape (H, W) or (H, W, C), optional
+        Factor of the squared errors. Pixels without any weight may have any value.
+    affine : Affine, optional
+        The unit, if these are pixels of a larger image; by default that of the pixels.
+    """
+    values = values_in(pixels, space)
+    affine = affine or Extent.of(values).affine(space)
+    if affine != Affine():
+        values = (values - np.float32(affine.offset)) / np.float32(affine.scale)
+    if space in LIGHT:
+        return Data(values, pixels, _product(by_strips(dark_weight, values), weight), affine)
+    return Data(values, values, weight, affine)
+
+
+class Extent(NamedTuple):
+    """The smallest and the largest of some values, their sum and their number."""
+
+    low: float
+    high: float
+    total: float
+    number: int
+
+    @classmethod
+    def of(cls, values: Image) -> Extent:
+        """Return that of an array."""
+        total = float(values.sum(dtype=np.float64))
+        return cls(float(values.min()), float(values.max()), total, values.size)
+
+    def joined(self, other: Extent) -> Extent:
+        """Return that of both."""
+        low, high = min(self.low, other.low), max(self.high, other.high)
+        return Extent(low, high, self.total + other.total, self.number + other.number)
+
+    def affine(self, space: str) -> Affine:
+        """Return the unit in which values are fitted.
+
+        Data are shifted by their mean and divided by their range, since steps of colours have an
+        absolute length; so are logarithms of light. Light that may exceed 1 is divided by its mean.
+        """
+        mean, width = self.total / self.number, self.high - self.low
+        if space == "radiance":
+            return Affine(mean / GREY) if mean > 0 else Affine()
+        if space not in ("data", "log"):
+            return Affine()
+        # A constant image has no range; what rounding makes of its mean is none either.
+        flat = width <= 1e-6 * max(abs(self.low), abs(self.high))
+        return Affine(1.0 if flat else width, mean)
+
+    @property
+    def is_of_codes(self) -> bool:
+        """Whether data are codes between 0 and 1, as those of textures."""
+        return self.low >= 0 and MIN_CODE < self.high <= MAX_PIXEL
+
+
+MIN_CODE = 0.1
+"""Least largest value of data that count as codes between 0 and 1, as those of textures."""
+
+
+def picture(
+    types: ArrayTypes,
+    space: str,
+    pixels: Sequence[Image],
+    data: Sequence[Data],
+    weight: Image | None = None,
+    first: int = 0,
+    factor: float = 1.0,
+) -> Picture:
+    """Return what an image, or a batch of images, shows, for the PSNRs.
+
+    Data are measured with their range as the peak, or 1 if they are codes, see `is_codes`.
+
+    Parameters
+    ----------
+    types : ArrayTypes
+    space : str
+    pixels : sequence of ndarray of float32, shape (H, W, C)
+        sRGB, normals or data.
+    data : sequence of Data
+        The same as they are fitted.
+    weight : ndarray of float32, shape (H, W) or (H, W, C), optional
+        Factor of the squared errors.
+    first : int, optional
+        The first channel among those of a set.
+    factor : float, optional
+        Factor of the channels in the set.
+    """
+    affines, shown, codes = [d.affine for d in data], list(pixels), True
+    if space == "data":
+        shown = [d.values * np.float32(factor) for d in data]
+        codes = all(map(is_codes, pixels))
+        if not codes:
+            affines = [Affine(1.0, a.offset / a.scale) for a in affines]
+    batch = np.stack(shown) if len(shown) > 1 else shown[0]
+    weights = None
+    if weight is not None:
+        weights = batch_to_tiles(types, np.atleast_3d(weight).mean(axis=2, keepdims=True))
+    return Picture(
+        space,
+        batch_to_tiles(types, batch),
+        slice(first, first + batch.shape[-1]),
+        upload(types.Float, np.array([a.scale / factor for a in affines])),
+        upload(types.Float, np.array([a.offset for a in affines])),
+        weights,
+        has_codes=codes,
+    )
+
+
+def is_codes(data: Image) -> bool:
+    """Return whether data are codes between 0 and 1, as those of textures."""
+    return Extent.of(data).is_of_codes
+
+
+def dark_weight(light: Image) -> Image:
+    """Return the factors of squared errors in linear light, an array of any shape.
+
+    The factors are ``max(light, BLACK)^-(2 DARKNESS)``, with 1 for white.
+    """
+    return np.asarray(np.maximum(light, BLACK) ** (-2 * DARKNESS), np.float32)
+
+
+def _product(curvature: Image, weight: Image | None) -> Image:
+    if weight is None:
+        return curvature
+    return curvature * (weight if weight.ndim == 3 else weight[..., None])
+
+
+def restored(gaussians: Gaussians, affine: Affine) -> Gaussians:
+    """Return a set in the units of the image."""
+    if affine == Affine():
+        return gaussians
+    color, background = gaussians.color * affine.scale, gaussians.background * affine.scale
+    return replace(gaussians, color=color, background=background + affine.offset)
+
+
+def fitted(gaussians: Gaussians, affine: Affine) -> Gaussians:
+    """Return a set in the units of a fit: the inverse of `restored`."""
+    scale = 1 / affine.scale
+    background = (gaussians.background - affine.offset) * scale
+    return replace(gaussians, color=gaussians.color * scale, background=background)

@@ -1,0 +1,70 @@
+"""The variables of GaussianImage (Zhang et al., ECCV 2024), which EigenGS uses too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+
+from ..backend.arrays import Float, tanh, types_of
+from ..fitting.variables import ImageSize, Variables
+from ..gaussian.covariance import cholesky_from_factor, factor_from_cholesky
+from ..gaussian.gaussians import Gaussians
+
+CHOLESKY_BOUND = 0.5
+"""Pixels added to the diagonal of the Cholesky factor, as GaussianImage does."""
+
+MIN_DIAGONAL = 0.01
+"""Smallest diagonal entry of the Cholesky factor in pixels. GaussianImage has no such bound, but an
+entry that reaches 0 makes the covariance singular, and the set not finite."""
+
+
+@dataclass(frozen=True)
+class Cholesky:
+    """atanh of the mean in [-1, 1], Cholesky factor of the covariance in pixels, and colour."""
+
+    def encode(self, gaussians: Gaussians) -> Variables:
+        """Return the variables; see `eigengs_dr.fitting.variables.Coordinates`."""
+        types = types_of(gaussians.mean)
+        x, y = gaussians.mean
+        sides = (dr.opaque(types.Float, side) for side in (gaussians.width, gaussians.height))
+        width, height = sides
+        l1, l2, l3 = cholesky_from_factor(*gaussians.factor)
+        return {
+            "mean": types.Float2(_atanh(2 * x / width - 1), _atanh(2 * y / height - 1)),
+            "cholesky": types.Float3(l1 - CHOLESKY_BOUND, l2, l3 - CHOLESKY_BOUND),
+            "color": gaussians.color,
+        }
+
+    def decode(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Gaussians:
+        """Return the set; see `eigengs_dr.fitting.variables.Coordinates`."""
+        width, height = size or (fixed.width, fixed.height)
+        parts = {}
+        if "mean" in variables:
+            x, y = (0.5 * (tanh(v) + 1) for v in variables["mean"])
+            parts["mean"] = type(fixed.mean)(x * width, y * height)
+        if "cholesky" in variables:
+            l1, l2, l3 = variables["cholesky"]
+            factor = factor_from_cholesky(l1 + CHOLESKY_BOUND, l2, l3 + CHOLESKY_BOUND)
+            parts["factor"] = type(fixed.factor)(factor)
+        if "color" in variables:
+            parts["color"] = variables["color"]
+        return replace(fixed, **parts)
+
+    def project(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Variables:
+        """Bound the diagonal; see `eigengs_dr.fitting.variables.Coordinates`."""
+        if "cholesky" not in variables:
+            return variables
+        l1, l2, l3 = variables["cholesky"]
+        least = MIN_DIAGONAL - CHOLESKY_BOUND
+        inside = type(variables["cholesky"])(dr.maximum(l1, least), l2, dr.maximum(l3, least))
+        return {**variables, "cholesky": inside}
+
+    def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[Float, float]:
+        """Return how far ellipses reach; see `eigengs_dr.fitting.variables.Coordinates`."""
+        side = 0.5 * max(fixed.width, fixed.height)  # the slope of tanh is at most 1
+        return moves.get("mean", 0.0) * side + moves.get("cholesky", 0.0) * fixed.cutoff, 1.0
+
+
+def _atanh(x: Float) -> Float:
+    return dr.atanh(dr.clip(x, -0.999999, 0.999999))
