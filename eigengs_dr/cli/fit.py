@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 import eigengs_dr as eg
 
 from ..backend.selection import select
-from ..fitting import memory
-from ..fitting.options import INITS, PIXELS_PER_FIRST_GAUSSIAN, PRESETS, FitOptions, default_count
 from ..image.color import SPACES, rendered_as
 from ..image.metrics import float_space, target_key
 from . import options
@@ -24,8 +23,18 @@ from .console import FAILED, INTERRUPTED, MISSED, about, bar, open_cluster, say
 from .options import MapFile
 from .outputs import check_outputs, check_replaceable, claim, name_outputs, name_pictures
 
+if TYPE_CHECKING:
+    from ..fitting.method import Method
+    from ..fitting.options import FitOptions
+
 Record = dict[str, Any]
 """The figures of one image, for its lines in the terminal and for the report."""
+
+INITS = ("adaptive", "grid", "random")
+"""Names of placements."""
+
+PRESETS = ("default", "gaussianimage", "eigengs")
+"""Names of methods: ours, and those of two papers."""
 
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
@@ -40,19 +49,19 @@ NOT_OF_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster")
 @options.maps("A map of a material by name, instead of IMAGE; repeat for more.")
 @options.number("--gaussians", "Number of Gaussians.  [default: 5000]")
 @options.value("--target-psnr", "DB", float, "Find the fewest for this PSNR.")
-@options.choice("--target-space", ["rgb", "ycbcr"], "Space of --target-psnr for images.")
+@options.choice("--target-space", ["rgb", "ycbcr"], "Space of --target-psnr.", True)
 @options.number("--max-gaussians", "Limit for --target-psnr.")
 @options.value("--blocks", "SIZE", int, "Fit by blocks.  [default: 1024 where memory needs it]")
 @options.level_counts("Levels of detail, each 4 times larger, or the Gaussians up to each.")
 @options.number("--iterations", "Steps of optimisation.", 1000)
-@options.choice("--init", INITS, "Initial placement of the Gaussians.")
+@options.choice("--init", INITS, "Initial placement.  [default: adaptive]", True)
 @options.value("--basis", "NAME|FILE", str, "Model to start from: natural, or a file.")
 @options.choice("--preset", PRESETS, "Our method, or that of a paper.")
 @options.choice(
     "--space", SPACES, "Textures take linear, light above 1 log, normal maps normal, values data."
 )
 @options.encoding
-@options.number("--seed", "Seed of --init random.", 0)
+@options.number("--seed", "Seed of all random numbers.", 0)
 @options.value("--preview", "FILE", options.path, "Picture (or folder) of photo, fit and outlines.")
 @click.option("--overwrite", is_flag=True, help="Of several images, fit all again.")
 @options.shared("cluster", "backend", "report", "quiet")
@@ -110,9 +119,8 @@ def fit(
         _check_maps(run.context, images, output)
     elif not images:
         raise click.UsageError("no image is given; name image files, or maps with --map")
-    start = _model(basis, choices["preset"], run.backend)
-    settings = FitOptions(**choices, backend=run.backend, start=start)
     files = [m.path for m in maps.values()] or [f for given in images for f in _expand(given)]
+    settings = _settings(choices, basis, run.backend, files[0], bool(maps))
     several = not maps and (len(files) > 1 or files != list(images))
     if run.cluster and (preview or not (several or blocks)):
         raise ValueError("--cluster takes several images, or --blocks, and no --preview")
@@ -133,7 +141,7 @@ def fit(
         )
     if not run.cluster:
         select(run.backend)
-    if settings.method.mean == "dense":
+    if settings.method.needs_model:
         say("note: the file holds the Gaussians alone; the mean image stays in the basis")
     with open_cluster(run.cluster) as client:
         if several:
@@ -142,8 +150,8 @@ def fit(
             records = [_fit_by_blocks(run, files[0], outputs[0], blocks, settings, client)]
         else:
             records = [_fit_whole(run, maps or files[0], outputs[0], pictures[0], settings)]
-    decisive = {k: v for k, v in vars(settings).items() if k not in ("backend", "start")}
-    if start is not None:
+    decisive = dict(choices)
+    if settings.start is not None:
         decisive["basis"] = basis or DEFAULT_BASIS
     figures = {"images": records} if several else records[0]
     run.write_report(decisive | {"block": blocks} | figures)
@@ -164,11 +172,66 @@ def _check_maps(context: click.Context, images: Sequence[Path | str], output: Pa
         raise ValueError("--map needs -o, the .npz file to write")
 
 
-def _model(basis: str | None, preset: str, backend: str | None) -> eg.EigenGS | None:
-    """Return the model to start from: that of --basis, or what the preset of the paper needs."""
-    if basis is None and PRESETS[preset].mean != "dense":
-        return None
-    return eg.EigenGS.load(basis or DEFAULT_BASIS, backend)
+def _settings(
+    choices: dict[str, Any], basis: str | None, backend: str | None, first: Path | str, maps: bool
+) -> FitOptions:
+    """Return the options of a fit for the words of the command line.
+
+    `first` is the first image: levels by their number count on its size.
+    """
+    from ..fitting.options import FitOptions
+
+    method, start = _method(choices["preset"], choices["init"]), None
+    if basis is not None or method.needs_model:
+        start = eg.EigenGS.load(basis or DEFAULT_BASIS, backend)
+    if start is not None and choices["init"]:
+        raise ValueError(f"init {choices['init']!r} and a start exclude each other; give one")
+    target, count, levels = (choices[name] for name in ("target_psnr", "gaussians", "levels"))
+    goal = None
+    if target is not None:
+        goal = eg.Goal(target, choices["target_space"] or "rgb", choices["max_gaussians"])
+    elif choices["max_gaussians"] is not None or choices["target_space"]:
+        raise ValueError(
+            "max_gaussians and target_space belong to target_psnr; give target_psnr too"
+        )
+    if levels is not None:
+        if goal:
+            raise ValueError("levels and target_psnr exclude each other; give one of them")
+        if isinstance(levels, int) and count is None:
+            count = _default_count(first)
+        count = eg.level_counts(levels[-1] if count is None else count, levels)
+    return FitOptions(
+        gaussians=count,
+        iterations=choices["iterations"],
+        target_psnr=goal,
+        start=start,
+        space=None if maps else choices["space"],
+        method=method,
+        seed=choices["seed"],
+        backend=backend,
+        encoding=choices["encoding"],
+    )
+
+
+def _method(preset: str, init: str | None) -> Method:
+    """Return the method of a name, perhaps with the placement of another name."""
+    from ..fitting.place import Adaptive, Grid, Random
+    from ..paper.eigengs import EIGENGS
+    from ..paper.gaussianimage import GAUSSIANIMAGE
+
+    method = {"default": eg.DEFAULT, "gaussianimage": GAUSSIANIMAGE, "eigengs": EIGENGS}[preset]
+    if init is None:
+        return method
+    return replace(method, place={"adaptive": Adaptive(), "grid": Grid(), "random": Random()}[init])
+
+
+def _default_count(path: Path | str) -> int:
+    """Return the default number of Gaussians for an image, by the header of its file."""
+    from ..blocks.windows import image_size
+    from ..fitting.options import DEFAULT_COUNT, default_count
+
+    size = image_size(path)
+    return DEFAULT_COUNT if size is None else default_count(size[0] * size[1])
 
 
 def _expand(source: Path | str) -> Sequence[Path | str]:
@@ -192,18 +255,18 @@ def _fit_whole(
     settings: FitOptions,
 ) -> Record:
     """Fit one image or maps, write its files, and return its figures."""
-    started, choices = time.perf_counter(), dict(vars(settings))
+    started = time.perf_counter()
     claim(output)
     maps = source if isinstance(source, dict) else {}
     name = (output if isinstance(source, dict) else Path(source)).name
-    if maps:
-        choices["space"] = {name: m.space for name, m in maps.items() if m.space}
     with bar(run.quiet) as show, about("--map" if maps else str(source)):
         show(f"{name}: load", 0, 1)
-        image = load_images(source, settings.space, settings.encoding)
-        loaded = time.perf_counter()
+        image = load_images(source, settings.space or "ycbcr", settings.encoding)
+        loaded, given = time.perf_counter(), image
+        if maps:
+            given = {key: eg.Map(image[key], m.space) for key, m in maps.items()}
         try:
-            result = eg.fit(image, progress=partial(show, name), **choices)
+            result = eg.fit(given, progress=partial(show, name), **vars(settings))
         except eg.FitInterrupted as interrupt:
             result = interrupt.result
             say(f"interrupted; the best fit so far is in {output}")
@@ -215,7 +278,7 @@ def _fit_whole(
             eg.save_image(picture, _comparison(image, result))
     times = {"seconds_load": loaded - started, "seconds_total": time.perf_counter() - started}
     title = str(output if maps else source)
-    run.tell(*_summary(title, record | times, settings.target_space, picture))
+    run.tell(*_summary(title, record | times, settings, picture))
     return record | times
 
 
@@ -247,16 +310,17 @@ def _figures(result: eg.Fit | eg.LargeFit) -> Record:
 
 
 def _similarity(image: Any, result: eg.Fit) -> Record:
-    """Compare a fit with its image; data are in the unit of the fit, and maps have none."""
-    from ..fitting.target import unit_of
+    """Compare a fit with its image, where both are shown as codes; maps have no figures."""
+    from ..fitting.objective import is_codes
     from ..viewer.pictures import displayed
 
+    space = result.gaussians.space
     if result.maps:
         return {}
-    space = result.gaussians.space
     image = displayed(image, space)
-    unit = unit_of(image, space)
-    pair = image / unit, result.image / unit
+    if space == "data" and not is_codes(image):
+        return {}
+    pair = image, result.image
     ms_ssim = eg.ms_ssim(*pair, space="ycbcr" if rendered_as(space) else "data")
     return {"ssim": eg.ssim(*pair), "ms_ssim": ms_ssim}
 
@@ -278,7 +342,7 @@ def _comparison(image: Any, result: eg.Fit) -> Any:
 
 
 def _summary(
-    name: str, record: Record, target_space: str, picture: Path | None = None
+    name: str, record: Record, settings: FitOptions, picture: Path | None = None
 ) -> list[str]:
     """Describe a fit for a terminal."""
     blocks = f" in {record['blocks']} blocks" if "blocks" in record else ""
@@ -290,7 +354,7 @@ def _summary(
     if "seconds_total" in record:
         lines[0] += f" ({record['seconds_total']:.1f} s with loading and measuring)"
     for m in record.get("maps", []):
-        figure, value = _target_figure(m, target_space)
+        figure, value = _target_figure(m, settings)
         lines.append(
             f"  {m['name']} in {m['space']} (channels: {m['channels']}), {figure} {value:.2f} dB"
         )
@@ -305,12 +369,14 @@ def _summary(
 
 
 def _psnrs(space: str, floats: float, rgb: float) -> str:
-    return f"  psnr_{float_space(space)} {floats:.2f} dB, psnr_rgb {rgb:.2f} dB"
+    line = f"  psnr_{float_space(space)} {floats:.2f} dB"
+    # Data that are no codes have no PSNR of 8 bits.
+    return line if math.isnan(rgb) else f"{line}, psnr_rgb {rgb:.2f} dB"
 
 
-def _target_figure(record: Record, target_space: str) -> tuple[str, float]:
+def _target_figure(record: Record, settings: FitOptions) -> tuple[str, float]:
     """Return the name and the value of the PSNR that a target means."""
-    key = target_key(record["space"], target_space)
+    key = target_key(record["space"], settings.goal.space if settings.goal else "rgb")
     name = key if key == "psnr_rgb" else f"psnr_{float_space(record['space'])}"
     return name, record[key]
 
@@ -326,10 +392,11 @@ def _exit_code(records: list[Record], expected: int, settings: FitOptions) -> in
         if record["stopped"] != "out of reach":
             continue
         spaces = record.get("maps") or [{"space": settings.space} | record]
-        found = [(*_target_figure(m, settings.target_space), m.get("name")) for m in spaces]
+        found = [(*_target_figure(m, settings), m.get("name")) for m in spaces]
         figure, value, name = min(found, key=lambda entry: entry[1])
+        assert settings.goal
         say(
-            f"{record['output' if name else 'input']}: {settings.target_psnr:g} dB {figure} are "
+            f"{record['output' if name else 'input']}: {settings.goal.psnr:g} dB {figure} are "
             f"out of reach: {record['gaussians']} Gaussians have {value:.2f}"
             + (f" in {name}" if name else "")
             + "; lower --target-psnr, or raise --max-gaussians or --iterations"
@@ -361,7 +428,7 @@ def _fit_several(
             say(f"error: {row.error}")
         picture = picture_of[row.name]
         if picture and row.result and row.input:
-            image = load_images(row.input, settings.space, settings.encoding)
+            image = load_images(row.input, settings.space or "ycbcr", settings.encoding)
             eg.save_image(picture, _comparison(image, row.result))
         show(folder.name, done, total, row)
 
@@ -374,7 +441,8 @@ def _fit_several(
             rows = stop.rows
             done = f"{len(rows)} of {len(files)} images are done"
             say(f"interrupted; {done}; the same command fits the others")
-    run.tell(*_summary_of_all(rows, folder, time.perf_counter() - started, settings.space))
+    space, seconds = settings.space or "ycbcr", time.perf_counter() - started
+    run.tell(*_summary_of_all(rows, folder, seconds, space))
     known = [{k: v for k, v in vars(row).items() if v not in (None, "")} for row in rows]
     return [{"stopped": record["status"]} | record for record in known]
 
@@ -382,10 +450,21 @@ def _fit_several(
 def _given(context: click.Context, settings: FitOptions) -> dict[str, Any]:
     """Return the options that the command line gives, and what stands for the others."""
     default = click.core.ParameterSource.DEFAULT
-    names = [n for n in context.params if context.get_parameter_source(n) is not default]
+    words = [n for n in context.params if context.get_parameter_source(n) is not default]
+    names = {FIELD_OF.get(word, word) for word in words}
     if settings.start is not None:
-        names.append("start")
+        names.add("start")
     return {name: value for name, value in vars(settings).items() if name in names}
+
+
+FIELD_OF = {
+    "levels": "gaussians",
+    "init": "method",
+    "preset": "method",
+    "target_space": "target_psnr",
+    "max_gaussians": "target_psnr",
+}
+"""The field of `FitOptions` that an option of the command line changes, if it has another name."""
 
 
 def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space: str) -> list[str]:
@@ -420,8 +499,8 @@ COMFORTABLE = 0.5
 
 def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
     """Return whether these options have a fit by blocks."""
-    usual = settings.preset == "default" and settings.placement == "adaptive"
-    return usual and settings.target_psnr is None and settings.levels is None and preview is None
+    usual = settings.method == eg.DEFAULT and settings.start is None
+    return usual and settings.goal is None and not settings.levels and preview is None
 
 
 def _plan_memory(
@@ -439,15 +518,17 @@ def _plan_memory(
     """
     from ..blocks.fit_large import BLOCK_SIDE
     from ..blocks.windows import image_size
+    from . import memory
 
     size = image_size(path)
     if size is None:
         return None
     height, width, channels = size
-    count = settings.gaussians or default_count(width * height)
-    if settings.target_psnr is not None:  # the first try of the search
-        count = max(1, width * height // PIXELS_PER_FIRST_GAUSSIAN)
-    problem = width, height, channels if rendered_as(settings.space) is None else 3, count
+    pixels, data = width * height, rendered_as(settings.space or "ycbcr") is None
+    channels = channels if data else 3
+    first = settings.goal is not None
+    count = settings.first_try(pixels, channels) if first else settings.count_for(pixels)
+    problem = width, height, channels, count
     needed, usable = memory.estimate_memory(*problem), memory.usable_memory()
     if usable and needed > COMFORTABLE * usable and _has_blocks(settings, preview):
         say(f"{path}: a fit of the whole takes too much memory; it is fitted by blocks")
@@ -463,7 +544,7 @@ def _fit_by_blocks(
     run: options.Run, path: Path | str, output: Path, side: int, settings: FitOptions, client: Any
 ) -> Record:
     """Fit one image by blocks into a file; after an interrupt, blocks that are done wait there."""
-    names = ("gaussians", "iterations", "space", "solve_steps", "cutoff", "backend", "encoding")
+    names = ("gaussians", "iterations", "space", "method", "seed", "backend", "encoding")
     choices = {name: getattr(settings, name) for name in names}
     with bar(run.quiet) as show:
 
@@ -480,5 +561,5 @@ def _fit_by_blocks(
             )
             return {"input": path, "output": output, "stopped": "interrupted"}
     record = {"input": path, "output": output, "stopped": "iterations", **_figures(result)}
-    run.tell(*_summary(str(path), record, settings.target_space))
+    run.tell(*_summary(str(path), record, settings))
     return record | {"blocks_resumed": result.resumed}

@@ -106,8 +106,8 @@ def fit_many(
     -----
     Small images of one size that follow each other are fitted in groups, see
     `eigengs_dr.fitting.fit.fit_images`. On llvm a result equals that of `eigengs_dr.fit` bit for
-    bit, whatever the other images are. On cuda sums run in another order: long fits end some tenths of a
-    decibel apart, up or down.
+    bit, whatever the other images are. On cuda sums run in another order: long fits end some
+    tenths of a decibel apart, up or down.
 
     Examples
     --------

@@ -1,9 +1,9 @@
-"""The memory that a fit takes, said before it starts."""
+"""Estimate of the memory of a fit, before it starts."""
 
 from __future__ import annotations
 
+from ..fitting.control import Surplus
 from ..storage.memory import usable_memory
-from .schedule import MAX_SURPLUS, MAX_SURPLUS_DENSITY
 
 BASE_BYTES = 165e6
 """Memory of Python, libLLVM and the compiled programs. This and the constants below follow the
@@ -47,7 +47,8 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
         tiles and take more. It counts the largest surplus, which short fits do not have.
     """
     pixels = width * height
-    with_surplus = min((1 + MAX_SURPLUS) * gaussians, MAX_SURPLUS_DENSITY * pixels)
+    surplus = Surplus()
+    with_surplus = min((1 + surplus.share) * gaussians, surplus.max_density * pixels)
     return round(
         BASE_BYTES
         + pixels * (BYTES_PER_PIXEL + channels * BYTES_PER_VALUE)
