@@ -12,7 +12,7 @@ for every core.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -87,9 +87,12 @@ class TileLists:
         The same pairs by Gaussian, for the adjoint; None if they were not asked for.
     capacity : int
         Size of `splat`, for the same reason as in `Pieces`.
-    steep : bool
+    steep : bool or Bool, shape (1,)
         Whether weights take exponentials at every pixel, because a Gaussian is too narrow, a tile
         is not 4 pixels wide or exponentials cost less; see `eigengs_dr.raster.evaluate.weights`.
+        An array, from `steep_now`, decides on the device.
+    radius : float
+        Cutoff for which the lists were made, in the units of the factor.
     """
 
     grid: Grid
@@ -101,7 +104,20 @@ class TileLists:
     image: Any
     pieces: Pieces | None
     capacity: int
-    steep: bool
+    steep: Any
+    radius: float
+
+    def runs(self, begin: UInt, end: UInt) -> list[tuple[bool, Any, Any]]:
+        """Return the loops over ``[begin, end)``: whether it takes exponentials, begin and end.
+
+        Where the device decides, there are two, of which one is empty.
+        """
+        if isinstance(self.steep, bool):
+            return [(self.steep, begin, end)]
+        return [
+            (False, begin, dr.select(self.steep, begin, end)),
+            (True, begin, dr.select(self.steep, end, begin)),
+        ]
 
     def __repr__(self) -> str:
         width, height = self.grid.width, self.grid.height
@@ -173,9 +189,37 @@ def build_lists(
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
     order, begin, end = _lanes(types, grid, starts, ordered and share.ordered)
-    lists = TileLists(grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), steep)
+    lists = TileLists(
+        grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), steep, radius
+    )
     dr.eval(lists)
     return lists
+
+
+def steep_now(lists: TileLists, shape: list, radius: float) -> TileLists:
+    """Return lists for Gaussians that have changed since, some of which may be steep now.
+
+    Nothing is copied to the host, so that frozen programs can record it. A kernel then holds both
+    ways to evaluate weights, and the one that is taken gives the bits that it gives alone.
+
+    Parameters
+    ----------
+    lists : TileLists
+        With pieces.
+    shape : list of 5 Float, shape (N,)
+        The Gaussians as they are now.
+    radius : float
+    """
+    if lists.steep is True:
+        return lists
+    assert lists.pieces is not None
+    types = types_of(shape[0])
+    # All write the same. Dr.Jit does it in the kernel that packs the parameters: a reduction would
+    # take two more.
+    found = dr.zeros(types.UInt, 1)
+    dr.make_opaque(found)
+    dr.scatter(found, 1, types.UInt(0), is_steep(shape, radius) & (lists.pieces.number > 0))
+    return replace(lists, steep=found != 0)
 
 
 def _images(types: ArrayTypes, count: int, grid: Grid) -> Any:
