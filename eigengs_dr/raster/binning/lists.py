@@ -318,11 +318,11 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[
     """Return the order of the tiles, and the ranges of their lists in this order."""
     tile = dr.arange(types.UInt, grid.tiles)
     if ordered:
-        length = np.diff(starts.numpy().astype(np.int64))
-        x, y = np.arange(grid.nx) // TILE_WINDOW, np.arange(grid.ny) // TILE_WINDOW
+        length = np.diff(starts.numpy().view(np.int32))
+        x, y = (np.arange(n, dtype=np.int32) // TILE_WINDOW for n in (grid.nx, grid.ny))
         window = (x + y[:, None] * (x[-1] + 1)).ravel()
-        per_image = window[-1] + 1
-        window = (window + per_image * np.arange(grid.images)[:, None]).ravel()
+        images = np.arange(grid.images, dtype=np.int32)[:, None]
+        window = (window + (window[-1] + 1) * images).ravel()
         tile = upload(types.UInt, order_lanes(length, window))
     return tile, dr.gather(types.UInt, starts, tile), dr.gather(types.UInt, starts, tile + 1)
 
@@ -371,8 +371,9 @@ def _in_order(
     capacity = dr.width(splat)
     slot = dr.arange(types.UInt, capacity)
     if granularity_of(types).ordered:
-        lengths = (end - begin).numpy().astype(np.int64)
-        slot = upload(types.UInt, order_lanes(lengths, np.arange(capacity) // PIECE_WINDOW))
+        lengths = (end - begin).numpy().view(np.int32)
+        window = np.arange(capacity, dtype=np.int32) // PIECE_WINDOW
+        slot = upload(types.UInt, order_lanes(lengths, window))
         splat, begin, end = (dr.gather(types.UInt, v, slot) for v in (splat, begin, end))
     return Pieces(tile, splat, begin, end, slot, first, number, (dr.width(tile), capacity))
 
@@ -478,7 +479,7 @@ PACKET = 16
 """Lanes of a SIMD packet; those of AVX-512."""
 
 
-def order_lanes(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
+def order_lanes(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray[np.uint32]:
     """Return an order of lanes with like lengths in a packet, and packets dealt out evenly.
 
     Dr.Jit cuts a launch on llvm into blocks of neighbouring lanes, two for each core. Pieces leave
@@ -488,10 +489,10 @@ def order_lanes(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray
 
     Parameters
     ----------
-    length : ndarray of int64, shape (lanes,)
+    length : ndarray of int32, shape (lanes,)
         Work of each lane.
-    window : ndarray of int64, shape (lanes,)
-        Ascending numbers of the windows; a lane stays in its window, with its neighbours in space.
+    window : ndarray of int32, shape (lanes,)
+        Numbers of the windows; a lane stays in its window, with its neighbours in space.
 
     Returns
     -------
@@ -509,12 +510,21 @@ def order_lanes(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray
     return np.concatenate([packets.ravel(), order[dealt:]])
 
 
-def _descending(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the stable order by window, then by descending length."""
-    levels = int(length.max(initial=0)) + 1
-    keys = window * levels + (levels - 1 - length)
+def _descending(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray[np.uint32]:
+    """Return the stable order by window, then by descending length.
+
+    A counting sort. Each window has as many keys as its longest list has entries, and one: all
+    windows together have no more keys than the lists have entries, beside one for each window.
+    """
+    # Lanes of one window come in runs, the rows of its tiles.
+    changes = np.flatnonzero(window[1:] != window[:-1]) + 1
+    bounds = np.concatenate([[0], changes, [len(window)]])
+    owner = window[bounds[:-1]]
+    longest = np.zeros(int(owner.max()) + 1, np.int32)
+    np.maximum.at(longest, owner, np.maximum.reduceat(length, bounds[:-1]))
+    empty = np.cumsum(longest + 1, dtype=np.int32) - 1  # keys of lanes without work
+    keys = np.repeat(empty[owner], np.diff(bounds)) - length
     starts = np.arange(len(keys) + 1, dtype=np.int32)
-    order: NDArray[np.int32] = transpose_pattern(
-        keys.astype(np.int32), starts, (int(window.max()) + 1) * levels
-    ).indices
+    keys = keys.astype(np.int32, copy=False)
+    order: NDArray[np.int32] = transpose_pattern(keys, starts, int(empty[-1]) + 1).indices
     return order.view(np.uint32)
