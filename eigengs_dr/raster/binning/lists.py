@@ -108,9 +108,9 @@ class TileLists:
     radius: float
 
     def runs(self, begin: UInt, end: UInt) -> list[tuple[bool, Any, Any]]:
-        """Return the loops over ``[begin, end)``: whether it takes exponentials, begin and end.
+        """Return loops over ``[begin, end)``: whether each takes exponentials, its begin and end.
 
-        Where the device decides, there are two, of which one is empty.
+        Where the device decides, there are two, of which it leaves one empty.
         """
         if isinstance(self.steep, bool):
             return [(self.steep, begin, end)]
