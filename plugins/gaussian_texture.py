@@ -19,7 +19,7 @@ import numpy as np
 from eigengs_dr.backend.arrays import Bool
 from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.image.color import rendered_as
-from eigengs_dr.raster.lookup.points import fold, gradient_terms, sum_at_points
+from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, sum_at_points
 from eigengs_dr.raster.parameters import KernelParameters
 from eigengs_dr.raster.render import decode_parameters
 
@@ -204,6 +204,13 @@ def gaussian_texture() -> type:
             turned = self.transform.inverse_transpose
             inverse = tuple(turned[j, i] for i in range(2) for j in range(2))
             seen = seen_metric(si, inverse, self.angle)
+            if self.wrap == "clamp":  # a footprint beyond the border may see what lies inside
+                u, v = self.transform @ si.uv
+                x, y = (
+                    near_image(u * self.width, self.width),
+                    near_image(v * self.height, self.height),
+                )
+                sx = sy = type(x)(1)
             return sum_over_footprint(self.table, (x, sx), (y, sy), inside, seen)
 
         def point(self, uv: Any) -> tuple:

@@ -143,7 +143,7 @@ def make_table(
     background, pyramid = found["background"], None
     channels = len(background)
     if sizes is not None:
-        levels = levels_of(sizes.width, sizes.height)
+        levels = levels_of(sizes.width, sizes.height, sizes.wrap)
         pyramid = GaussianPyramid(sizes.wrap, channels, levels, found["values"])
     packed = Packed(found["packed"], channels, cutoff, found["arranged"])
     kept = replace(lists, finest=finest)
@@ -257,7 +257,8 @@ def sum_over_footprint(
     table : Table
         With a pyramid.
     column, row : tuple of 2 Float
-        x and y in pixels, with their slopes, from `eigengs_dr.raster.lookup.points.fold`.
+        x and y in pixels, with the slopes 1 or -1, from `eigengs_dr.raster.lookup.points.fold`, or
+        of a clamped image from `near_image`.
     active : Bool
     seen : tuple
         From `eigengs_dr.plugins.cone.seen_metric`.
@@ -267,8 +268,7 @@ def sum_over_footprint(
     list of Float
         One sum for each channel, without the background.
     """
-    # The slopes of `fold` turn a footprint in mirrored images. They also take away its width along
-    # an axis on which the point lies outside of a clamped image.
+    # The slopes of `fold` turn a footprint in mirrored images.
     (x, sx), (y, sy) = column, row
     sizes, pyramid = table.lists.sizes, table.pyramid
     assert sizes and pyramid
@@ -277,7 +277,8 @@ def sum_over_footprint(
     unit, blind = bound_covariance(inverse)
     squares = (sx * sx, sx * sy, sy * sy)
     footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, squares, strict=True)]
-    blind &= valid & (sx * sy != 0)
+    # Of a clamped image, the mean is nowhere seen: the largest footprint has its border too.
+    blind &= valid & (sizes.wrap != "clamp")
     distant = is_minified(pyramid, footprint)
     near, wide = active & ~distant, active & distant & ~blind
 

@@ -91,7 +91,7 @@ def adjoint_pieces(
     shape, block = splat[:NUM_SHAPE_PARAMS], (tile_size[0], rows)
     length, images = block[0] * rows, _images_in(factors, lists)
 
-    def add_tile(i: UInt, sums: list) -> tuple:
+    def add_tile(steep: bool, end: UInt, i: UInt, sums: list) -> tuple:
         active = i < end
         tile = gather_index(types, pieces.tile, i, active)
         d = gather_run(types, delta, tile * shares + part, length * channels, active)
@@ -110,22 +110,27 @@ def adjoint_pieces(
             own, f = sums[channels:], []
             if images:
                 f = gather_run(types, factors, tile * shares + part, length * images, active)
-            for k, w in enumerate(weights(shape, x, y, block, radius, lists.steep)):
+            for k, w in enumerate(weights(shape, x, y, block, radius, steep)):
                 cotangent(k, w)
                 square = dr.square(w)
                 own = [dr.fma(square, f[k * images + n], s) for n, s in enumerate(own)]
             return i + 1, color + own
-        gradient = weights_vjp(shape, x, y, block, radius, cotangent, lists.steep)
+        gradient = weights_vjp(shape, x, y, block, radius, cotangent, steep)
         return i + 1, [s + g for s, g in zip(sums, gradient, strict=False)] + color
 
+    def run(steep: bool, begin: UInt, end: UInt, sums: list) -> list:
+        return dr.while_loop(
+            (types.UInt(begin), sums),
+            lambda i, sums: i < end,
+            lambda i, sums: add_tile(steep, end, i, sums),
+            label="pull back",
+            max_iterations=-1,
+        )[-1]
+
     number = channels + (images if color_only else NUM_SHAPE_PARAMS)
-    sums = dr.while_loop(
-        (types.UInt(begin), [types.Float(0) for _ in range(number)]),
-        lambda i, sums: i < end,
-        add_tile,
-        label="pull back",
-        max_iterations=-1,
-    )[-1]
+    sums = [types.Float(0) for _ in range(number)]
+    for steep, first, last in lists.runs(begin, end):
+        sums = run(steep, first, last, sums)
     stride = -(-number // 4) * 4
     parts = dr.empty(types.Float, stride * shares * dr.width(pieces.slot))
     values = [*sums, *[types.Float(0)] * (stride - number)]

@@ -94,32 +94,38 @@ def _sum_blocks(
         spread = weights(shape, blocks.x, blocks.y, blocks.size, radius, steep)
         return [(w, c) for w in spread for c in color]
 
-    def add(i: UInt, sums: list) -> tuple:
-        active = i < blocks.end
-        n = gather_index(types, lists.splat, i, active)
-        p = unpack_parameters(packed, n, number, active)
-        terms = contributions(p, lists.steep)
-        return i + 1, [dr.fma(w, c, s) for (w, c), s in zip(terms, sums, strict=True)]
+    def run(steep: bool, begin: UInt, end: UInt, sums: list) -> list:
+        def gather(i: UInt, source: Float) -> list:
+            active = i < end
+            n = gather_index(types, lists.splat, i, active)
+            return unpack_parameters(source, n, number, active)
 
-    def add_tangent(i: UInt, sums: list) -> tuple:
-        active = i < blocks.end
-        n = gather_index(types, lists.splat, i, active)
-        p = unpack_parameters(packed, n, number, active)
-        with dr.resume_grad():
-            dr.enable_grad(p)
-            dr.set_grad(p, unpack_parameters(tangent, n, number, active))
-            out = [w * c for w, c in contributions(p, True)]
-            dr.forward_to(out)
-            change = dr.grad(out)
-        return i + 1, [s + d for s, d in zip(sums, change, strict=True)]
+        def add(i: UInt, sums: list) -> tuple:
+            terms = contributions(gather(i, packed), steep)
+            return i + 1, [dr.fma(w, c, s) for (w, c), s in zip(terms, sums, strict=True)]
 
-    sums: list = dr.while_loop(
-        (types.UInt(blocks.begin), [types.Float(b) for _ in range(blocks.pixels) for b in start]),
-        lambda i, sums: i < blocks.end,
-        add if tangent is None else add_tangent,
-        label="sum splats",
-        max_iterations=-1,
-    )[-1]
+        def add_tangent(i: UInt, sums: list) -> tuple:
+            p = gather(i, packed)
+            with dr.resume_grad():
+                dr.enable_grad(p)
+                dr.set_grad(p, gather(i, tangent))
+                out = [w * c for w, c in contributions(p, True)]
+                dr.forward_to(out)
+                change = dr.grad(out)
+            return i + 1, [s + d for s, d in zip(sums, change, strict=True)]
+
+        return dr.while_loop(
+            (types.UInt(begin), sums),
+            lambda i, sums: i < end,
+            add if tangent is None else add_tangent,
+            label="sum splats",
+            max_iterations=-1,
+        )[-1]
+
+    sums = [types.Float(b) for _ in range(blocks.pixels) for b in start]
+    runs = lists.runs(blocks.begin, blocks.end)
+    for steep, begin, end in runs if tangent is None else [(True, blocks.begin, blocks.end)]:
+        sums = run(steep, begin, end, sums)
     return sums
 
 

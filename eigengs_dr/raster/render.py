@@ -21,10 +21,11 @@ from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
 from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
-from .binning.lists import TileLists, build_lists
+from .binning.lists import TileLists, build_lists, steep_now
 from .binning.tiles import TILE, Grid
 from .kernels import channel_sums, forward
 from .parameters import (
+    EXP2_SCALE,
     KernelParameters,
     detached_shape,
     gather_run,
@@ -60,7 +61,8 @@ def render(
         Standard deviations at which a Gaussian ends, in (0, 12]; by default the cutoff of the set.
     lists : TileLists, optional
         What `tile_lists` returned for this set, its size and its cutoff, or for a set that it was
-        a few steps ago. By default they are made anew, which `drjit.freeze` cannot record.
+        a few steps ago. The Gaussians may have shrunk since, as far as they like. By default lists
+        are made anew, which `drjit.freeze` cannot record.
 
     Returns
     -------
@@ -71,8 +73,8 @@ def render(
     ------
     ValueError
         If a side is not positive, the image is too large to index by 32 bits, the cutoff is not
-        in (0, 12], the lists are of another size or number of Gaussians, or `drjit.freeze` records
-        without lists.
+        in (0, 12], the lists are of another size, cutoff or number of Gaussians, or `drjit.freeze`
+        records without lists.
 
     Notes
     -----
@@ -95,6 +97,7 @@ def render(
     parameters = decode_parameters(scaled)
     if lists is not None:
         _check_lists(lists, scaled)
+        lists = steep_now(lists, dr.detach(parameters.shape), kernel_radius(scaled.cutoff))
     elif dr.flag(dr.JitFlag.FreezingScope):
         raise ValueError(
             "render: drjit.freeze cannot record how tile lists are made; make them by "
@@ -120,7 +123,8 @@ def tile_lists(
 
     Lists carry no derivatives. Within the margin, a tile that a Gaussian newly reaches is listed
     already. Beyond it the rendering misses that Gaussian there, and so do the derivatives: make the
-    lists anew every few steps.
+    lists anew every few steps. A Gaussian may shrink by any factor: whether one has become so
+    narrow that weights need exponentials at every pixel is found on the device in each rendering.
 
     Parameters
     ----------
@@ -202,7 +206,7 @@ def _check_rows(gaussians: Gaussians) -> None:
 
 
 def _check_lists(lists: TileLists, gaussians: Gaussians) -> None:
-    """Raise ValueError for lists of another size or number of Gaussians."""
+    """Raise ValueError for lists of another size, number of Gaussians or cutoff."""
     assert lists.pieces is not None
     found = lists.grid.width, lists.grid.height, dr.width(lists.pieces.number)
     wanted = gaussians.width, gaussians.height, len(gaussians)
@@ -210,6 +214,11 @@ def _check_lists(lists: TileLists, gaussians: Gaussians) -> None:
         raise ValueError(
             "render: the lists are of {}x{} pixels and {} Gaussians, ".format(*found)
             + "the rendering has {}x{} and {}; make them anew by tile_lists".format(*wanted)
+        )
+    if lists.radius != kernel_radius(gaussians.cutoff):
+        raise ValueError(
+            f"render: the lists are of the cutoff {lists.radius / EXP2_SCALE:g}, the rendering has "
+            f"{gaussians.cutoff:g}; make them anew by tile_lists"
         )
 
 

@@ -18,6 +18,11 @@ def some_points(count=60, size=SIZE, seed=3):
     return points.astype(np.float32).astype(np.float64)
 
 
+def around(points, wrap, size=SIZE):
+    """Points of a clamped image also outside of it, up to its own size."""
+    return points * 3 - size if wrap == "clamp" else points
+
+
 def exact_at(scene, points, cutoff, margin=1e-4):
     """The sum in float64 without background, (points, C), and which points are off all edges."""
     delta = points[:, None] - scene.mean
@@ -44,7 +49,17 @@ def check_gradient(loss, scene, name, backend):
 
 
 def tiled(scene, wrap, copies=3):
-    """The picture and copies of it on every side, at `FINE` samples a pixel."""
+    """The picture and copies of it on every side, at `FINE` samples a pixel.
+
+    A clamped one has the values of the outermost centres of pixels beyond them.
+    """
+    if wrap == "clamp":
+        axes = [np.clip((np.arange(n * FINE) + 0.5) / FINE, 0.5, n - 0.5) for n in scene.size]
+        points = np.stack(np.meshgrid(*axes), axis=2)
+        image = exact_at(scene, points.reshape(-1, 2), CUTOFF)[0] + scene.background
+        image = image.reshape(*points.shape[:2], -1)
+        more = [(copies * n * FINE,) * 2 for n in scene.size[::-1]]
+        return np.pad(image, [*more, (0, 0)], mode="edge"), copies
     image = render_exact(
         scene.mean * FINE,
         scene.factor / FINE,

@@ -56,6 +56,19 @@ def test_oblong_family(backend):
         assert model.dense_mean(7, 9).shape == (9, 7, 3)
 
 
+@pytest.mark.parametrize("empty", [(0,), (1, 2), (0, 1, 2)])
+def test_channels_without_coefficients_are_those_of_the_mean(backend, empty):
+    """And change no other channel."""
+    model = small_model(backend)
+    some = [np.ones(min(2, k), np.float32) for k in model.components]
+    mean, full = (model.reconstruct(c).to_arrays() for c in ([[]] * 3, some))
+    found = model.reconstruct([[] if c in empty else a for c, a in enumerate(some)]).to_arrays()
+    for name in ("color", "background"):
+        wanted = np.where(np.isin(np.arange(3), empty), mean[name], full[name])
+        np.testing.assert_array_equal(found[name], wanted)
+    np.testing.assert_array_equal(mean["color"], model.gaussians.to_arrays()["color"])
+
+
 # --- Encode ------------------------------------------------------------------------------------
 
 

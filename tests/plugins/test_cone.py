@@ -6,8 +6,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from _helpers.footprints import brute_force
 from _helpers.poster import camera
-from _helpers.texture import at, gaussians, in_front, mi, texture
+from _helpers.sets import SIZE, random_scene
+from _helpers.texture import at, backend, gaussians, in_front, mi, texture
 from eigengs_dr.plugins import pixel_angle, texture_of
 from eigengs_dr.plugins.cone import PIXEL, metric
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance
@@ -105,23 +107,29 @@ class TestPlane:
             errors.append(np.square(images - reference).mean())
         assert errors[0] < 0.35 * errors[1]
 
-    @pytest.mark.parametrize(("angle", "scale"), [(0.05, 3), (0.3, 3), (0.9, 3), (0.5, 1)])
-    @pytest.mark.parametrize("outside", ["v", "both"])
-    def test_clamped_outside_it_sees_the_border(self, angle, scale, outside):
-        """Blurred along the border, not with what lies inside of it."""
-        g = gaussians("linear")
-        g.color *= 3
-        width = PIXEL * angle / scale
-        along = 0.5 + width * np.linspace(-3, 3, 61) if outside == "v" else np.array([1.7])
-        weight = np.exp(-0.5 * np.linspace(-3, 3, len(along)) ** 2)
-        mirrored = 1 - np.abs(1 - along % 2) if outside == "v" else along
-        border = texture(g, wrap_mode="clamp").eval(at(mi.Float(np.float32(mirrored)), 1.4))
-        expected = np.average(np.array(border), axis=1, weights=weight)
-        si = facing(t=1.0)
-        si.dp_du, si.dp_dv = mi.Vector3f(scale, 0, 0), mi.Vector3f(0, scale, 0)
-        si.uv = mi.Point2f(0.5 if outside == "v" else 1.7, 1.4)
-        found = texture(g, wrap_mode="clamp", prefilter=angle).eval(si)
-        np.testing.assert_allclose(np.ravel(found), expected, atol=0.01)
+    @pytest.mark.parametrize("angle", [0.03, 0.3, 0.9])
+    @pytest.mark.parametrize(("u", "v"), [(None, 0.4), (0.3, None), (None, 1.4), (-1.2, None)])
+    def test_clamped_it_sees_the_centres_of_outer_pixels_continued(self, angle, u, v):
+        """Along a line across the image and far beyond, against brute force, and without a jump."""
+        scene, line = random_scene(), np.linspace(-1, 2, 1201)
+        uv = np.stack([line if k is None else np.full_like(line, k) for k in (u, v)], axis=1)
+        tex = texture(scene.on(backend()), wrap_mode="clamp", raw=True, cutoff=5.0, prefilter=angle)
+        si = in_front(at(*(mi.Float(np.float32(k)) for k in uv.T.copy())))
+        found = np.array(tex.eval(si)).T
+        covariance = np.diag((PIXEL * angle * np.array(SIZE)) ** 2)
+        exact = brute_force(scene, "clamp", (uv * SIZE)[::40], covariance)
+        np.testing.assert_allclose(found[::40], exact, atol=0.02)
+        assert np.abs(np.diff(found, axis=0)).max() < 0.02 + 0.02 / angle / 12
+
+    @pytest.mark.parametrize("scale", [1e3, 1e6])
+    def test_clamped_from_afar_it_does_not_jump_to_the_mean(self, scale):
+        """The largest footprint sees the border too, which the mean does not know."""
+        scene = random_scene()
+        tex = texture(scene.on(backend()), wrap_mode="clamp", raw=True, cutoff=5.0, prefilter=0.5)
+        found = np.array(tex.eval(in_front(at(0.4, 0.6), scale))).T
+        covariance = np.diag((MAX_FOOTPRINT * np.array(SIZE)) ** 2)
+        exact = brute_force(scene, "clamp", np.array([[0.4, 0.6]]) * SIZE, covariance)
+        np.testing.assert_allclose(found, exact, atol=0.02)
 
     def test_a_footprint_that_sees_all_sees_the_mean(self):
         g = gaussians("linear")

@@ -92,3 +92,39 @@ def test_nothing_is_freed_while_a_user_records(backend):
     assert not seen
     with eg.exclusive():
         assert freed
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_gaussian_that_shrinks_to_an_eighth_of_a_pixel_is_drawn(backend, frozen):
+    """With lists of before, plain or replayed, also in the gradient; and it may grow again."""
+    scene = random_scene(count=30)
+    scene.factor[:] /= 4
+    scene.mean[0] = 7.5, 8.5
+    wide = scene.on(backend)
+    scene.factor[0] = 8, 0, 8
+    narrow, exact, sure = scene.on(backend), scene.exact(3.0), scene.off_edge(3.0)
+    lists = eg.tile_lists(wide)
+    assert lists.steep == (backend != "llvm")
+    assert not sure.all() and sure[8, 7] and np.abs(exact[8, 7] - scene.background).max() > 0.1
+
+    def program(g, lists):
+        return step(g, lists, ())
+
+    frozen_program = dr.freeze(program) if frozen else program
+    for g in (wide, narrow, wide, narrow):
+        found, wanted = frozen_program(g, lists), step(g, None, ())
+        np.testing.assert_allclose(found[0].numpy(), wanted[0].numpy(), atol=1e-5)
+        for name in NAMES:
+            pair = [getattr(gradient, name).numpy() for gradient in (found[1], wanted[1])]
+            np.testing.assert_allclose(*pair, rtol=1e-4, atol=1e-4)
+        if g is wide:  # nobody is steep: the bits of fresh lists
+            np.testing.assert_array_equal(found[0].numpy(), wanted[0].numpy())
+    np.testing.assert_allclose(found[0].numpy()[sure], exact[sure], atol=1e-5)
+
+
+def test_lists_of_another_cutoff_are_refused(backend):
+    g = on(backend)
+    lists = eg.tile_lists(g, cutoff=2)
+    eg.render(g, cutoff=2, lists=lists)
+    with pytest.raises(ValueError, match=r"the lists are of the cutoff 2, the rendering has 3; "):
+        eg.render(g, cutoff=3, lists=lists)

@@ -12,7 +12,7 @@ for every core.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -87,9 +87,12 @@ class TileLists:
         The same pairs by Gaussian, for the adjoint; None if they were not asked for.
     capacity : int
         Size of `splat`, for the same reason as in `Pieces`.
-    steep : bool
+    steep : bool or Bool, shape (1,)
         Whether weights take exponentials at every pixel, because a Gaussian is too narrow, a tile
         is not 4 pixels wide or exponentials cost less; see `eigengs_dr.raster.evaluate.weights`.
+        An array, from `steep_now`, decides on the device.
+    radius : float
+        Cutoff for which the lists were made, in the units of the factor.
     """
 
     grid: Grid
@@ -101,7 +104,20 @@ class TileLists:
     image: Any
     pieces: Pieces | None
     capacity: int
-    steep: bool
+    steep: Any
+    radius: float
+
+    def runs(self, begin: UInt, end: UInt) -> list[tuple[bool, Any, Any]]:
+        """Return loops over ``[begin, end)``: whether each takes exponentials, its begin and end.
+
+        Where the device decides, there are two, of which it leaves one empty.
+        """
+        if isinstance(self.steep, bool):
+            return [(self.steep, begin, end)]
+        return [
+            (False, begin, dr.select(self.steep, begin, end)),
+            (True, begin, dr.select(self.steep, end, begin)),
+        ]
 
     def __repr__(self) -> str:
         width, height = self.grid.width, self.grid.height
@@ -173,9 +189,37 @@ def build_lists(
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
     order, begin, end = _lanes(types, grid, starts, ordered and share.ordered)
-    lists = TileLists(grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), steep)
+    lists = TileLists(
+        grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), steep, radius
+    )
     dr.eval(lists)
     return lists
+
+
+def steep_now(lists: TileLists, shape: list, radius: float) -> TileLists:
+    """Return lists for Gaussians that have changed since, some of which may be steep now.
+
+    Nothing is copied to the host, so that frozen programs can record it. A kernel then holds both
+    ways to evaluate weights, and the one that is taken gives the bits that it gives alone.
+
+    Parameters
+    ----------
+    lists : TileLists
+        With pieces.
+    shape : list of 5 Float, shape (N,)
+        The Gaussians as they are now.
+    radius : float
+    """
+    if lists.steep is True:
+        return lists
+    assert lists.pieces is not None
+    types = types_of(shape[0])
+    # All write the same. Dr.Jit does it in the kernel that packs the parameters: a reduction would
+    # take two more.
+    found = dr.zeros(types.UInt, 1)
+    dr.make_opaque(found)
+    dr.scatter(found, 1, types.UInt(0), is_steep(shape, radius) & (lists.pieces.number > 0))
+    return replace(lists, steep=found != 0)
 
 
 def _images(types: ArrayTypes, count: int, grid: Grid) -> Any:
@@ -274,11 +318,11 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[
     """Return the order of the tiles, and the ranges of their lists in this order."""
     tile = dr.arange(types.UInt, grid.tiles)
     if ordered:
-        length = np.diff(starts.numpy().astype(np.int64))
-        x, y = np.arange(grid.nx) // TILE_WINDOW, np.arange(grid.ny) // TILE_WINDOW
+        length = np.diff(starts.numpy().view(np.int32))
+        x, y = (np.arange(n, dtype=np.int32) // TILE_WINDOW for n in (grid.nx, grid.ny))
         window = (x + y[:, None] * (x[-1] + 1)).ravel()
-        per_image = window[-1] + 1
-        window = (window + per_image * np.arange(grid.images)[:, None]).ravel()
+        images = np.arange(grid.images, dtype=np.int32)[:, None]
+        window = (window + (window[-1] + 1) * images).ravel()
         tile = upload(types.UInt, order_lanes(length, window))
     return tile, dr.gather(types.UInt, starts, tile), dr.gather(types.UInt, starts, tile + 1)
 
@@ -327,8 +371,9 @@ def _in_order(
     capacity = dr.width(splat)
     slot = dr.arange(types.UInt, capacity)
     if granularity_of(types).ordered:
-        lengths = (end - begin).numpy().astype(np.int64)
-        slot = upload(types.UInt, order_lanes(lengths, np.arange(capacity) // PIECE_WINDOW))
+        lengths = (end - begin).numpy().view(np.int32)
+        window = np.arange(capacity, dtype=np.int32) // PIECE_WINDOW
+        slot = upload(types.UInt, order_lanes(lengths, window))
         splat, begin, end = (dr.gather(types.UInt, v, slot) for v in (splat, begin, end))
     return Pieces(tile, splat, begin, end, slot, first, number, (dr.width(tile), capacity))
 
@@ -434,7 +479,7 @@ PACKET = 16
 """Lanes of a SIMD packet; those of AVX-512."""
 
 
-def order_lanes(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
+def order_lanes(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray[np.uint32]:
     """Return an order of lanes with like lengths in a packet, and packets dealt out evenly.
 
     Dr.Jit cuts a launch on llvm into blocks of neighbouring lanes, two for each core. Pieces leave
@@ -444,10 +489,10 @@ def order_lanes(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray
 
     Parameters
     ----------
-    length : ndarray of int64, shape (lanes,)
+    length : ndarray of int32, shape (lanes,)
         Work of each lane.
-    window : ndarray of int64, shape (lanes,)
-        Ascending numbers of the windows; a lane stays in its window, with its neighbours in space.
+    window : ndarray of int32, shape (lanes,)
+        Numbers of the windows; a lane stays in its window, with its neighbours in space.
 
     Returns
     -------
@@ -465,12 +510,21 @@ def order_lanes(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray
     return np.concatenate([packets.ravel(), order[dealt:]])
 
 
-def _descending(length: NDArray[np.int64], window: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the stable order by window, then by descending length."""
-    levels = int(length.max(initial=0)) + 1
-    keys = window * levels + (levels - 1 - length)
+def _descending(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray[np.uint32]:
+    """Return the stable order by window, then by descending length.
+
+    A counting sort. Each window has as many keys as its longest list has entries, and one: all
+    windows together have no more keys than the lists have entries, beside one for each window.
+    """
+    # Lanes of one window come in runs, the rows of its tiles.
+    changes = np.flatnonzero(window[1:] != window[:-1]) + 1
+    bounds = np.concatenate([[0], changes, [len(window)]])
+    owner = window[bounds[:-1]]
+    longest = np.zeros(int(owner.max()) + 1, np.int32)
+    np.maximum.at(longest, owner, np.maximum.reduceat(length, bounds[:-1]))
+    empty = np.cumsum(longest + 1, dtype=np.int32) - 1  # keys of lanes without work
+    keys = np.repeat(empty[owner], np.diff(bounds)) - length
     starts = np.arange(len(keys) + 1, dtype=np.int32)
-    order: NDArray[np.int32] = transpose_pattern(
-        keys.astype(np.int32), starts, (int(window.max()) + 1) * levels
-    ).indices
+    keys = keys.astype(np.int32, copy=False)
+    order: NDArray[np.int32] = transpose_pattern(keys, starts, int(empty[-1]) + 1).indices
     return order.view(np.uint32)

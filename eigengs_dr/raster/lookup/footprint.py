@@ -13,7 +13,7 @@ from .points import Packed, Terms, in_list_order
 
 MAX_FOOTPRINT = 0.4
 """Largest standard deviation of a footprint, in widths and heights of the texture. A footprint that
-has it in all directions gets the mean of the texture: it would keep at most
+has it in all directions gets the mean of a texture that repeats: it would keep at most
 ``exp(-(2 pi MAX_FOOTPRINT)^2 / 2)`` = 4 % of the coarsest wave of a repeating texture."""
 
 
@@ -51,13 +51,16 @@ def bound_covariance(metric: list) -> tuple[list, Bool]:
 
 
 def inside_share(
-    shape: list, footprint: list, x: Float, y: Float, width: int, height: int
+    shape: list, footprint: list, center: tuple, spans: list, at: tuple, free: list
 ) -> Float:
-    """Return the part of the product of a footprint and a Gaussian that lies in the image.
+    """Return the part of the product of a footprint and a Gaussian that lies in a rectangle.
 
     The product is a Gaussian with the mean ``x - Sigma_f Sigma'^-1 (x - mu)`` and the covariance
     ``Sigma_f - Sigma_f Sigma'^-1 Sigma_f``. The masses in the vertical and the horizontal strip of
-    the image are multiplied. The result is exact except near corners.
+    the rectangle are multiplied. The result is exact except near corners.
+
+    Beyond the border of a clamped image, a Gaussian is constant across the border. It then has the
+    precision 0 along this axis, and along the other one its mean at the border.
 
     Parameters
     ----------
@@ -65,10 +68,14 @@ def inside_share(
         The widened Gaussian, from `eigengs_dr.raster.evaluate.widen`.
     footprint : list of 3 Float
         As for `eigengs_dr.raster.evaluate.widen`.
-    x, y : Float
+    center : (Float, Float)
         Centre of the footprint, in pixels.
-    width, height : int
-        Size of the image, in pixels.
+    spans : list of (Float, Float)
+        Ends of the rectangle along x and along y.
+    at : (Float, Float)
+        Where the Gaussian is seen: the centre, but at the border on axes that are not free.
+    free : list of 2 Float
+        For x and y 1, or 0 where the Gaussian is constant along the axis.
 
     Returns
     -------
@@ -77,21 +84,20 @@ def inside_share(
     """
     mean_x, mean_y, a, b, c = shape
     fxx, fxy, fyy = footprint
-    dx, dy = x - mean_x, y - mean_y
+    dx, dy = at[0] - mean_x, at[1] - mean_y
     u, v = dr.fma(a, dx, b * dy), c * dy
+    a, b, c = a * free[0], b * free[1], c * free[1]
     gx, gy = a * u, dr.fma(b, u, c * v)
 
-    def strip(
-        center: Float, along: Float, across: Float, other: Float, variance: Float, side: int
-    ) -> Float:
+    def strip(k: int, along: Float, across: Float, other: Float, variance: Float) -> Float:
         left = dr.fma(a, along, b * across), c * across
         rest = dr.maximum(variance - dr.fma(left[0], left[0], left[1] * left[1]), 1e-6)
         steep = rsqrt(rest) * (math.sqrt(0.5) / EXP2_SCALE)
-        middle = center - other
-        return 0.5 * (quick_erf((side - middle) * steep) + quick_erf(middle * steep))
+        middle, (low, high) = center[k] - other, spans[k]
+        return 0.5 * (quick_erf((high - middle) * steep) + quick_erf((middle - low) * steep))
 
     shift_x, shift_y = dr.fma(fxx, gx, fxy * gy), dr.fma(fxy, gx, fyy * gy)
-    return strip(x, fxx, fxy, shift_x, fxx, width) * strip(y, fxy, fyy, shift_y, fyy, height)
+    return strip(0, fxx, fxy, shift_x, fxx) * strip(1, fxy, fyy, shift_y, fyy)
 
 
 def quick_erf(x: Float) -> Float:

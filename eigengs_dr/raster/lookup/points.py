@@ -184,6 +184,21 @@ def fold(x: Float, side: int, wrap: str) -> tuple[Float, Float]:
     return dr.select(odd, side - local, local), dr.select(odd, -one, one)
 
 
+def near_image(x: Float, side: int) -> Float:
+    """Move a coordinate near a clamped image, where footprints see what they see further out.
+
+    The longest reach 1.2 sides. What is not finite becomes 0.
+
+    Parameters
+    ----------
+    x : Float
+        In pixels.
+    side : int
+        Width or height of the image, in pixels.
+    """
+    return dr.clip(dr.select(dr.isfinite(x), x, 0), -1.5 * side, 2.5 * side)
+
+
 def cell_range(cells: Cells, x: Float, y: Float, active: Bool) -> tuple[UInt, UInt]:
     """Return begin and end of the list of the cell at a point of the image; else both are 0."""
     types, grid = types_of(x), cells.grid

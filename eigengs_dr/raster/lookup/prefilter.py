@@ -4,11 +4,18 @@ The convolution of two Gaussians is a Gaussian. Therefore a pixel sees the sum o
 (`eigengs_dr.raster.evaluate.widen`) and needs neither a mip map nor more samples. At the borders of
 the image, a Gaussian is multiplied by the part of its product with the footprint that lies in the
 image, and the sum includes all copies of the image that the footprint reaches.
+
+A clamped image continues the centres of its outermost pixels: the plane has nine parts, the image
+and one beyond each border and corner. Beyond a border a Gaussian is constant across it, hence seen
+from the border with the footprint's width along the border alone, times the share of the footprint
+that lies there. Like the shares inside of the image this is exact but for the error of
+`eigengs_dr.raster.lookup.footprint.quick_erf`, and near corners for footprints that lean.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 
@@ -18,6 +25,9 @@ from ..parameters import gather_index, kernel_covariance, unpack_parameters
 from .footprint import filtered_terms, inside_share
 from .points import Packed, cell_range, sum_range
 from .size_classes import FOOTPRINT_REACH, SizeClasses
+
+FAR = 1e9
+"""End in pixels of the parts of the plane beyond the borders of a clamped image."""
 
 
 def sum_prefiltered(
@@ -35,7 +45,7 @@ def sum_prefiltered(
         Its copies in the order of lists are from `eigengs_dr.raster.lookup.footprint.arrange`.
     x, y : Float
         Centre of the footprint in pixels, moved into the image by
-        `eigengs_dr.raster.lookup.points.fold`.
+        `eigengs_dr.raster.lookup.points.fold`, or near it by `near_image` if that is clamped.
     footprint : list of 3 Float
         xx, xy, yy of the covariance, in pixels squared; not differentiated.
     active : Bool
@@ -45,18 +55,24 @@ def sum_prefiltered(
     list of Float
         One sum for each channel.
     """
-    types = types_of(packed.values)
     footprint = [dr.detach(f) for f in footprint]
-    reach = [FOOTPRINT_REACH * dr.safe_sqrt(footprint[k]) for k in (0, 2)]
+    reach, sides = _reach(footprint), (sizes.width, sizes.height)
+    bounds = [
+        [_part(sizes, dr.detach(v) + k, side) for k in (-r, r)]
+        for v, r, side in zip((x, y), reach, sides, strict=True)
+    ]
+    near, seen = (x, y), footprint
+    if sizes.wrap == "clamp":
+        near, seen = _at_borders(sizes, (x, y), footprint)
+        reach = _reach(seen)
     widest = dr.maximum(*reach) * (1 / FOOTPRINT_REACH)
     listed = active & (widest <= sizes.listed[-1][0])
-    bounds = []
-    for v, r, side in zip((x, y), reach, (sizes.width, sizes.height), strict=True):
-        listed &= (v >= r) & (v + r <= side)
-        bounds.append([types.Int(dr.floor((dr.detach(v) + k) * (1 / side))) for k in (-r, r)])
-    ends = _shortest_list(sizes, x, y, widest, listed)
-    terms = filtered_terms(packed, footprint)
-    total = sum_range(sizes.listed[0][1].splat, ends, packed, x, y, terms)
+    for v, r, side in zip(near, reach, sides, strict=True):
+        first, last = _ends(sizes, side)
+        listed &= (v >= first + r) & (v + r <= last)
+    ends = _shortest_list(sizes, *near, widest, listed)
+    terms = filtered_terms(packed, seen)
+    total = sum_range(sizes.listed[0][1].splat, ends, packed, *near, terms)
     rest = active & ~listed
     part = where_any(
         rest, lambda: _sum_copies(sizes, packed, x, y, footprint, bounds, rest), packed
@@ -102,15 +118,76 @@ def where_any(
     )
 
 
+def _ends(sizes: SizeClasses, side: int) -> tuple[float, float]:
+    """Return where the image ends along an axis."""
+    return (0.5, side - 0.5) if sizes.wrap == "clamp" else (0.0, float(side))
+
+
+def _reach(footprint: list) -> list:
+    """Return how far a footprint reaches along x and y."""
+    return [FOOTPRINT_REACH * dr.safe_sqrt(footprint[k]) for k in (0, 2)]
+
+
+def _at_borders(sizes: SizeClasses, point: tuple, footprint: list) -> tuple[Any, list]:
+    """Move footprints that lie beyond a border of a clamped image to it.
+
+    Without their width across the border they see the same, and cells list it.
+    """
+    xx, xy, yy = footprint
+    moved, inside = [], []
+    sides = sizes.width, sizes.height
+    for v, reach, side in zip(point, _reach(footprint), sides, strict=True):
+        first, last = _ends(sizes, side)
+        inside.append((v + reach >= first) & (v - reach <= last))
+        moved.append(dr.select(inside[-1], v, dr.clip(v, first, last)))
+    (x, y) = inside
+    return moved, [dr.select(x, xx, 0), dr.select(x & y, xy, 0), dr.select(y, yy, 0)]
+
+
+def _part(sizes: SizeClasses, v: Float, side: int) -> Any:
+    """Return the number of the copy at a coordinate; of a clamped image -1, 0 or 1."""
+    Int = types_of(v).Int
+    if sizes.wrap != "clamp":
+        return Int(dr.floor(v * (1 / side)))
+    first, last = _ends(sizes, side)
+    return dr.select(v > last, Int(1), dr.select(v < first, Int(-1), 0))
+
+
+def _share(
+    sizes: SizeClasses, shape: list, footprint: list, place: tuple, at: tuple, center: tuple
+) -> Float:
+    """Return the share in the part (i, j) of the plane of the footprint times a Gaussian."""
+    types = types_of(center[0])
+    spans, free = [], []
+    for k, side in zip(place, (sizes.width, sizes.height), strict=True):
+        first, last = _ends(sizes, side)
+        if sizes.wrap == "clamp":
+            low = dr.select(k < 0, types.Float(-FAR), dr.select(k > 0, types.Float(last), first))
+            high = dr.select(k < 0, types.Float(first), dr.select(k > 0, types.Float(FAR), last))
+            spans.append((low, high))
+            free.append(dr.select(k == 0, types.Float(1), 0))
+        else:
+            spans.append((first, last))
+            free.append(types.Float(1))
+    return inside_share(shape, footprint, center, spans, at, free)
+
+
 def _local(sizes: SizeClasses, i: UInt, j: UInt, x: Float, y: Float) -> tuple:
-    """Return the point in the copy (i, j), and the sign of the footprint's xy in this copy."""
+    """Return the point in the copy (i, j), and factors of the footprint's xx, xy, yy there."""
     types = types_of(x)
+    if sizes.wrap == "clamp":
+        (left, right), (top, bottom) = (_ends(sizes, n) for n in (sizes.width, sizes.height))
+        fx, fy = (dr.select(k == 0, types.Float(1), 0) for k in (i, j))
+        x = dr.select(i == 0, x, dr.select(i < 0, types.Float(left), right))
+        y = dr.select(j == 0, y, dr.select(j < 0, types.Float(top), bottom))
+        return x, y, (fx, fx * fy, fy)
+    one = types.Float(1)
     x, y = x - types.Float(i) * sizes.width, y - types.Float(j) * sizes.height
     if sizes.wrap == "repeat":
-        return x, y, types.Float(1)
+        return x, y, (one, one, one)
     odd_x, odd_y = (i & 1) == 1, (j & 1) == 1
     x, y = dr.select(odd_x, sizes.width - x, x), dr.select(odd_y, sizes.height - y, y)
-    return x, y, dr.select(odd_x == odd_y, types.Float(1), -1)
+    return x, y, (one, dr.select(odd_x == odd_y, one, -1), one)
 
 
 def _sum_copies(
@@ -141,8 +218,9 @@ def _sum_copies(
         """
         k, i, j = place
         square, cells, nx, ny, inverse, origin = unpack_parameters(sizes.table, types.UInt(k), 6)
-        x0, y0, sign = _local(sizes, i, j, dr.detach(x), dr.detach(y))
-        xx, xy, yy = footprint[0] + square, footprint[1] * sign, footprint[2] + square
+        x0, y0, factors = _local(sizes, i, j, dr.detach(x), dr.detach(y))
+        xx, xy, yy = (f * k for f, k in zip(footprint, factors, strict=True))
+        xx, yy = xx + square, yy + square
         reach = cutoff * dr.sqrt(yy)
         first = types.Int(dr.maximum(dr.floor((y0 - reach - origin) * inverse), 0))
         last = types.Int(dr.minimum(dr.floor((y0 + reach - origin) * inverse), ny - 1))
@@ -191,13 +269,15 @@ def _sum_copies(
         (_, i, j), (x, y) = place, point
         here = (n < end) & (j <= bottom)
         shape, color = packed.gather(gather_index(types, sizes.splat, n, here), here)
-        px, py, sign = _local(sizes, i, j, x, y)
-        seen = [scaled[0], scaled[1] * sign, scaled[2]]
+        px, py, factors = _local(sizes, i, j, x, y)
+        seen = [f * k for f, k in zip(scaled, factors, strict=True)]
+        # Of a clamped image, the whole footprint decides how much of it lies in each part.
+        own, center = (scaled, (x, y)) if sizes.wrap == "clamp" else (seen, (px, py))
         shape, amplitude = widen(shape, seen)
         (w,) = weights(shape, px, py, (1, 1), packed.radius)
         (part,) = where_any(
             crosses,
-            lambda: [inside_share(shape, seen, px, py, sizes.width, sizes.height)],
+            lambda: [_share(sizes, shape, own, (i, j), (px, py), center)],
             packed,
             [types.Float(1)],
         )

@@ -51,9 +51,11 @@ class Level:
     first : int
         Index of its first point in `GaussianPyramid.values`.
     nx, ny : int
-        Number of columns and rows of points.
+        Number of columns and rows of points in the image.
     dx, dy : float
         Spacings in pixels.
+    pad : int
+        Number of columns and rows of points beyond each border.
     """
 
     first: int
@@ -61,6 +63,17 @@ class Level:
     ny: int
     dx: float
     dy: float
+    pad: int = 0
+
+    @property
+    def columns(self) -> int:
+        """Number of columns with the padding."""
+        return self.nx + 2 * self.pad
+
+    @property
+    def rows(self) -> int:
+        """Number of rows with the padding."""
+        return self.ny + 2 * self.pad
 
 
 @dataclass(frozen=True)
@@ -88,7 +101,9 @@ class GaussianPyramid:
 def pyramid_mean(lattice: GaussianPyramid) -> list:
     """Return the mean of every channel over the image: a list of Float, shape (1,)."""
     level, UInt = lattice.levels[-1], types_of(lattice.values).UInt
-    index = dr.arange(UInt, level.nx * level.ny) + level.first
+    point = dr.arange(UInt, level.nx * level.ny)
+    index = (point // level.nx + level.pad) * level.columns + point % level.nx + level.pad
+    index += level.first
     return [dr.mean(row) for row in unpack_parameters(lattice.values, index, lattice.channels)]
 
 
@@ -143,6 +158,7 @@ def sum_pyramid(
     types = types_of(lattice.values)
     xx, xy, yy = footprint = dr.detach(footprint)
     first, nx, ny, dx, dy = _pick(types, lattice.levels, _smallest_variance(footprint))
+    pad = lattice.levels[0].pad
     # In spacings of the level; the values are already blurred by SAMPLE_DEVIATION^2.
     u, v = x * rcp(dx) - 0.5, y * rcp(dy) - 0.5
     xx = dr.maximum(xx * dr.square(rcp(dx)) - SAMPLE_DEVIATION**2, SAMPLE_DEVIATION**2)
@@ -167,7 +183,7 @@ def sum_pyramid(
         q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
         w = falloff(dr.maximum(q, 0), 2 * kernel_radius(SAMPLE_REACH) ** 2) * scale
         column, row = (_fold(types, k, n, lattice.wrap) for k, n in ((i, nx), (j, ny)))
-        point = first + row * types.UInt(nx) + column
+        point = first + row * types.UInt(nx + 2 * pad) + column
         seen = unpack_parameters(lattice.values, point, lattice.channels, here)
         sums = [dr.fma(w, c, s) for c, s in zip(seen, sums, strict=True)]
         i = i + 1
@@ -202,7 +218,12 @@ def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Float) -> list
 
 
 def _fold(types: ArrayTypes, index: UInt, count: Float, wrap: str) -> UInt:
-    """Move the index of a point into the level; points lie half a spacing inside the borders."""
+    """Return the column of a point of the level; in the image, points lie half a spacing inside.
+
+    Points beyond the padding of a clamped image have the values of the outermost ones.
+    """
+    if wrap == "clamp":
+        return types.UInt(dr.clip(index, -PADDING, types.Int(count) + (PADDING - 1)) + PADDING)
     k = types.Float(index)
     if wrap == "repeat":
         return types.UInt(k - count * dr.floor((k + 0.5) * rcp(count)))
@@ -215,14 +236,20 @@ FINEST, FEWEST = 1, 8
 number of points along the shorter side of the coarsest level."""
 
 
-def levels_of(width: int, height: int) -> tuple[Level, ...]:
+PADDING = 3
+"""Points beyond each border of a clamped image. Three spacings outside, the blur of a level, of
+`SAMPLE_DEVIATION`, sees 0.01 % of what lies inside: further out, values are constant."""
+
+
+def levels_of(width: int, height: int, wrap: str) -> tuple[Level, ...]:
     """Return the levels of the pyramid of an image."""
     levels: list[Level] = []
     spacing, first = FINEST, 0
+    pad = PADDING if wrap == "clamp" else 0
     while not levels or min(width, height) >= FEWEST * spacing:
         nx, ny = math.ceil(width / spacing), math.ceil(height / spacing)
-        levels.append(Level(first, nx, ny, width / nx, height / ny))
-        first += nx * ny
+        levels.append(Level(first, nx, ny, width / nx, height / ny, pad))
+        first += levels[-1].columns * levels[-1].rows
         spacing *= 2
     return tuple(levels)
 
@@ -238,7 +265,7 @@ def list_finest(shape: list, width: int, height: int, radius: float, adjoint: bo
     adjoint : bool
         Whether the colours or shapes of the pyramid have derivatives.
     """
-    blur = _blur(types_of(shape[0]), levels_of(width, height)[0])
+    blur = _blur(types_of(shape[0]), levels_of(width, height, "repeat")[0])
     widened, _ = widen(dr.detach(shape), kernel_covariance(blur))
     return build_lists(widened, radius, Grid(width, height), adjoint=adjoint)
 
@@ -263,11 +290,11 @@ def build_pyramid(sizes: SizeClasses, packed: Packed, finest: TileLists) -> Gaus
         From `list_finest`.
     """
     types = types_of(packed.values)
-    levels, parts = levels_of(sizes.width, sizes.height), list[Float]()
+    levels, parts = levels_of(sizes.width, sizes.height, sizes.wrap), list[Float]()
     for number, level in enumerate(levels):
-        index = dr.arange(types.UInt, level.nx * level.ny)
-        x = (types.Float(index % level.nx) + 0.5) * level.dx
-        y = (types.Float(index // level.nx) + 0.5) * level.dy
+        index = dr.arange(types.UInt, level.columns * level.rows)
+        x = (types.Float(index % level.columns) + (0.5 - level.pad)) * level.dx
+        y = (types.Float(index // level.columns) + (0.5 - level.pad)) * level.dy
         blur = _blur(types, level)
         if parts:
             finer = (replace(levels[number - 1], first=0),)
@@ -287,7 +314,8 @@ def _finest(
 ) -> list:
     """Return the blurred sum at all pixels: widen all Gaussians once, and render them.
 
-    At the border, copies of the image and the part of a Gaussian inside the image count too.
+    At the border, copies of the image and the part of a Gaussian inside the image count too. There
+    and beyond, each point is looked up.
     """
     types = types_of(packed.values)
     width, height = sizes.width, sizes.height
@@ -302,11 +330,11 @@ def _finest(
     near_x, near_y = (dr.gather(types.Float, v, ring) for v in (x, y))
     seen = sum_prefiltered(sizes, packed, near_x, near_y, blur, types.Bool(True))
     dr.eval(seen)  # once for all channels
-    index = dr.arange(types.UInt, width * height)
+    pixel = types.UInt(types.Int(y)) * width + types.UInt(types.Int(x))
     result = []
     for k, part in enumerate(seen):
-        whole = dr.zeros(types.Float, width * height)
+        whole = dr.zeros(types.Float, dr.width(x))
         dr.scatter(whole, part, ring)
-        inner = dr.gather(types.Float, image, index * len(color) + k)
+        inner = dr.gather(types.Float, image, pixel * len(color) + k, ~edge)
         result.append(dr.select(edge, whole, inner))
     return result

@@ -1,5 +1,7 @@
 """Lists of Gaussians: complete and tight; their pieces, and the order of lanes."""
 
+import tracemalloc
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -218,6 +220,42 @@ def test_windows_keep_neighbours_together():
     length = np.random.default_rng(0).integers(1, 9, 150)
     order = order_lanes(length, window)
     np.testing.assert_array_equal(order, np.lexsort((np.arange(150), -length, window)))
+
+
+def plain_order(length, window):
+    """`order_lanes` by a sort of pairs, which takes any numbers."""
+    order = np.lexsort((np.arange(len(length)), -length, window))
+    dealt = len(order) // PACKET * PACKET
+    packets = order[:dealt].reshape(-1, PACKET)
+    full = length[packets[:, [0, -1]]].any(axis=1)
+    place = np.zeros(len(packets), int)
+    for kind in (full, ~full):
+        place[kind] = np.linspace(0, 65535, kind.sum()).astype(int)
+    packets = packets[np.lexsort((np.arange(len(packets)), place))]
+    return np.concatenate([packets.ravel(), order[dealt:]])
+
+
+@pytest.mark.parametrize("lanes", [1, 16, 100, 5000])
+@pytest.mark.parametrize("longest", [0, 1, 40, 100_000])
+def test_lanes_are_in_the_order_of_a_plain_sort(lanes, longest):
+    """Windows of one run, and windows of tiles, which return row after row."""
+    rng = np.random.default_rng(lanes + longest)
+    length = np.where(rng.uniform(size=lanes) < 0.6, rng.integers(0, longest + 1, lanes), 0)
+    lane = np.arange(lanes)
+    for window in (lane // 64, lane % 80 // 32 + 3 * (lane // 800)):
+        np.testing.assert_array_equal(order_lanes(length, window), plain_order(length, window))
+
+
+def test_the_order_of_lanes_takes_the_memory_of_the_lists():
+    """Not that of all windows times the longest list: one tile may hold most Gaussians."""
+    window = np.arange(64_000) // 32
+    length = np.ones(len(window), int)
+    length[5] = 20_000
+    tracemalloc.start()
+    order_lanes(length, window)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100 * len(window)
 
 
 def test_empty_packets_are_dealt_out():

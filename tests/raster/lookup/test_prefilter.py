@@ -11,6 +11,7 @@ from scipy.special import erf
 
 from _helpers.footprints import (
     CUTOFF,
+    around,
     brute_force,
     check_gradient,
     exact_at,
@@ -56,11 +57,11 @@ def filtered(*given):
 
 
 class TestSumFiltered:
-    @pytest.mark.parametrize("wrap", ["repeat", "mirror"])
+    @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
     @pytest.mark.parametrize("k", range(len(FOOTPRINTS)))
     def test_sees_what_brute_force_sees(self, backend, wrap, k):
-        """Exact but for the tails of footprints, and near corners: see `share`."""
-        scene, points = random_scene(1, 60), some_points()
+        """Exact but for the tails of footprints, and near corners: see `inside_share`."""
+        scene, points = random_scene(1, 60), around(some_points(), wrap)
         scene = scene._replace(mean=0.2 * np.array(SIZE) + 0.6 * scene.mean)
         corner = np.abs(points - np.round(points / SIZE) * SIZE).max(axis=1) < 3
         exact = brute_force(scene, wrap, points, FOOTPRINTS[k])
@@ -88,8 +89,9 @@ class TestSumFiltered:
 
     @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
     def test_without_a_footprint_it_is_the_sum(self, backend, wrap):
-        scene, points = random_scene(3), some_points()
-        exact, sure = exact_at(scene, points, CUTOFF)
+        scene, points = random_scene(3), around(some_points(), wrap)
+        inside = np.clip(points, 0.5, np.array(SIZE) - 0.5) if wrap == "clamp" else points
+        exact, sure = exact_at(scene, inside, CUTOFF)
         found = stacked(filtered(scene.on(backend), wrap, points, np.zeros((2, 2))))
         np.testing.assert_allclose(found[sure], exact[sure], atol=1e-5)
 
@@ -112,14 +114,18 @@ class TestSumFiltered:
         found = stacked(filtered(scene.on(backend), wrap, points, covariance, 3.0))
         np.testing.assert_allclose(found, exact, atol=2e-3)
 
+    @pytest.mark.parametrize("wrap", ["mirror", "clamp"])
     @pytest.mark.parametrize("k", [1, 3])
     @pytest.mark.parametrize("name", ["mean", "factor", "color"])
-    def test_gradient_is_a_finite_difference(self, backend, k, name):
+    def test_gradient_is_a_finite_difference(self, backend, wrap, k, name):
         """Points inside and at borders, so that both ways of summing are seen; in float64."""
-        points, weight = some_points(40), np.random.default_rng(0).normal(size=(40, 3))
+        points, weight = (
+            around(some_points(40), wrap),
+            np.random.default_rng(0).normal(size=(40, 3)),
+        )
 
         def loss(gaussians):
-            rows = filtered(gaussians, "mirror", points, FOOTPRINTS[k], 9.0)
+            rows = filtered(gaussians, wrap, points, FOOTPRINTS[k], 9.0)
             Float = types_of(gaussians.mean).Float
             return dr.sum(sum(r * Float(w) for r, w in zip(rows, weight.T.copy(), strict=True)))
 
