@@ -244,9 +244,7 @@ def test_an_interrupt_after_the_last_round_keeps_the_best_set_before_it():
             raise KeyboardInterrupt
 
     gaussians, objective = placed(image)
-    [found] = refine(
-        objective, often(), begin(gaussians), 200, scored(image), progress=stop
-    )
+    [found] = refine(objective, often(), begin(gaussians), 200, scored(image), progress=stop)
     *first, best, last = (row["iteration"] for row in found.trace)
     assert first == [0, 10, 20] and best in (50, 100) and last == last_round
     assert len(found.gaussians) == COUNT
