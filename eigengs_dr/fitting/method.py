@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
-from .control import Perturb, Redistribute, Relocate, Surplus
+from .control import Perturb, Redistribute, Relocate, Retreat, Surplus
 from .optimizer import Adam, Optimizer
 from .place import Adaptive, Placement
 from .solvers.conjugate_gradient import solve
@@ -176,7 +176,7 @@ class Method:
 
 DEFAULT = Method(
     place=Adaptive(),
-    controls=(Surplus(), Redistribute(), Relocate(), Perturb()),
+    controls=(Retreat(), Surplus(), Redistribute(), Relocate(), Perturb()),
     optimizer=Adam(0.9, 0.9, 1e-12),
     rates={"mean": 0.4, "factor": 0.22, "color": 0.0115},
     coordinates=Relative(),
