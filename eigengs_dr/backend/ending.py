@@ -2,8 +2,8 @@
 
 A `KeyboardInterrupt` may be raised in any line: in an import it becomes an error that blames the
 installation, in Dr.Jit an abort. So the program raises none. It deletes its temporary files and
-ends, but in blocks that end their work by themselves, see `eigengs_dr.backend.feedback`. What uses
-the package as a library has the signals as they were.
+ends, but in blocks that end their work by themselves, see `eigengs_dr.backend.interrupts`. What
+uses the package as a library has the signals as they were.
 """
 
 from __future__ import annotations

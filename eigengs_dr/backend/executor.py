@@ -1,7 +1,6 @@
 """Where tasks run: in this process, or on the workers of a cluster.
 
-Functions that take ``client`` ask `executor_for` for an `Executor`. This module knows no cluster:
-who does puts its executor into `EXECUTORS`.
+Functions that take ``client`` ask `eigengs_dr.cluster.client.executor_for` for an `Executor`.
 """
 
 from __future__ import annotations
@@ -77,11 +76,6 @@ class Executor(Protocol):
         """
 
 
-EXECUTORS: dict[str, Callable[[Any], Executor]] = {}
-"""What makes an `Executor` of a client, by the package that defines the class of the client;
-`eigengs_dr` puts that of Dask here."""
-
-
 class LocalExecutor:
     """The `Executor` of this process: one task after the other, without copies."""
 
@@ -121,34 +115,3 @@ def completed(
             if lost:
                 raise ClusterError(f"a part of the work cannot be done: {lost}")
             yield task, value
-
-
-def executor_for(client: Any = None) -> Executor:
-    """Return the executor of a client.
-
-    Parameters
-    ----------
-    client : distributed.Client, Executor or None
-        None stands for this process.
-
-    Returns
-    -------
-    Executor
-
-    Raises
-    ------
-    TypeError
-        If no executor is known for the type of the client.
-    ClusterError
-        If the workers of the client cannot be used.
-    """
-    if client is None:
-        return LocalExecutor()
-    kind = type(client)
-    if make := EXECUTORS.get(kind.__module__.partition(".")[0]):
-        return make(client)
-    if isinstance(client, Executor):
-        return client
-    raise TypeError(
-        f"client is a {kind.__module__}.{kind.__name__}; pass a distributed.Client, or None"
-    )

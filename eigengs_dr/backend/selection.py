@@ -14,8 +14,8 @@ from types import ModuleType
 from typing import Any
 
 from . import gpu
-from .feedback import warn
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path, too_old
+from .messages import warn
 
 BACKENDS = ("llvm", "cuda", "metal")
 

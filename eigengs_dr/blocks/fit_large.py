@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..backend.arguments import takes_numbers
-from ..backend.executor import executor_for
-from ..backend.feedback import defer_interrupts, shows_progress
+from ..backend.interrupts import defer_interrupts
+from ..backend.progress import shows_progress
 from ..backend.selection import select
+from ..cluster.client import executor_for
 from ..fitting.options import FitOptions, named_options
 from ..fitting.target import in_unit
 from ..gaussian.file import CUTOFF, check_suffix, write

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..backend.feedback import warn
+from ..backend.messages import warn
 from ..image.header import transparency_note
 from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
 from ..image.pixels import encoding_of

@@ -11,12 +11,12 @@ import click
 
 import eigengs_dr as eg
 
-from ..backend.feedback import printable
+from ..backend.messages import printable
 from ..backend.selection import select
 from ..gaussian import file as set_file
 from ..gaussian.file import SetData
+from ..gaussian.packed import is_packed
 from ..storage import npz
-from ..storage.atomic import reader_of
 from . import options
 from .console import about, table
 from .outputs import check_outputs, name_pictures
@@ -65,7 +65,7 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     from ..eigenbasis.eigengs import SHIPPED
 
     file = SHIPPED.get(str(file), file)
-    packed = bool(reader_of(file))
+    packed = is_packed(file)
     found = set_file.FORMAT if packed else npz.format_of(file)
     kinds = {set_file.FORMAT: "image", set_file.MATERIAL: "material", model_file.FORMAT: "model"}
     if found not in kinds:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import click
 
-from ..backend.feedback import printable
+from ..backend.messages import printable
 from ..backend.selection import BACKENDS
 from ..image.color import SPACES
 from ..image.pixels import ENCODINGS

@@ -25,9 +25,9 @@ from distributed.comm import CommClosedError
 from distributed.protocol.pickle import dumps, loads
 from distributed.scheduler import KilledWorker
 
-from .. import __version__
 from ..backend.executor import ClusterError, Done, Function
-from ..backend.feedback import defer_interrupts, terminate_as_interrupt
+from ..backend.interrupts import defer_interrupts, terminate_as_interrupt
+from ..version import __version__
 from .local import local_cluster
 from .worker import package_versions, run_task, share
 

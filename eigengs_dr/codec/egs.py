@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
 from ..gaussian.file import CUTOFF, SetData, check
+from ..gaussian.packed import MAGIC
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage.atomic import atomic_write
 from ..storage.memory import check_content
@@ -37,9 +38,6 @@ from .range_coder import Decoder, Encoder
 IntArray = NDArray[np.int64]
 
 SUFFIX = ".egs"
-
-MAGIC = b"\x89EGS"
-"""First bytes of a file. The first byte is no ASCII character, so no text file starts with it."""
 
 VERSION, MAPS_VERSION = 3, 4
 """Versions of the format, for a set without maps and with a table of maps. Versions 1

@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.feedback import defer_interrupts
+from ..backend.interrupts import defer_interrupts
 from ..backend.recording import exclusive
 from ..fitting.descent import run
 from ..fitting.fit import Fit, finish

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..backend.feedback import shows_progress
+from ..backend.progress import shows_progress
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_image
 from ..fitting.options import FitOptions, refuse_unknown

@@ -22,8 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..backend.executor import Executor, executor_for
-from ..backend.feedback import defer_interrupts, warn
+from ..backend.executor import Executor
+from ..backend.interrupts import defer_interrupts
+from ..backend.messages import warn
+from ..cluster.client import executor_for
 from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians

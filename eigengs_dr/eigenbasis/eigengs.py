@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arguments import takes_numbers
-from ..backend.feedback import shows_progress, to_html
+from ..backend.notebook import to_html
+from ..backend.progress import shows_progress
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.feedback import defer_interrupts, warn
+from ..backend.interrupts import defer_interrupts
+from ..backend.messages import warn
 from ..image.folder import list_images
 from ..image.io import ImageError, check_image
 from ..image.metrics import psnr

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arguments import takes_numbers
-from ..backend.feedback import defer_interrupts, shows_progress, to_html
+from ..backend.interrupts import defer_interrupts
+from ..backend.notebook import to_html
+from ..backend.progress import shows_progress
 from ..backend.recording import exclusive
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import CUTOFF, FitFigures, write

@@ -82,7 +82,7 @@ def refine(
         to end the refinement.
     interrupted : callable, optional
         Called before every step; True ends the refinement. See
-        `eigengs_dr.backend.feedback.defer_interrupts`.
+        `eigengs_dr.backend.interrupts.defer_interrupts`.
     score : callable, optional
         ``score(gaussians)`` returns a row of the trace without its iteration, by default that of
         `measure`. Its psnr_ycbcr decides which set is the best.

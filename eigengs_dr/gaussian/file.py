@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.feedback import printable
+from ..backend.messages import printable
 from ..image.color import MAX_CHANNELS, SPACES
 from ..image.formats import SUFFIXES
 from ..storage import npz
-from ..storage.atomic import reader_of
 from ..storage.npz import BadValue, Field
+from . import packed
 from .channels import MAX_CHANNELS as MAX_MAPS
 from .channels import TextureMap, check_maps, find_map
 
@@ -228,10 +228,7 @@ def _properties(found: Arrays) -> tuple[tuple[int, int], str, float, tuple[Textu
 
 def maps_of(path: Path) -> tuple[TextureMap, ...]:
     """Return the maps of a file, ``.npz`` or ``.egs``; none for one image. Errors as `read`."""
-    if reader := reader_of(path):
-        maps: tuple[TextureMap, ...] = reader.read_maps(path)
-        return maps
-    return read_head(path).maps
+    return packed.read_maps(path) if packed.is_packed(path) else read_head(path).maps
 
 
 def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
@@ -276,8 +273,8 @@ def read_figures(path: Path) -> FitFigures | None:
 def read(path: Path, sections: int | None = None) -> SetData:
     """Read and check a set; parameters and errors as for `eigengs_dr.Gaussians.load`."""
     with _errors_of(path):
-        if reader := reader_of(path):
-            data: SetData = reader.read_set(path, sections)
+        if packed.is_packed(path):
+            data = packed.read_set(path, sections)
         elif sections is not None:
             raise BadValue("has no sections; pass sections only for .egs files")
         else:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arguments import takes_numbers
 from ..backend.arrays import Float, UInt, settle, types_in, types_of, upload, upload_rows
-from ..backend.feedback import to_html
+from ..backend.notebook import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
 from ..image.color import check_size

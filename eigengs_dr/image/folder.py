@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.feedback import warn
+from ..backend.messages import warn
 from .color import BASIS_SPACES, check_size, to_planes
 from .formats import LEFT_SUFFIXES, READ_SUFFIXES
 from .io import check_image, load_image

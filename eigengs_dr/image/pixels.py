@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.feedback import warn
+from ..backend.messages import warn
 from .strips import Pixels, by_strips
 
 ENCODINGS = ("srgb", "linear")

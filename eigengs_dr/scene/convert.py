@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arguments import takes_numbers
-from ..backend.feedback import shows_progress, warn
+from ..backend.messages import warn
+from ..backend.progress import shows_progress
 from ..backend.recording import exclusive
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded

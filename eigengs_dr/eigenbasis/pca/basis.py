@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...backend.arguments import takes_numbers
-from ...backend.feedback import shows_progress, to_html, warn
+from ...backend.messages import warn
+from ...backend.notebook import to_html
+from ...backend.progress import shows_progress
 from ...image.color import check_size, to_planes, ycbcr_to_rgb
 from ...image.folder import Source
 from ...image.io import check_image

@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.executor import completed, executor_for
-from ...backend.feedback import warn
+from ...backend.executor import completed
+from ...backend.messages import warn
+from ...cluster.client import executor_for
 from ...image.folder import ReadProgress, Source, list_images, read_blocks
 from ...image.pixels import ImageError
 from ...image.remote import is_url

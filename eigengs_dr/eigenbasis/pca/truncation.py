@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.feedback import warn
+from ...backend.messages import warn
 
 MIN_MSE = 1e-12
 """Smallest mean squared error, 120 dB; smaller errors are rounding of single precision."""
