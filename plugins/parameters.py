@@ -145,7 +145,7 @@ class SharedFile:
         self.tables: dict[tuple, Any] = {}
         self.shared = to_tensors(self.gaussians)
 
-    def source(self, name: str | None) -> Source:
+    def source(self, name: str | None) -> TextureParameters:
         """Return a map, or the whole file, as the source of a texture.
 
         Raises
@@ -165,10 +165,12 @@ class SharedFile:
                 f"gaussian_texture: {self.path} {missing} map = one of {', '.join(names)}"
             )
         if name is None:
-            return Source(self.gaussians, self.shared, file=self)
+            return TextureParameters(self.gaussians, self.shared, file=self)
         gaussians = self.gaussians[name]
         tensors = to_tensors(gaussians) | {key: self.shared[key] for key in SHAPES}
-        return Source(gaussians, tensors, file=self, part=slices(maps)[names.index(name)])
+        return TextureParameters(
+            gaussians, tensors, file=self, part=slices(maps)[names.index(name)]
+        )
 
     def parameters(self) -> KernelParameters:
         """Return the parameters of all channels, decoded map by map."""
@@ -204,7 +206,7 @@ SHAPES = ("mean", "factor")
 
 
 @dataclass(eq=False)
-class Source:
+class TextureParameters:
     """The parameters of a texture, and the Gaussians that they stand for.
 
     They are mean (N, 2), factor (N, 3), color (N, C) and background (C,) of a set, in native pixels
@@ -274,7 +276,7 @@ class Source:
         return replace(start, color=types.FloatX(colors), background=types.FloatX(background))
 
 
-def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> Source:
+def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> TextureParameters:
     """Return the coefficients of a model, by default 0, as the source of a texture.
 
     A channel with fewer components than others ignores the rest of its row.
@@ -286,7 +288,7 @@ def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> So
     if coefficients is None:
         coefficients = np.zeros((channels, most), np.float32)
     tensors = {"coefficients": upload(mi.TensorXf, coefficients)}
-    return Source(model.gaussians, tensors, [upload(mi.TensorXf, w) for w in weights])
+    return TextureParameters(model.gaussians, tensors, [upload(mi.TensorXf, w) for w in weights])
 
 
 # ---------------------------------------------------------------------------------------------

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.file import SetData, crop
+from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.region import crop
 from ..image.color import rendered_as
 from ..image.formats import TIFF_SUFFIXES
 from ..image.io import bits_of, dtype_of, to_file, write_pixels

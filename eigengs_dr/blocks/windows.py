@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..backend.messages import warn
+from ..gaussian.file import MAX_SET_SIDE
 from ..image.header import transparency_note
 from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
 from ..image.pixels import encoding_of
 from ..image.reading import TIFF, decode, read_header, reader_of
 from ..image.remote import is_copied
 from ..image.tiff import has_windows, read_window
-
-MAX_SIDE = 1 << 16
-"""Longest side of a set of Gaussians, in pixels."""
 
 Pixels = NDArray[Any]
 """Pixels (h, w) or (h, w, channels) of any type."""
@@ -201,8 +199,10 @@ def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixe
 
 
 def _check_sides(name: str, shape: tuple[int, ...]) -> None:
-    if not all(1 <= side <= MAX_SIDE for side in shape[:2]):
-        raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
+    if not all(1 <= side <= MAX_SET_SIDE for side in shape[:2]):
+        raise ImageError(
+            f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SET_SIDE:,}"
+        )
 
 
 def _read_part(path: str, rows: slice, columns: slice) -> Pixels:

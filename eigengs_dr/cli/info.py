@@ -188,7 +188,7 @@ def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) 
 
 def _draw(file: Path, kind: str, picture: Path) -> None:
     """Write the picture of a set, of its maps side by side, or of a model."""
-    from ..image.resize import join_pictures
+    from ..image.sheet import join_pictures
     from ..viewer.pictures import component_sheet
 
     shown: Any

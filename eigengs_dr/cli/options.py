@@ -22,7 +22,7 @@ EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 MAX_PIXELS = 1 << 29
 """Pixels of the largest picture to render, except into TIFF files; it takes 3 bytes a pixel."""
 
-MAX_SIDE = 1 << 17
+MAX_RENDERED_SIDE = 1 << 17
 """Longest side of a picture to render into a TIFF file."""
 
 Option = Callable[[Callable[..., Any]], Callable[..., Any]]
@@ -64,7 +64,7 @@ def size(text: str) -> tuple[int, int]:
 
 def scale(text: str) -> float:
     """Parse a factor on a size."""
-    if not 0 < (factor := float(text)) <= MAX_SIDE:
+    if not 0 < (factor := float(text)) <= MAX_RENDERED_SIDE:
         raise click.BadParameter(f"{text}: expected a number above 0, such as 2 or 0.5")
     return factor
 
@@ -136,8 +136,10 @@ def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, 
 
     A picture that is written by parts may be larger than one that is held in memory.
     """
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise click.UsageError(f"{width}x{height}: expected sides of 1 to {MAX_SIDE:,} pixels")
+    if not (1 <= width <= MAX_RENDERED_SIDE and 1 <= height <= MAX_RENDERED_SIDE):
+        raise click.UsageError(
+            f"{width}x{height}: expected sides of 1 to {MAX_RENDERED_SIDE:,} pixels"
+        )
     if width * height > MAX_PIXELS and not by_parts:
         most = f"at most {MAX_PIXELS:,} pixels, or a .tif file"
         raise click.UsageError(f"{width}x{height}: expected {most}")

@@ -30,7 +30,7 @@ from .pca.truncation import TruncationCurve, curve_from_eigenvalues, name_compon
 if TYPE_CHECKING:  # what trains, encodes and runs over many images is imported where it is called
     from ..collection.manifest import ImageRow
     from ..collection.sources import Images
-    from ..image.folder import Source
+    from ..image.folder import TrainingImages
     from .encoder import Encoder
     from .pca.basis import Eigenbasis
 
@@ -82,7 +82,7 @@ class EigenGS:
     @takes_numbers
     def fit(
         cls,
-        basis: Eigenbasis | Source,
+        basis: Eigenbasis | TrainingImages,
         gaussians: int = 5000,
         frequency_aware: bool | str = "auto",
         seed: int = 0,

@@ -21,7 +21,7 @@ from ..backend.arrays import Float, UInt, settle, types_in, types_of, upload, up
 from ..backend.notebook import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
-from ..image.color import check_size
+from ..image.pixels import check_size
 from ..storage.npz import BadValue
 from .channels import TextureMap, find_map
 from .file import CUTOFF, Arrays, SetData, check, read, write

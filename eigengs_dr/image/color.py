@@ -8,8 +8,7 @@ colour space, and a row for each channel.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from operator import index
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -426,27 +425,6 @@ def unit_codes(channels: Sequence[Array]) -> list[Array]:
 
 BASIS_SPACES = ("ycbcr", "rgb")
 """Colour spaces of a family."""
-
-
-def check_size(size: Iterable[int]) -> tuple[int, int]:
-    """Return a size, (width, height) in pixels, as two integers.
-
-    Parameters
-    ----------
-    size : (int, int)
-
-    Raises
-    ------
-    ValueError
-        If `size` is not a pair of integers, or a side is not positive.
-    """
-    try:
-        width, height = map(index, size)
-    except (TypeError, ValueError):
-        raise ValueError(f"size is {size!r}; expected (width, height) in whole pixels") from None
-    if min(width, height) < 1:
-        raise ValueError(f"size is {width}x{height}; both sides must be at least 1 pixel")
-    return width, height
 
 
 def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:

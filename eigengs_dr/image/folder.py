@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.messages import warn
-from .color import BASIS_SPACES, check_size, to_planes
+from .color import BASIS_SPACES, to_planes
 from .formats import LEFT_SUFFIXES, READ_SUFFIXES
 from .io import check_image, load_image
-from .pixels import ImageError
+from .pixels import ImageError, check_size
 from .remote import is_url, list_urls
 from .resize import center_crop
 from .strips import available_cores
@@ -35,7 +35,9 @@ then tells. One image may wait whatever its size."""
 MAX_NAMED = 3
 """Largest number of files that a warning names."""
 
-Source = str | os.PathLike[str] | NDArray[Any] | Iterable[str | os.PathLike[str] | NDArray[Any]]
+TrainingImages = (
+    str | os.PathLike[str] | NDArray[Any] | Iterable[str | os.PathLike[str] | NDArray[Any]]
+)
 """A folder or its URL, an array of images, or any iterable of files, of URLs and of such arrays."""
 
 ReadProgress = Callable[[int, int | None, dict[str, Any]], None]
@@ -132,7 +134,7 @@ def list_images(images: str | os.PathLike[str]) -> Sequence[str | Path]:
 
 
 def read_blocks(
-    source: Source,
+    source: TrainingImages,
     size: tuple[int, int],
     space: str,
     length: int,

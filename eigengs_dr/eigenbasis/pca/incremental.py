@@ -18,7 +18,7 @@ BLOCK_BYTES = 768 << 20
 MAX_BLOCK = 1024
 """Most images in a block: its Gram matrix has as many rows."""
 
-MARGIN = 0.25
+EXTRA_SHARE = 0.25
 """Additional components from block to block, as a share of the components to keep."""
 
 Rows = NDArray[np.float32]
@@ -75,7 +75,7 @@ def block_length(size: tuple[int, int]) -> int:
 
 def rank_for(components: int) -> int:
     """Return how many rows a state needs for `components` accurate components at the end."""
-    return components + int(np.ceil(MARGIN * components))
+    return components + int(np.ceil(EXTRA_SHARE * components))
 
 
 def merge(state: EigenState, block: Rows, rank: int) -> EigenState:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...backend.executor import completed
 from ...backend.messages import warn
 from ...cluster.client import executor_for
-from ...image.folder import ReadProgress, Source, list_images, read_blocks
+from ...image.folder import ReadProgress, TrainingImages, list_images, read_blocks
 from ...image.pixels import ImageError
 from ...image.remote import is_url
 from ...storage.checkpoint import read_arrays, write_arrays
@@ -63,7 +63,7 @@ class Stream(NamedTuple):
 
 
 def find_states(
-    source: Source,
+    source: TrainingImages,
     size: tuple[int, int],
     space: str,
     ranks: Sequence[int],
