@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eigengs_dr.backend.arrays import types_of, upload
+from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.channels import slices
 from eigengs_dr.gaussian.gaussians import (
@@ -28,10 +29,10 @@ from eigengs_dr.gaussian.gaussians import (
 from eigengs_dr.raster.parameters import KernelParameters
 from eigengs_dr.raster.render import decode_parameters
 
-Arrays = dict[str, Any]
+Arrays = Record
 
 
-def texture_of(gaussians: Gaussians | Fitted, **properties: Any) -> dict[str, Any]:
+def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     """Return a set as the dictionary of a ``gaussian_texture``, for `mitsuba.load_dict`.
 
     Parameters
@@ -68,7 +69,7 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: Any) -> dict[str, An
     }
 
 
-def gaussians_of(parameters: Mapping[str, Any], texture: str, like: Gaussians) -> Gaussians:
+def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians) -> Gaussians:
     """Read a set back from the parameters of a texture, differentiably.
 
     Parameters
@@ -93,7 +94,7 @@ def gaussians_of(parameters: Mapping[str, Any], texture: str, like: Gaussians) -
     return from_tensors(_found(parameters, texture), like)
 
 
-def keep_in_bounds(parameters: Any, texture: str, like: Gaussians) -> None:
+def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians) -> None:
     """Project the parameters of a texture into their bounds, after a step of an optimiser.
 
     The function applies `eigengs_dr.Gaussians.bounded`: means stay in the image, standard
@@ -110,7 +111,7 @@ def keep_in_bounds(parameters: Any, texture: str, like: Gaussians) -> None:
         parameters[f"{texture}.{name}"] = bounded[name]
 
 
-def _found(parameters: Mapping[str, Any], texture: str) -> Arrays:
+def _found(parameters: Mapping[str, object], texture: str) -> Arrays:
     keys = {name: f"{texture}.{name}" for name in FIELDS}
     return {name: parameters[key] for name, key in keys.items() if key in parameters}
 
@@ -229,7 +230,7 @@ class TextureParameters:
 
     start: Gaussians
     read: Arrays
-    weights: Sequence[Any] = ()
+    weights: Sequence[Tensor] = ()
     file: SharedFile | None = None
     part: slice = field(default_factory=lambda: slice(None))
 
@@ -257,7 +258,7 @@ class TextureParameters:
         except ValueError as error:
             raise ValueError(f"gaussian_texture: {error}") from error
 
-    def _reconstruct(self, coefficients: Any) -> Gaussians:
+    def _reconstruct(self, coefficients: Tensor) -> Gaussians:
         """Return the set of some coefficients of a model."""
         start, found = self.start, tuple(coefficients.shape)
         expected = (len(self.weights), self.weights[0].shape[1])

@@ -144,7 +144,7 @@ def wrap_mode(props: Properties) -> str:
     return wrap
 
 
-def to_uv(props: Properties) -> Any:
+def to_uv(props: Properties) -> mi.ScalarTransform3f:
     """Read ``to_uv``, by default the identity.
 
     Parameters
@@ -176,7 +176,7 @@ def to_uv(props: Properties) -> Any:
     return mi.ScalarTransform3f([*rows, [0, 0, 1]])
 
 
-def check_invertible(transform: Any) -> None:
+def check_invertible(transform: mi.ScalarTransform3f) -> None:
     """Raise `ValueError` if a transform of uv is not finite, or maps the plane to a line."""
     matrix = np.array(transform.matrix, np.float64)
     linear = matrix[:2, :2]

@@ -16,7 +16,6 @@ import sys
 TYPE_CHECKING = False  # `typing` and `contextlib` take longer than all else before the first line
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from typing import Any
 
 NAME = "eigengs-dr"
 """Name of the program; every line on standard error starts with it."""
@@ -52,7 +51,7 @@ def end_at_signals() -> None:
             signal.signal(number, end_program)
 
 
-def end_program(number: int, frame: Any) -> None:
+def end_program(number: int, frame: object) -> None:
     """End the process as the handler of a signal; what is under way is deleted first."""
     _ignore_signals()
     for undo in reversed([*_undo.values()]):

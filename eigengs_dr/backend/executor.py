@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
-Function = Callable[[Any, Any], Any]
+Task = TypeVar("Task")
+Value = TypeVar("Value")
+
+Function = Callable[[Task, Any], Value]
 """``function(task, shared)``, a function of a module."""
 
 
@@ -22,8 +25,8 @@ class Done(NamedTuple):
 
     Attributes
     ----------
-    task : Any
-    value : Any
+    task : object
+    value : object
         What the function returned.
     lost : str
         One line, if the task ended its worker so often that it is given up; the value is then
@@ -48,7 +51,7 @@ class Executor(Protocol):
     workers: int
 
     def map(
-        self, function: Function, tasks: Iterable[Any], shared: Any = None
+        self, function: Function[Task, Value], tasks: Iterable[Task], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task, and yield the results.
 
@@ -59,7 +62,7 @@ class Executor(Protocol):
         tasks : iterable
             Tasks of NumPy arrays, paths, numbers, bytes, and records of these. They are drawn when
             workers become free, a few ahead.
-        shared : Any
+        shared : object
             What all tasks use; it travels once.
 
         Yields
@@ -82,7 +85,7 @@ class LocalExecutor:
     workers = 1
 
     def map(
-        self, function: Function, tasks: Iterable[Any], shared: Any = None
+        self, function: Function[Task, Value], tasks: Iterable[Task], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`."""
         for task in tasks:
@@ -90,8 +93,11 @@ class LocalExecutor:
 
 
 def completed(
-    executor: Executor, function: Function, tasks: Iterable[Any], shared: Any = None
-) -> Generator[tuple[Any, Any], None, None]:
+    executor: Executor,
+    function: Function[Task, Value],
+    tasks: Iterable[Task],
+    shared: Any = None,
+) -> Generator[tuple[Task, Value], None, None]:
     """Run tasks none of which may fail.
 
     Parameters
@@ -102,7 +108,7 @@ def completed(
 
     Yields
     ------
-    task, value : Any
+    task, value : object
         See `Done`.
 
     Raises

@@ -6,11 +6,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
 
 from .ending import end_program
 
-Handler = Any
+Handler = Callable[[int, FrameType | None], object] | int | None
 """What `signal.getsignal` returns."""
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -87,7 +87,7 @@ def _first_signal(
         for number, old in handlers.items():
             signal.signal(number, old)
 
-    def handle(number: int, frame: Any) -> None:
+    def handle(number: int, frame: object) -> None:
         restore()
         react()
 

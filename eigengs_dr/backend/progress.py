@@ -12,7 +12,10 @@ from typing import Any, TypeVar
 DELAY = 2.0
 """Seconds before a bar appears."""
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+Progress = Callable[..., None] | bool | None
+"""What callers give, see `shows_progress`."""
+
+Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def shows_progress(function: Function) -> Function:
@@ -24,7 +27,7 @@ def shows_progress(function: Function) -> Function:
     arguments = signature(function)
 
     @wraps(function)
-    def call(*values: Any, **options: Any) -> Any:
+    def call(*values: object, **options: object) -> object:
         bound = arguments.bind(*values, **options)
         with progress_bar(bound.arguments.get("progress"), function.__name__) as show:
             bound.arguments["progress"] = show
@@ -34,7 +37,7 @@ def shows_progress(function: Function) -> Function:
 
 
 @contextmanager
-def progress_bar(progress: Any = None, name: str = "") -> Iterator[Callable[..., None] | None]:
+def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable[..., None] | None]:
     """Show a bar during a block, and return what reports progress.
 
     Parameters

@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from . import gpu
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path, too_old
 from .messages import warn
+from .types import Record
 
 BACKENDS = ("llvm", "cuda", "metal")
 
@@ -126,7 +126,7 @@ def _cuda_agrees() -> bool:
     return right
 
 
-def describe(backend: str | None = None) -> dict[str, Any]:
+def describe(backend: str | None = None) -> Record:
     """Return the hardware and the versions that a measurement depends on.
 
     Parameters

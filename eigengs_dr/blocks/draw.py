@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..backend.types import Values
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.region import crop
@@ -24,7 +24,7 @@ from .windows import TILE_SIDE, Source, Window, write_tiles
 BAND_PIXELS = 1 << 22
 """Pixels of a band of a picture that is drawn at once; one takes some 100 bytes."""
 
-Picture = NDArray[Any]
+Picture = Values
 
 
 def draw(data: SetData, backend: str | None = None) -> Picture:
@@ -52,7 +52,7 @@ def draw_region(
     region: tuple[int, int, int, int],
     size: tuple[int, int],
     backend: str | None = None,
-    kind: Any = np.uint8,
+    kind: type[np.generic] = np.uint8,
 ) -> Iterator[Picture]:
     """Draw a region of a set at any size, in bands of rows from top to bottom.
 
@@ -162,7 +162,7 @@ def compare_tasks(
         yield CompareTask(block, source.window(block.rows, block.columns), part, backend)
 
 
-def compare(task: CompareTask, shared: Any = None) -> tuple[float, float]:
+def compare(task: CompareTask, shared: None = None) -> tuple[float, float]:
     """Return the sums of the squared errors of a part in the spaces of psnr_ycbcr and psnr_rgb."""
     pixels, shown = task.window.read(), draw(task.data, task.backend)
     space = float_space(task.data.space)

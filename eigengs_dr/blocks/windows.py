@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..backend.messages import warn
+from ..backend.types import Record, Values
 from ..gaussian.file import MAX_SET_SIDE
 from ..image.header import transparency_note
 from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
@@ -24,7 +25,7 @@ from ..image.reading import TIFF, decode, read_header, reader_of
 from ..image.remote import is_copied
 from ..image.tiff import has_windows, read_window
 
-Pixels = NDArray[Any]
+Pixels = Values
 """Pixels (h, w) or (h, w, channels) of any type."""
 
 
@@ -94,7 +95,7 @@ class Source:
     height: int
     channels: int
     name: str
-    identity: dict[str, Any]
+    identity: Record
     pixels: Any
     keep_grey: bool
     encoding: str = "srgb"
@@ -157,7 +158,7 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     return Source(shape[1], shape[0], channels, name, identity, pixels, keep_grey, encoding)
 
 
-def _identity(path: Path) -> dict[str, Any]:
+def _identity(path: Path) -> Record:
     """Return what tells a file from others, and from itself when it has changed."""
     try:
         state = path.stat()

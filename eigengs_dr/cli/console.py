@@ -102,7 +102,7 @@ def bar(quiet: bool) -> Iterator[Callable[..., None]]:
     """
     with progress_bar(False if quiet else None) as show:
 
-        def show_printable(label: str, *values: Any) -> None:
+        def show_printable(label: str, *values: object) -> None:
             if show:
                 show(printable(label), *values)
 

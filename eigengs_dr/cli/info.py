@@ -13,6 +13,7 @@ import eigengs_dr as eg
 
 from ..backend.messages import printable
 from ..backend.selection import select
+from ..backend.types import Record
 from ..gaussian import file as set_file
 from ..gaussian.file import SetData
 from ..gaussian.packed import is_packed
@@ -22,7 +23,7 @@ from .console import about, table
 from .outputs import check_outputs, name_pictures
 from .scene import explained, load_mitsuba
 
-Facts = dict[str, Any]
+Facts = Record
 
 
 @click.command()

@@ -11,6 +11,7 @@ import click
 
 from ..backend.messages import printable
 from ..backend.selection import BACKENDS
+from ..backend.types import Record
 from ..image.color import SPACES
 from ..image.pixels import ENCODINGS
 from ..image.remote import is_url
@@ -25,7 +26,12 @@ MAX_PIXELS = 1 << 29
 MAX_RENDERED_SIDE = 1 << 17
 """Longest side of a picture to render into a TIFF file."""
 
-Option = Callable[[Callable[..., Any]], Callable[..., Any]]
+Command = Callable[..., object]
+
+Kind = click.ParamType | type | Callable[[str], object]
+"""What a value of an option is."""
+
+Option = Callable[[Command], Command]
 """What adds an option to a command."""
 
 # Each function below parses the text of an option or an argument; its name stands in the help.
@@ -146,7 +152,7 @@ def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, 
     return width, height
 
 
-def value(name: str, metavar: str | None, kind: Any, text: str, default: object = None) -> Option:
+def value(name: str, metavar: str | None, kind: Kind, text: str, default: object = None) -> Option:
     """Make an option that takes a value of a type of click, or one that a function parses."""
     return click.option(name, metavar=metavar, type=kind, help=text, default=default)
 
@@ -169,7 +175,7 @@ def output(text: str, metavar: str, required: bool = True) -> Option:
 
 def maps(text: str) -> Option:
     """Make the option that names image files of maps."""
-    many: Any = {"multiple": True, "type": map_file, "callback": by_name}
+    many: Record = {"multiple": True, "type": map_file, "callback": by_name}
     return click.option("--map", "maps", metavar="NAME[:SPACE]=FILE", help=text, **many)
 
 
@@ -217,10 +223,10 @@ class Run(NamedTuple):
 def shared(*names: str) -> Option:
     """Add options of `SHARED` to a command, which gets them as its first argument, a `Run`."""
 
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(command: Command) -> Command:
         @click.pass_context
         @wraps(command)
-        def call(context: click.Context, /, **given: Any) -> Any:
+        def call(context: click.Context, /, **given: Any) -> object:
             return command(Run(context, **{name: given.pop(name) for name in names}), **given)
 
         for name in reversed(names):

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 
-def executor_for(client: Client | Executor | None = None) -> Executor:
+def executor_for(client: object = None) -> Executor:
     """Return the executor of a client.
 
     Parameters

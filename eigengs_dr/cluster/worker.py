@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, cached_property
 from importlib.metadata import version
-from typing import Any
 
 from distributed import Worker, get_worker
 from distributed.protocol.pickle import dumps, loads
@@ -42,7 +41,7 @@ class Shared:
         self.data, self.versions = data, versions
 
     @cached_property
-    def value(self) -> tuple[Any, Any]:
+    def value(self) -> tuple[Callable, object]:
         """The function and its second argument."""
         function, shared = loads(self.data)
         return function, shared

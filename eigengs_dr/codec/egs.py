@@ -22,6 +22,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.types import Integers
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
 from ..gaussian.file import CUTOFF, SetData, check
 from ..gaussian.packed import MAGIC
@@ -34,8 +35,6 @@ from .cells import EVENNESS, MAX_LEVELS, code_cells, hilbert_encode
 from .gaussian_model import GaussianCoder
 from .quantization import Steps, Symbols, dequantize
 from .range_coder import Decoder, Encoder
-
-IntArray = NDArray[np.int64]
 
 SUFFIX = ".egs"
 
@@ -159,7 +158,7 @@ def _map_table(maps: Sequence[TextureMap]) -> bytes:
     return b"".join(parts)
 
 
-def section_to_bytes(section: Symbols, steps: Steps, corner: IntArray, levels: int) -> bytes:
+def section_to_bytes(section: Symbols, steps: Steps, corner: Integers, levels: int) -> bytes:
     """Return the bytes of a section; sort its Gaussians in Hilbert-curve order.
 
     Parameters
@@ -183,7 +182,7 @@ def section_to_bytes(section: Symbols, steps: Steps, corner: IntArray, levels: i
     return HEAD.pack(count, len(body), section_check(count, body)) + body
 
 
-def _cells(cells: IntArray, levels: int, evenness: int) -> Encoder:
+def _cells(cells: Integers, levels: int, evenness: int) -> Encoder:
     """Return an encoder that has coded cells, with one of the parameters `EVENNESS`."""
     coder = Encoder()
     code_cells(coder, cells, levels, EVENNESS[evenness])
@@ -272,7 +271,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             raise ValueError(f"{path}: {error}") from None
 
 
-def _read_header(file: BinaryIO) -> tuple[int, int, IntArray, EgsContent]:
+def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
     """Return the levels, the number of sections, the first cell, and a content without sections.
 
     Headers that `to_bytes` never writes are refused; `Gaussians.load` checks the rest.

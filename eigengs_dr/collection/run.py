@@ -18,7 +18,7 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def run_images(
     overwrite: bool,
     job: Job,
     progress: RowProgress | None = None,
-    client: Any = None,
+    client: object = None,
 ) -> list[ImageRow]:
     """Run a job; for arguments, rows and errors see `eigengs_dr.fit_many`.
 
@@ -290,7 +290,7 @@ def _figures_of(row: ImageRow) -> FitFigures | None:
     return FitFigures(row.psnr_ycbcr, row.psnr_rgb, row.iterations or 0, name)
 
 
-def _results(images: list[Any], job: Job) -> list[Any]:
+def _results(images: list, job: Job) -> list:
     """Return the results of a group; if it fails, its images say one by one what is wrong."""
     if isinstance(images[0], Exception):
         return images

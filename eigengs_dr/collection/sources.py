@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..backend.types import Record
 from ..gaussian.file import read_figures, read_head
 from ..image.folder import list_images
 from ..image.remote import is_url, stem_of
@@ -87,9 +88,9 @@ def list_sources(images: Images) -> Iterable[RunImage]:
     return sources
 
 
-def _name_each(images: Iterable[Any]) -> Iterator[RunImage]:
+def _name_each(images: Iterable) -> Iterator[RunImage]:
     """Name images one by one; a name that is taken is an error of the image."""
-    taken: dict[str, Any] = {}
+    taken: Record = {}
     for place, image in enumerate(images):
         is_file = isinstance(image, (str, os.PathLike))
         item = Path(image) if is_file and not is_url(image) else image
@@ -129,7 +130,7 @@ def plan_output(source: RunImage, manifest: Manifest, overwrite: bool) -> RunIma
     if overwrite or row.get("status") == "failed":
         return source
     width, height = head.size
-    figures: dict[str, Any] = {"width": width, "height": height, "gaussians": head.gaussians}
+    figures: Record = {"width": width, "height": height, "gaussians": head.gaussians}
     if fit := read_figures(output):
         figures |= {k: v for k, v in fit._asdict().items() if k != "source"}
     return source.row("skipped", **figures)

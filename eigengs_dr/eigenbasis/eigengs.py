@@ -20,6 +20,7 @@ from ..backend.arguments import takes_numbers
 from ..backend.notebook import to_html
 from ..backend.progress import shows_progress
 from ..backend.recording import exclusive
+from ..backend.types import Record
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from ..image.pixels import EncodedImage
@@ -256,7 +257,7 @@ class EigenGS:
         mean: str = "gaussians",
         target_psnr: float | None = None,
         progress: Any = None,
-        client: Any = None,
+        client: object = None,
     ) -> list[ImageRow]:
         """Encode many images; a bad image is a row with its error and does not end the run.
 
@@ -320,7 +321,7 @@ class EigenGS:
             raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
         return cls(**read_members(path, backend))
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Record:
         """Leave the encoder here: what it has computed holds arrays of Dr.Jit."""
         return {key: value for key, value in self.__dict__.items() if key != "encoder"}
 

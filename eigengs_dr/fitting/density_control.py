@@ -91,7 +91,7 @@ class DensityControl:
         found, images = relocate(gaussians, how, image), dr.width(gaussians.background[0])
         grid = Grid(found.width, found.height, images=images)
         canvas = Canvas.of(types_of(found.mean), grid)
-        return take(found, order_along_hilbert(canvas, found.mean))
+        return take(found, order_along_hilbert(canvas, (found.mean[0], found.mean[1])))
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,8 @@ class _Comparison:
 def _upload(gaussians: Gaussians, target: NDArray[np.float32], weight: Array | None) -> TiledImage:
     """Copy an image and its weights to the device."""
     types = types_of(gaussians.mean)
-    return TiledImage(*(v if v is None else batch_to_tiles(types, v) for v in (target, weight)))
+    weights = None if weight is None else batch_to_tiles(types, weight)
+    return TiledImage(batch_to_tiles(types, target), weights)
 
 
 def _compare(gaussians: Gaussians, image: TiledImage) -> _Comparison:

@@ -123,7 +123,7 @@ def _atanh(x: Float) -> Float:
 
 def _decode_cholesky(fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Gaussians:
     width, height = size or (fixed.width, fixed.height)
-    parts = {}
+    parts: Variables = {}
     if "mean" in variables:
         x, y = (0.5 * (tanh(v) + 1) for v in variables["mean"])
         parts["mean"] = type(fixed.mean)(x * width, y * height)

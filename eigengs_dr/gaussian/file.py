@@ -6,12 +6,12 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.messages import printable
+from ..backend.types import Arrays
 from ..image.color import MAX_CHANNELS, SPACES
 from ..image.formats import SUFFIXES
 from ..storage import npz
@@ -75,8 +75,6 @@ FIGURES: dict[str, Field] = {"figures": Field("f8", 1, 3), "source": Field("U", 
 
 MAX_SOURCE = 64
 """Characters of the name of an image that a file keeps: its last."""
-
-Arrays = dict[str, NDArray[Any]]
 
 
 class SetData(NamedTuple):

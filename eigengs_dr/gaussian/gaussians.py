@@ -17,17 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arguments import takes_numbers
-from ..backend.arrays import Float, UInt, settle, types_in, types_of, upload, upload_rows
+from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
 from ..backend.notebook import to_html
 from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
+from ..backend.types import Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size
 from ..storage.npz import BadValue
 from .channels import TextureMap, find_map
 from .file import CUTOFF, Arrays, SetData, check, read, write
-
-Rows = Float
-"""Several rows of Dr.Jit floats: an Array2f, Array3f or ArrayXf."""
 
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
@@ -285,7 +283,7 @@ class Gaussians:
         longer = dr.float64_array_t(types.Float)(dr.maximum(*size))
         low, high = types.Float(0.5 / longer), 1 / MIN_DEVIATION
 
-        def inside(x: Float, low: Float, high: Float, otherwise: Float) -> Float:
+        def inside(x: Float, low: FloatLike, high: FloatLike, otherwise: FloatLike) -> Float:
             return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
 
         a, b, c = self.factor
@@ -476,7 +474,7 @@ FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}
 
 
 @exclusive()
-def to_tensors(gaussians: Gaussians) -> dict[str, Rows]:
+def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return the parameters of a set as tensors; differentiable.
 
     Parameters
@@ -508,7 +506,7 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Rows]:
 
 
 @exclusive()
-def from_tensors(tensors: Mapping[str, Rows], like: Gaussians) -> Gaussians:
+def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """Create a set from tensors; differentiable. The inverse of `to_tensors`.
 
     Parameters
@@ -551,10 +549,21 @@ def from_tensors(tensors: Mapping[str, Rows], like: Gaussians) -> Gaussians:
         expected = (columns,) if name == "background" else (count, columns)
         if tuple(tensor.shape) != expected or not count:
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {expected}")
-    return replace(like, **{name: _columns_of(getattr(like, name), t) for name, t in given.items()})
+
+    def rows(name: str) -> Rows:
+        old: Rows = getattr(like, name)
+        return _columns_of(old, given[name]) if name in given else old
+
+    return replace(
+        like,
+        mean=rows("mean"),
+        factor=rows("factor"),
+        color=rows("color"),
+        background=rows("background"),
+    )
 
 
-def _columns_of(like: Rows, tensor: Rows) -> Rows:
+def _columns_of(like: Rows, tensor: Tensor) -> Rows:
     """Return the columns of a tensor as a nested array with the type of `like`."""
     types = types_of(like)
     number = tensor.shape[-1]

@@ -59,7 +59,7 @@ def check_encoding(encoding: str | None) -> None:
         raise ValueError(f"encoding {encoding!r} is unknown; use one of {known}")
 
 
-def encoding_of(image: Any, encoding: str | None = None) -> str | None:
+def encoding_of(image: object, encoding: str | None = None) -> str | None:
     """Return what the pixels of an image are.
 
     Parameters
@@ -98,7 +98,7 @@ def encoding_of(image: Any, encoding: str | None = None) -> str | None:
     return None
 
 
-def peak_of(dtype: np.dtype[Any]) -> int:
+def peak_of(dtype: np.dtype) -> int:
     """Return the value of white: the largest integer, or 1 for floats and bool.
 
     Raises

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.recording import exclusive
+from ..backend.types import Record
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
@@ -173,7 +173,7 @@ def check_count(count: int) -> None:
         )
 
 
-def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> dict[str, Any]:
+def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> Record:
     """Return the arrays of a set for a page.
 
     Parameters
@@ -251,7 +251,7 @@ NAMES = {
 """What the channels of a model are called, by its space."""
 
 
-def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> dict[str, Any]:
+def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> Record:
     """Return the components of a model for a page.
 
     Parameters

@@ -75,7 +75,7 @@ class Eigenbasis:
         energy: float | None = None,
         space: str = "ycbcr",
         progress: Any = None,
-        client: Any = None,
+        client: object = None,
         checkpoint: str | os.PathLike[str] | None = None,
     ) -> Eigenbasis:
         """Find the eigenbasis of a family of images in one pass.

@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, Bool, Float, UInt, rcp, rsqrt, types_of
+from ...backend.arrays import ArrayTypes, rcp, rsqrt, types_of
+from ...backend.types import Bool, Float, UInt
 from ..binning.lists import TileLists, build_lists
 from ..binning.tiles import Grid
 from ..evaluate import falloff, widen

@@ -1,0 +1,143 @@
+"""The words of annotations: arrays of Dr.Jit, and arrays of NumPy.
+
+Which types of Dr.Jit an array has, of llvm or cuda, in single or double precision, is known at run
+time only: the same code serves all. What a checker can know is what an array holds, and that is
+what these names say. It then refuses a mask where a number belongs, or a row for several rows.
+Functions of Dr.Jit itself take and return anything, as far as a checker sees.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PathLike = str | os.PathLike[str]
+"""The path of a file or a folder, or a URL."""
+
+Doubles = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Floats = NDArray[np.floating]
+"""Floats of NumPy: of double, of single, of either precision."""
+
+Integers = NDArray[np.int64]
+"""Integers of NumPy."""
+
+Values = NDArray[Any]
+"""A NumPy array of any dtype."""
+
+Arrays = dict[str, Values]
+"""Arrays of NumPy by their names, as in a file."""
+
+Record = dict[str, Any]
+"""Numbers, texts and lists of them by their names, as in JSON."""
+
+if TYPE_CHECKING:
+
+    class DrJitArray:
+        """What all arrays of Dr.Jit have."""
+
+        index: int
+        state: object
+
+        def __init__(self, *values: object) -> None: ...
+        def numpy(self) -> NDArray[np.float32]:
+            """Return a copy, or a view."""
+
+        def __len__(self) -> int: ...
+        def __eq__(self, other: object) -> bool: ...
+
+    class Bool(DrJitArray):
+        """A mask."""
+
+        def __and__(self, other: Bool | bool) -> Bool: ...
+        def __or__(self, other: Bool | bool) -> Bool: ...
+        def __xor__(self, other: Bool | bool) -> Bool: ...
+        def __invert__(self) -> Bool: ...
+
+        __rand__ = __and__
+        __ror__ = __or__
+
+    class UInt(DrJitArray):
+        """Integers of 32 bits, with or without a sign."""
+
+        def __add__(self, other: UInt | int) -> UInt: ...
+        def __sub__(self, other: UInt | int) -> UInt: ...
+        def __mul__(self, other: UInt | int) -> UInt: ...
+        def __floordiv__(self, other: UInt | int) -> UInt: ...
+        def __mod__(self, other: UInt | int) -> UInt: ...
+        def __lshift__(self, other: UInt | int) -> UInt: ...
+        def __rshift__(self, other: UInt | int) -> UInt: ...
+        def __and__(self, other: UInt | int) -> UInt: ...
+        def __or__(self, other: UInt | int) -> UInt: ...
+        def __xor__(self, other: UInt | int) -> UInt: ...
+        def __neg__(self) -> UInt: ...
+        def __invert__(self) -> UInt: ...
+        def __lt__(self, other: UInt | int) -> Bool: ...
+        def __le__(self, other: UInt | int) -> Bool: ...
+        def __gt__(self, other: UInt | int) -> Bool: ...
+        def __ge__(self, other: UInt | int) -> Bool: ...
+        def __getitem__(self, place: int) -> int: ...
+
+        __radd__ = __add__
+        __rsub__ = __sub__
+        __rmul__ = __mul__
+
+    class Float(DrJitArray):
+        """Floats."""
+
+        def __add__(self, other: Float | UInt | float) -> Float: ...
+        def __sub__(self, other: Float | UInt | float) -> Float: ...
+        def __mul__(self, other: Float | UInt | float) -> Float: ...
+        def __truediv__(self, other: Float | UInt | float) -> Float: ...
+        def __neg__(self) -> Float: ...
+        def __lt__(self, other: Float | float) -> Bool: ...
+        def __le__(self, other: Float | float) -> Bool: ...
+        def __gt__(self, other: Float | float) -> Bool: ...
+        def __ge__(self, other: Float | float) -> Bool: ...
+        def __getitem__(self, place: int) -> float: ...
+
+        __radd__ = __add__
+        __rsub__ = __sub__
+        __rmul__ = __mul__
+        __rtruediv__ = __truediv__
+
+    class Rows(DrJitArray):
+        """Several rows of floats: an Array2f, Array3f or ArrayXf."""
+
+        def __add__(self, other: Rows | Float | float) -> Rows: ...
+        def __sub__(self, other: Rows | Float | float) -> Rows: ...
+        def __mul__(self, other: Rows | Float | float) -> Rows: ...
+        def __truediv__(self, other: Rows | Float | float) -> Rows: ...
+        def __neg__(self) -> Rows: ...
+        def __getitem__(self, row: int) -> Float: ...
+        def __setitem__(self, row: int, value: Float) -> None: ...
+        def __iter__(self) -> Iterator[Float]: ...
+
+        __radd__ = __add__
+        __rsub__ = __sub__
+        __rmul__ = __mul__
+
+    class Tensor(DrJitArray):
+        """A tensor of floats."""
+
+        shape: tuple[int, ...]
+        array: Float
+
+        def __getitem__(self, part: object) -> Tensor: ...
+
+else:  # whatever Dr.Jit gives
+
+    class DrJitArray:
+        """Stands for the arrays of Dr.Jit in annotations alone."""
+
+    Bool = UInt = Float = Rows = Tensor = DrJitArray
+
+Mask = Bool | bool
+"""A mask, or one truth value for all."""
+
+FloatLike = Float | float
+"""Floats, or one number for all."""
