@@ -47,7 +47,7 @@ PENALTY = 1e3
 """Weight of the equality constraints; the differences of neighbouring samples are at most 1."""
 
 
-@cache
+@cache  # a quadratic program, for every texture of a spectral variant
 def basis() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute the smoothest basis spectra that reproduce the three primaries.
 
@@ -109,7 +109,7 @@ def _hat_colors() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return half[::2], colors
 
 
-@cache
+@cache  # of constants
 def mean_weights() -> tuple[float, float, float]:
     """Return the means of R, G and B over the wavelengths, exactly: they are linear in pieces."""
     _, spectra = basis()

@@ -144,6 +144,9 @@ def gaussian_texture() -> type:
 
         # --- Lookups -----------------------------------------------------------------------------
 
+        # Mitsuba calls lookups while it records a program: if the collector freed another scene
+        # then, the program would lose that scene's textures, and read freed memory.
+
         @collector_off()
         def eval(self, si: Interaction, active: Mask = True) -> mi.Spectrum:
             color = self._color(si, active)
@@ -355,12 +358,12 @@ def register_plugins() -> None:
         _register(mi.variant())
 
 
-@cache
+@cache  # a second callback would register everything twice
 def _follow() -> None:
     mi.detail.add_variant_callback(lambda old, new: _register(new))
 
 
-@cache
+@cache  # once for each variant
 def _register(variant: str) -> None:
     scalar = variant.startswith("scalar")
     register_texture("gaussian_texture", _refuse if scalar else gaussian_texture())

@@ -4,6 +4,8 @@
 - ``selection``: picks llvm or cuda
 - ``arrays``: array types that go together; copies of NumPy arrays; exact arithmetic on cuda
 - ``recording``: frozen programs; one thread at a time
+- ``doors``: what callers reach the package by, and where it takes the lock
+- ``types``: the words of annotations
 - ``messages``: warnings, and text for a terminal
 - ``progress``: bars
 - ``interrupts``: Ctrl-C and SIGTERM between steps

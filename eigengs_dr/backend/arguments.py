@@ -51,6 +51,8 @@ def takes_numbers(function: Function) -> Function:
     """Decorate a function whose numbers may be those of NumPy, see `plain_numbers`."""
     arguments = signature(function)
     annotations = {name: p.annotation for name, p in arguments.parameters.items()}
+    if not any(annotation in KINDS for annotation in annotations.values()):
+        return function
 
     @wraps(function)
     def call(*values: object, **options: object) -> object:

@@ -83,7 +83,7 @@ def types_in(module: ModuleType, bits: int = 32) -> ArrayTypes:
     return _types(module.__name__, bits)
 
 
-@cache
+@cache  # nearly every function asks
 def _types(module: str, bits: int) -> ArrayTypes:
     suffix = "64" if bits == 64 else ""
     names = ["Int32", "UInt32", "Bool", "Array2u"]

@@ -9,6 +9,8 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
+from .recording import exclusive
+
 Task = TypeVar("Task")
 Value = TypeVar("Value")
 
@@ -89,7 +91,9 @@ class LocalExecutor:
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`."""
         for task in tasks:
-            yield Done(task, function(task, shared))
+            with exclusive():  # a task may use Dr.Jit, beside other threads of the caller
+                value = function(task, shared)
+            yield Done(task, value)
 
 
 def completed(

@@ -266,7 +266,7 @@ def _flatten(value: Any, arrays: list[DrJitArray]) -> Shape:
     return kind, names, tuple(_flatten(part, arrays) for part in parts)
 
 
-@cache
+@cache  # asked at every call of a frozen program
 def _field_names(kind: type) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind))
 

@@ -105,13 +105,13 @@ def _has(dr: ModuleType, name: str) -> bool:
     return kind is not None and bool(dr.has_backend(kind))
 
 
-@cache
+@cache  # the second call is silent
 def _announce(backend: str, state: str) -> None:
     """Warn of the state of a backend, once in a process."""
     warn(f"backend {backend}: {state}; compare with backend 'llvm'")
 
 
-@cache
+@cache  # it asks a file, or compares fits, and warns once
 def _cuda_agrees() -> bool:
     """Whether cuda may be the default: a fit agrees with llvm; warn if it does not."""
     from .detail import cuda_device

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..backend.doors import door
 from ..backend.types import Values
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
@@ -47,6 +48,11 @@ def _load(data: SetData, backend: str | None) -> Gaussians:
     return Gaussians.from_data(data, backend)
 
 
+@door
+def _pixels_of(data: SetData, backend: str | None) -> Picture:
+    return render(_load(data, backend)).numpy()
+
+
 def draw_region(
     data: SetData,
     region: tuple[int, int, int, int],
@@ -83,7 +89,7 @@ def draw_region(
     for first in range(0, height, rows):
         band = width, min(rows, height - first)
         part = crop(data, (0, first / scale[1]), band, scale)
-        yield to_file(render(_load(part, backend)).numpy(), rendered_as(data.space), kind)
+        yield to_file(_pixels_of(part, backend), rendered_as(data.space), kind)
 
 
 def save_region(

@@ -76,7 +76,7 @@ def _any_number(coder: Coder, number: Integers, upper: Integers) -> Integers:
     return np.minimum(result, number)
 
 
-@cache
+@cache  # a tree of cells asks for small n again and again
 def _beta_binomial(n: int, evenness: int) -> stream.model.Model:
     """Return the model of the number of n Gaussians in a half."""
     chances = [1.0]

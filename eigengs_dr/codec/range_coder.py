@@ -146,7 +146,7 @@ def _shift(kind: Integers) -> Integers:
     return np.maximum(0, -(-kind // PER_OCTAVE) - 3)
 
 
-@cache
+@cache  # some hundred models, each asked for with every number of its class
 def _student(label: int, tails: int) -> stream.model.Model:
     """Return the model of the high parts of numbers of a class, see `Coder.numbers`."""
     kind, offset = divmod(label, OFFSETS)

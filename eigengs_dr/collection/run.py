@@ -25,6 +25,7 @@ import numpy as np
 from ..backend.executor import Executor
 from ..backend.interrupts import defer_interrupts
 from ..backend.messages import warn
+from ..backend.recording import exclusive
 from ..cluster.client import executor_for
 from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write
@@ -295,7 +296,8 @@ def _results(images: list, job: Job) -> list:
     if isinstance(images[0], Exception):
         return images
     try:
-        return list(job.work(images))
+        with exclusive():  # for a group, so that other threads wait for no folder
+            return list(job.work(images))
     except FAILURES as error:
         return [error] if len(images) == 1 else [_results([image], job)[0] for image in images]
 

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.arguments import takes_numbers
 from ..backend.notebook import to_html
 from ..backend.progress import shows_progress
-from ..backend.recording import exclusive
 from ..backend.types import Record
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
@@ -158,7 +157,6 @@ class EigenGS:
             return None
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
-    @exclusive()
     @takes_numbers
     def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
         """Find the coefficients of an image by least squares on the rendered components.
@@ -192,7 +190,6 @@ class EigenGS:
         """
         return self.encoder.project(check_image(image, copy=False), target_psnr)
 
-    @exclusive()
     def reconstruct(
         self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
     ) -> Gaussians:
@@ -212,7 +209,6 @@ class EigenGS:
         """
         return self.encoder.reconstruct(coefficients, size)
 
-    @exclusive()
     @takes_numbers
     def encode(
         self,
@@ -333,7 +329,6 @@ class EigenGS:
         return Encoder(self.gaussians, self.weights, self.mean_image, self.low)
 
 
-@exclusive()
 def _encode_all(
     images: list[EncodedImage], model: EigenGS, options: tuple[str, str, float | None]
 ) -> list[Gaussians]:
@@ -341,6 +336,6 @@ def _encode_all(
     return [model.encode(image, *options) for image in images]
 
 
-@cache
+@cache  # a file of the package does not change
 def _shipped(name: str, backend: str | None) -> EigenGS:
     return EigenGS(**read_members(SHIPPED[name], backend))

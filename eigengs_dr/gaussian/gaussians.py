@@ -16,10 +16,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..backend.arguments import takes_numbers
 from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
+from ..backend.doors import class_of_doors, door
 from ..backend.notebook import to_html
-from ..backend.recording import exclusive
 from ..backend.selection import BackendError, select
 from ..backend.types import Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size
@@ -32,6 +31,7 @@ MIN_DEVIATION = 0.25
 between pixel centres, where it has no gradient."""
 
 
+@class_of_doors
 @dataclass(repr=False, eq=False)
 class Gaussians:
     """N two-dimensional Gaussians and a constant background: an image of any size.
@@ -84,7 +84,6 @@ class Gaussians:
     maps: tuple[TextureMap, ...] = ()
 
     @classmethod
-    @takes_numbers
     def from_arrays(
         cls,
         mean: ArrayLike,
@@ -128,7 +127,6 @@ class Gaussians:
         return cls.from_data(SetData(arrays, size, space, cutoff, tuple(maps)), backend, dtype)
 
     @classmethod
-    @exclusive()
     def from_data(
         cls, data: SetData, backend: str | None = None, dtype: DTypeLike = np.float32
     ) -> Gaussians:
@@ -161,7 +159,6 @@ class Gaussians:
         size = self.width, self.height
         return SetData(self.to_arrays(), size, self.space, self.cutoff, self.maps)
 
-    @exclusive()
     def to_arrays(self) -> Arrays:
         """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,) as NumPy arrays."""
 
@@ -197,7 +194,6 @@ class Gaussians:
         """Number of channels."""
         return len(self.color)
 
-    @exclusive()
     def __getitem__(self, selection: Any) -> Gaussians:
         """Select Gaussians by a slice, an integer array or a boolean mask, or a map by its name.
 
@@ -229,8 +225,6 @@ class Gaussians:
         color, background = kind(list(self.color)[own]), kind(list(self.background)[own])
         return replace(self, color=color, background=background, space=found.space, maps=())
 
-    @exclusive()
-    @takes_numbers
     def scaled(self, width: int, height: int) -> Gaussians:
         """Scale the picture to another native size, in pixels; differentiable.
 
@@ -263,7 +257,6 @@ class Gaussians:
             height=height,
         )
 
-    @exclusive()
     def bounded(self, size: tuple[Float, Float] | None = None) -> Gaussians:
         """Clip every parameter to its bounds.
 
@@ -310,7 +303,6 @@ class Gaussians:
         write(path, self.data())
 
     @classmethod
-    @takes_numbers
     def load(
         cls,
         path: str | os.PathLike[str],
@@ -374,7 +366,7 @@ def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
     return [row + dr.zeros(type(row), len(gaussians)) for row in rows]
 
 
-@exclusive()
+@door
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     """Join sets and add their backgrounds: the result renders as the sum of the sets.
 
@@ -473,7 +465,7 @@ FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}
 """Parameters of a set, with their numbers of columns; 0 means the number of channels."""
 
 
-@exclusive()
+@door
 def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return the parameters of a set as tensors; differentiable.
 
@@ -505,7 +497,7 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     return tensors
 
 
-@exclusive()
+@door
 def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """Create a set from tensors; differentiable. The inverse of `to_tensors`.
 

@@ -12,9 +12,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..backend.arguments import takes_numbers
 from ..backend.arrays import ArrayTypes, make_divisor, settle, types_of
-from ..backend.recording import exclusive
+from ..backend.doors import door
 from ..backend.types import Float, FloatLike, Tensor, UInt, Values
 from ..gaussian.channels import show_sums, slices
 from ..gaussian.file import MAX_CUTOFF, check_index_range
@@ -34,8 +33,7 @@ from .parameters import (
 )
 
 
-@exclusive()
-@takes_numbers
+@door
 def render(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -107,8 +105,7 @@ def render(
     return from_sum(gaussians.space, tensor)
 
 
-@exclusive()
-@takes_numbers
+@door
 def tile_lists(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -157,8 +154,7 @@ def tile_lists(
     return bin_gaussians(scaled, float(margin))
 
 
-@exclusive()
-@takes_numbers
+@door
 def picture_of(
     gaussians: Gaussians | Fitted,
     width: int | None = None,

@@ -11,10 +11,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arguments import takes_numbers
+from ..backend.doors import door
 from ..backend.messages import warn
 from ..backend.progress import shows_progress
-from ..backend.recording import exclusive
 from ..backend.types import PathLike, Record
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded
@@ -97,8 +96,7 @@ class ConvertedScene(NamedTuple):
 
 
 @shows_progress
-@exclusive()
-@takes_numbers
+@door
 def convert_scene(
     scene: PathLike | Record,
     output: str | os.PathLike[str],

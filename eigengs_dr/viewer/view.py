@@ -17,7 +17,6 @@ import jinja2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.recording import exclusive
 from ..backend.types import Record
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
@@ -67,7 +66,7 @@ class Page:
         return f'<iframe srcdoc="{escape(self.html)}" style="{style}"></iframe>'
 
 
-@cache
+@cache  # compiled once
 def _template() -> jinja2.Template:
     """Return the template of a page; an unknown value is an error, and text is escaped."""
     environment = jinja2.Environment(
@@ -79,7 +78,6 @@ def _template() -> jinja2.Template:
     return environment.get_template("page.html.j2")
 
 
-@exclusive()
 def view(
     source: Gaussians | Fit | EigenGS,
     image: ArrayLike | None = None,
