@@ -9,8 +9,6 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
-from .recording import exclusive
-
 Task = TypeVar("Task")
 Value = TypeVar("Value")
 
@@ -90,6 +88,8 @@ class LocalExecutor:
         self, function: Function[Task, Value], tasks: Iterable[Task], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`."""
+        from .recording import exclusive  # loads Dr.Jit, which the help of commands does not need
+
         for task in tasks:
             with exclusive():  # a task may use Dr.Jit, beside other threads of the caller
                 value = function(task, shared)
