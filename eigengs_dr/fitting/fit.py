@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.arguments import takes_numbers
-from ..backend.feedback import defer_interrupts, shows_progress, to_html
-from ..backend.recording import exclusive
+from ..backend.doors import door
+from ..backend.interrupts import defer_interrupts
+from ..backend.notebook import to_html
+from ..backend.progress import shows_progress
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians, scale_channels
@@ -123,7 +124,7 @@ class FitInterrupted(KeyboardInterrupt):
 
 @named_options
 @shows_progress
-@takes_numbers
+@door
 def fit(
     image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map],
     gaussians: int | Sequence[int] | None = None,
@@ -261,7 +262,6 @@ def fit(
     return replace(found, source=source)
 
 
-@exclusive()
 def fit_images(
     images: Sequence[PixelsOrPath],
     options: FitOptions,
@@ -312,7 +312,6 @@ def fit_images(
     return _finished(found, affines, mean_image, started, seconds_init)
 
 
-@exclusive()
 def fit_maps(
     images: list[MapImage],
     options: FitOptions,
