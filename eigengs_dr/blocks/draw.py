@@ -171,7 +171,7 @@ def compare_tasks(
 
 
 def compare(
-    task: CompareTask, shared: Any = None, *, affine: Affine, codes: bool
+    task: CompareTask, shared: None = None, *, affine: Affine, codes: bool
 ) -> tuple[float, float]:
     """Return the sums of the squared errors of a part in the spaces of psnr_ycbcr and psnr_rgb.
 

@@ -101,8 +101,7 @@ class State:
 
     def replaced(self, gaussians: Gaussians) -> State:
         """Return the state with another set, from which the optimiser starts anew."""
-        nothing = {"fixed": None, "moving": None, "lists": ()}
-        return replace(self, gaussians=gaussians, **nothing)
+        return replace(self, gaussians=gaussians, fixed=None, moving=None, lists=())
 
     @property
     def total(self) -> int:
@@ -141,7 +140,6 @@ def descend(
     """
     part = range(iterations) if part is None else part
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
-    changes = sorted({*(step for _, steps in acts for step in steps), part.stop})
     factors, largest = method.rate_factors(iterations, state.chosen), 0
     rates = rate_table(objective.types, method, factors)
     with release_later(state), freeze_program(step_program(objective, method)) as take_step:
@@ -152,9 +150,8 @@ def descend(
             if state.moving is None:
                 state = started(state, method, step, objective.grid.images)
             if not state.lists or step >= state.until:
-                end = next(change for change in changes if change > step)
-                state = _listed(state, objective, method, factors, step, end)
-            largest = max(largest, len(state.fixed))
+                state = _listed(state, objective, method, factors, step, part.stop)
+            largest = max(largest, len(state.gaussians))
             moving, moved = take_step(
                 largest,
                 state.moving,

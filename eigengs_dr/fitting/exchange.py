@@ -238,7 +238,8 @@ def in_order(gaussians: Gaussians, images: int = 1) -> Gaussians:
     """
     grid = Grid(gaussians.width, gaussians.height, images=images)
     canvas = Canvas.of(types_of(gaussians.mean), grid)
-    return take(gaussians, order_along_hilbert(canvas, gaussians.mean))
+    x, y = gaussians.mean
+    return take(gaussians, order_along_hilbert(canvas, (x, y)))
 
 
 def blend(one: Gaussians, other: Gaussians, share: Float) -> Gaussians:

@@ -293,8 +293,9 @@ def fit_images(
                 start = fitted(start, data[0].affine)
             moves = options.iterations > 0
             objective, begun = start_from(start, objective, options.method, pixels[0], moves)
-            if options.method.needs_model:
-                mean_image = options.method.mean_image(start, width, height)
+            base = objective.pictures[0].base
+            if base is not None:
+                mean_image = objective.picture(base).numpy()
 
         def score(gaussians: Gaussians) -> list[Row]:
             seconds = (time.perf_counter() - started) / len(images)

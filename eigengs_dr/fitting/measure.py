@@ -101,7 +101,9 @@ def _squared_errors(
         return [values[k * channels : (k + 1) * channels] for k in range(length)]
 
     pixels, inside = read(rendered), pixels_inside(types, grid)
-    floats, codes, areas = [], [], []
+    floats: list[Float] = []
+    codes: list[Float] = []
+    areas: list[Float] = []
     for space, first, image, scale, offset, weight, base in pictures:
         a, b = spread(scale, owner), spread(offset, owner)
         totals = [types.Float(0)] * 3

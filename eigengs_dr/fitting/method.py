@@ -46,11 +46,13 @@ class Model(Protocol):
     def gaussians(self) -> Gaussians:
         """Gaussians at the native size of the model."""
 
-    def encode(self, image: NDArray[np.float32], colors: str = "exact") -> Gaussians:
+    def encode(
+        self, image: NDArray[np.float32], colors: str = "exact", mean: str = "gaussians"
+    ) -> Gaussians:
         """Return the set of an image at the size of the image."""
 
     def dense_mean(self, width: int, height: int) -> NDArray[np.float32]:
-        """Return the pixels (height, width, C) of the mean image, in the space of the set."""
+        """Return the pixels (height, width, C) that a set of the mean "dense" lacks."""
 
 
 @dataclass(frozen=True)

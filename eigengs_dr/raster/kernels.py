@@ -106,6 +106,7 @@ def _sum_blocks(
             return i + 1, [dr.fma(w, c, s) for (w, c), s in zip(terms, sums, strict=True)]
 
         def add_tangent(i: UInt, sums: list) -> tuple:
+            assert tangent is not None
             p = gather(i, packed)
             with dr.resume_grad():
                 dr.enable_grad(p)

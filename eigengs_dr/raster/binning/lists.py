@@ -318,7 +318,8 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[
     """Return the order of the tiles, and the ranges of their lists in this order."""
     tile = dr.arange(types.UInt, grid.tiles)
     if ordered:
-        length = np.diff(starts.numpy().view(np.int32))
+        ends = starts.numpy().view(np.int32)
+        length = ends[1:] - ends[:-1]
         x, y = (np.arange(n, dtype=np.int32) // TILE_WINDOW for n in (grid.nx, grid.ny))
         window = (x + y[:, None] * (x[-1] + 1)).ravel()
         images = np.arange(grid.images, dtype=np.int32)[:, None]
