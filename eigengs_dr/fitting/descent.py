@@ -41,6 +41,8 @@ class Moving(NamedTuple):
         The state of the optimiser for each variable.
     time : Float, shape (1,)
         Steps since the optimiser started.
+    speed : Float, shape (1,) or (N,)
+        Factor of all learning rates.
     packed : Float
         The parameters of the set for the kernels.
     rate_scale : Float or None
@@ -50,6 +52,7 @@ class Moving(NamedTuple):
     variables: Variables
     moments: dict[str, tuple]
     time: Float
+    speed: Float
     packed: Float
     rate_scale: Float | None
 
@@ -70,8 +73,11 @@ class State:
         Whether the user chose the Gaussians: controls then move them only for the better.
     squares : Float or None, shape (images,)
         The sums of ``h (p - t)^2`` that a control has measured before this step.
+    speed : tuple of float
+        Factor of all learning rates, for each image; () for 1.
     fixed : Gaussians or None
-        The set whose variables move; None until the next step, which starts the optimiser.
+        The set at which the optimiser started, whose variables move; None until the next step,
+        which starts the optimiser.
     moving : Moving or None
     since : int
         The step at which the optimiser started.
@@ -86,6 +92,7 @@ class State:
     surplus: int = 0
     chosen: bool = False
     squares: Float | None = None
+    speed: tuple[float, ...] = ()
     fixed: Gaussians | None = None
     moving: Moving | None = None
     since: int = 0
@@ -94,8 +101,7 @@ class State:
 
     def replaced(self, gaussians: Gaussians) -> State:
         """Return the state with another set, from which the optimiser starts anew."""
-        nothing = {"fixed": None, "moving": None, "lists": ()}
-        return replace(self, gaussians=gaussians, **nothing)
+        return replace(self, gaussians=gaussians, fixed=None, moving=None, lists=())
 
     @property
     def total(self) -> int:
@@ -134,8 +140,8 @@ def descend(
     """
     part = range(iterations) if part is None else part
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
-    changes = sorted({*(step for _, steps in acts for step in steps), part.stop})
-    rates, largest = rate_table(objective.types, method, iterations), 0
+    factors, largest = method.rate_factors(iterations, state.chosen), 0
+    rates = rate_table(objective.types, method, factors)
     with release_later(state), freeze_program(step_program(objective, method)) as take_step:
         for step in part:
             for control, steps in acts:
@@ -144,9 +150,8 @@ def descend(
             if state.moving is None:
                 state = started(state, method, step, objective.grid.images)
             if not state.lists or step >= state.until:
-                end = next(change for change in changes if change > step)
-                state = _listed(state, objective, method, step, iterations, end)
-            largest = max(largest, len(state.fixed))
+                state = _listed(state, objective, method, factors, step, part.stop)
+            largest = max(largest, len(state.gaussians))
             moving, moved = take_step(
                 largest,
                 state.moving,
@@ -189,16 +194,28 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
         color = [row + zeros for row in gaussians.color]
         scale = rate_scale_of(color, method.rate_exponent, images)
         dr.eval(scale)
-    moving = Moving(variables, moments, dr.opaque(types.Float, 0), pack(gaussians), scale)
+    speed = upload(types.Float, np.array(state.speed or (1.0,)))
+    if len(state.speed) > 1:
+        image, _ = make_divisor(types, state.total).divmod(dr.arange(types.UInt, len(gaussians)))
+        speed = dr.gather(types.Float, speed, image)
+        dr.eval(speed)
+    time = dr.opaque(types.Float, 0)
+    moving = Moving(variables, moments, time, speed, pack(gaussians), scale)
     return replace(state, fixed=gaussians, moving=moving, since=step, lists=())
 
 
 def _listed(
-    state: State, objective: Pixels, method: Method, step: int, iterations: int, end: int
+    state: State,
+    objective: Pixels,
+    method: Method,
+    factors: Sequence[float],
+    step: int,
+    end: int,
 ) -> State:
     """Make the tile lists of the current set; they last until `end`, or until it moved too far."""
     assert state.fixed is not None and state.moving is not None
-    until, moves = next_build(method, step, iterations, end, state.since)
+    slowed = [factor * max(state.speed, default=1.0) for factor in factors]
+    until, moves = next_build(method, slowed, step, end, state.since)
     pad, growth = method.coordinates.reach(state.fixed, moves)
     if state.moving.rate_scale is not None:
         pad *= state.moving.rate_scale
@@ -212,15 +229,17 @@ def _listed(
 
 
 def next_build(
-    method: Method, step: int, iterations: int, end: int, since: int = 0
+    method: Method, factors: Sequence[float], step: int, end: int, since: int = 0
 ) -> tuple[int, dict[str, float]]:
     """Return how long the tile lists of a step last, and how far the variables move until then.
 
     Parameters
     ----------
     method : Method
-    step, iterations : int
-        The step that needs lists, and the number of steps of the descent.
+    factors : sequence of float
+        From `Method.rate_factors`.
+    step : int
+        The step that needs lists.
     end : int
         A step that needs no lists, or other ones.
     since : int, optional
@@ -236,7 +255,7 @@ def next_build(
     largest, total, stop = max(method.rates.values()), 0.0, step
     while stop < end:
         warm = min(1.0, (stop - since + 1) / max(1, method.warm_up))
-        factor = method.rate_factor(stop, iterations) * warm
+        factor = factors[stop] * warm
         if stop > step and largest * (total + factor) > method.drift:
             break
         total += factor
@@ -244,9 +263,11 @@ def next_build(
     return stop, {name: rate * total for name, rate in method.rates.items()}
 
 
-def rate_table(types: ArrayTypes, method: Method, iterations: int) -> Float:
-    """Return the learning rates of all steps, step after step, as Float."""
-    factors = [method.rate_factor(step, iterations) for step in range(iterations)]
+def rate_table(types: ArrayTypes, method: Method, factors: Sequence[float]) -> Float:
+    """Return the learning rates of all steps, step after step, as Float.
+
+    The factors are those of `Method.rate_factors`.
+    """
     table = np.outer(factors, list(method.rates.values()))
     return upload(types.Float, table.ravel().astype(np.float32 if types.bits == 32 else np.float64))
 
@@ -314,7 +335,7 @@ def _move(
     Float, coordinates = type(moving.packed), method.coordinates
     slopes = _pull_back(coordinates, fixed, moving.variables, gradient, size)
     time = moving.time + 1
-    warm = dr.minimum(time * (1 / max(1, method.warm_up)), 1)
+    warm = dr.minimum(time * (1 / max(1, method.warm_up)), 1) * moving.speed
     variables, moments = {}, {}
     for k, name in enumerate(method.rates):
         rate = dr.gather(Float, rates, index * len(method.rates) + k) * warm
@@ -325,7 +346,7 @@ def _move(
         )
     variables = coordinates.project(fixed, variables, size)
     moved = coordinates.decode(fixed, variables, size)
-    return Moving(variables, moments, time, pack(moved), moving.rate_scale), moved
+    return Moving(variables, moments, time, moving.speed, pack(moved), moving.rate_scale), moved
 
 
 def _sum_level(parts: Float, lists: TileLists, channels: int, count: int) -> list:

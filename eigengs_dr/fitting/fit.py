@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.arguments import takes_numbers
-from ..backend.feedback import defer_interrupts, shows_progress, to_html
-from ..backend.recording import exclusive
+from ..backend.doors import door
+from ..backend.interrupts import defer_interrupts
+from ..backend.notebook import to_html
+from ..backend.progress import shows_progress
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians, scale_channels
@@ -22,7 +23,7 @@ from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
 from .descent import begin
 from .fewest import fewest
-from .levels import place_levels, sort_levels
+from .levels import place_levels, sort_levels, without_placement
 from .loop import FitProgress, Refinement, Score, refine, sets_of
 from .maps import Map, MapImage, balance, combine, read_maps, score_maps
 from .measure import Row, psnrs
@@ -123,7 +124,7 @@ class FitInterrupted(KeyboardInterrupt):
 
 @named_options
 @shows_progress
-@takes_numbers
+@door
 def fit(
     image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map],
     gaussians: int | Sequence[int] | None = None,
@@ -261,7 +262,6 @@ def fit(
     return replace(found, source=source)
 
 
-@exclusive()
 def fit_images(
     images: Sequence[PixelsOrPath],
     options: FitOptions,
@@ -293,8 +293,9 @@ def fit_images(
                 start = fitted(start, data[0].affine)
             moves = options.iterations > 0
             objective, begun = start_from(start, objective, options.method, pixels[0], moves)
-            if options.method.needs_model:
-                mean_image = options.method.mean_image(start, width, height)
+            base = objective.pictures[0].base
+            if base is not None:
+                mean_image = objective.picture(base).numpy()
 
         def score(gaussians: Gaussians) -> list[Row]:
             seconds = (time.perf_counter() - started) / len(images)
@@ -312,7 +313,6 @@ def fit_images(
     return _finished(found, affines, mean_image, started, seconds_init)
 
 
-@exclusive()
 def fit_maps(
     images: list[MapImage],
     options: FitOptions,
@@ -367,7 +367,9 @@ def _refined(
     """
     method, iterations, key = options.method, options.iterations, options.seed
     (width, height), channels = objective.size, objective.channels
-    counts, chosen = options.levels, begun is not None or options.method.place != Adaptive()
+    counts, chosen = options.levels, begun is not None
+    if method.place != Adaptive():  # the choice of a placement is not undone
+        method = without_placement(method)
     if counts:
         begun = place_levels(objective, method, counts, iterations, key, interrupted)
         objective = replace(objective, levels=counts[:-1])
