@@ -8,7 +8,8 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, objective_of, picture, squared_error, ycbcr_psnr
-from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Surplus, rounds
+from _helpers.sets import check_equal
+from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Retreat, Surplus, rounds
 from eigengs_dr.fitting.descent import begin, descend
 from eigengs_dr.fitting.loop import refine
 from eigengs_dr.fitting.objective import Part
@@ -18,8 +19,8 @@ COUNT, STEPS = 30, 100
 
 def often(every=15, share=1.0):
     """The default method with rounds in short descents too."""
-    controls = Surplus(share, every=every), Redistribute(), Relocate(every), Perturb(every=every)
-    return replace(eg.DEFAULT, controls=controls)
+    rounds = Surplus(share, every=every), Redistribute(), Relocate(every), Perturb(every=every)
+    return replace(eg.DEFAULT, controls=(Retreat(), *rounds))
 
 
 def placed(image=None, backend=None):
@@ -82,15 +83,52 @@ def test_levels_and_parts_are_not_placed_anew(what):
 
 
 def test_chosen_gaussians_are_replaced_by_better_ones_alone():
-    """The second time, those that stand where the error asked for have less error."""
+    """Those that are useless: with more than twice the error that they would have anew."""
     gaussians, objective = placed()
     color = 0 * gaussians.color
     useless = begin(replace(gaussians, mean=0 * gaussians.mean + 3, color=color), chosen=True)
     found = acts(Redistribute(), useless, objective, 20)
     assert squared_error(found.gaussians, objective) < squared_error(useless.gaussians, objective)
-    *_, end = descend(objective, often(), begin(gaussians), 60)
-    state = replace(end, chosen=True)
+    state = begin(gaussians, chosen=True)
     assert acts(Redistribute(), state, objective, 20) is state
+    assert acts(Redistribute(useless=0.9), state, objective, 20) is not state
+
+
+def test_a_retreat_returns_where_the_error_has_risen():
+    """To the set at which the optimiser started, with the rates times the factor, once more."""
+    gaussians, objective = placed()
+    control, method = Retreat(), replace(eg.DEFAULT, controls=())
+    assert control.steps(200) == [10, 20, 40, 80, 160]
+    for factor, returns in ((1.0, False), (1000.0, True)):
+        *_, state = descend(objective, method.at_rates(factor), begin(gaussians), 10)
+        found = acts(control, state, objective, 10)
+        assert (found is not state) == returns
+        if returns:
+            check_equal(found.gaussians, gaussians.to_arrays())
+            assert found.speed == (0.4,) and found.moving is None
+            again = acts(control, replace(found, fixed=state.fixed), objective, 20)
+            assert again.speed == (0.4,)  # its error is that of the start: it has not risen
+    begun = begin(gaussians)
+    assert acts(control, begun, objective, 10) is begun  # nothing has moved
+
+
+def test_each_image_of_a_batch_retreats_for_itself():
+    """The sets are those of single fits, bit for bit."""
+    images = [eg.sample("coffee")[100:132, 200:232], np.full((SIDE, SIDE, 3), 0.3, np.float32)]
+    method = replace(eg.DEFAULT.at_rates(30), controls=(Retreat(),))
+    options = {"gaussians": 40, "iterations": 45, "method": method}
+    for row, image in zip(eg.fit_many(images, **options), images, strict=True):
+        np.testing.assert_array_equal(row.result.image, eg.fit(image, **options).image)
+
+
+def test_rates_that_are_too_high_are_lowered():
+    """What is gained is nearly that of good rates."""
+    image = eg.sample("coffee")[100:148, 200:248]
+    good, high = (
+        eg.fit(image, 100, 200, method=eg.DEFAULT.at_rates(factor)).psnr_ycbcr for factor in (1, 8)
+    )
+    start = eg.fit(image, 100, 0).psnr_ycbcr
+    assert high > start + 0.5 * (good - start)
 
 
 def test_relocation_lets_the_surplus_go_evenly():

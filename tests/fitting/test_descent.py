@@ -85,14 +85,17 @@ def test_a_part_of_the_steps(backend):
     assert squared_error(whole, objective) < 0.9 * squared_error(gaussians, objective)
 
 
-def test_rates(backend):
-    """Half a cosine, which ends near what `decay` leaves."""
-    steps = 40
-    rates = {"mean": 0.1, "factor": 0.2, "color": 0.3}
-    method = still(rates=rates, decay=0.25)
-    table = rate_table(types_in(select(backend)), method, steps).numpy().reshape(steps, 3)
-    left = 0.25 + 0.75 * 0.5 * (1 + np.cos(np.pi * np.arange(steps) / steps))
-    np.testing.assert_allclose(table, np.outer(left, list(rates.values())), rtol=1e-5)
+@pytest.mark.parametrize("chosen", [False, True])
+def test_rates(backend, chosen):
+    """Half a cosine, which ends near what `decay` leaves; another one before a redistribution."""
+    steps, rates = 200, {"mean": 0.1, "factor": 0.2, "color": 0.3}
+    method = replace(eg.DEFAULT, rates=rates, decay=0.25)
+    factors = method.rate_factors(steps, chosen)
+    table = rate_table(types_in(select(backend)), method, factors).numpy().reshape(steps, 3)
+    lengths = (200,) if chosen else (20, 180)
+    left = [0.25 + 0.75 * 0.5 * (1 + np.cos(np.pi * np.arange(n) / n)) for n in lengths]
+    expected = np.outer(np.concatenate(left), list(rates.values()))
+    np.testing.assert_allclose(table, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("warm_up", [0, 4])
@@ -171,7 +174,7 @@ def test_lists_that_last_hold_what_gaussians_reach(backend, count):
     missed = []
     while stop < steps:
         built = sets[stop]
-        stop, moves = next_build(method, stop, steps, steps)
+        stop, moves = next_build(method, method.rate_factors(steps), stop, steps)
         margin = method.coordinates.reach(gaussians, moves)
         needed = pairs_of(bin_gaussians(sets[stop - 1]))
         held = (pairs_of(bin_gaussians(built, *m)) for m in (margin, ()))

@@ -9,7 +9,7 @@ import eigengs_dr as eg
 from _helpers.halves import fitted, squared_error
 from _helpers.photos import coffee
 from _helpers.waves import METHODS
-from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Surplus
+from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Retreat, Surplus
 from eigengs_dr.fitting.method import Method, Model
 from eigengs_dr.fitting.optimizer import Adam
 from eigengs_dr.fitting.place import Adaptive, Grid, gaussians_at
@@ -23,7 +23,7 @@ from eigengs_dr.paper.placement import RandomColors
 NAMES = {
     value.__name__: value
     for value in (
-        *(Method, Adaptive, Surplus, Redistribute, Relocate, Perturb, Adam, Relative),
+        *(Method, Adaptive, Surplus, Redistribute, Relocate, Perturb, Retreat, Adam, Relative),
         *(Adan, Cholesky, EigenGSMethod, RandomColors, Grid),
     )
 }

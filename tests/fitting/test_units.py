@@ -27,7 +27,16 @@ def psnr_of_range(found, values):
     return 10 * np.log10(np.ptp(values) ** 2 / error)
 
 
-UNITS = [(1e-6, 0), (1e-6, 1e-2), (0.01, -3), (3, 1), (300, 1200), (1e6, 0), (1e6, -1e10)]
+UNITS = [
+    (1e-6, 0),
+    (1e-6, 1e-2),
+    (0.01, -3),
+    (3, 1),
+    (300, 1200),
+    (1e6, 0),
+    (0.01, -100),
+    (1e4, 1e8),
+]
 
 
 @pytest.mark.parametrize(("scale", "offset"), UNITS)
@@ -45,14 +54,16 @@ def test_psnrs_do_not_depend_on_the_unit(values, scale, offset):
         assert psnr_of_range(found, other) == pytest.approx(found.psnr_ycbcr, abs=0.05)
 
 
-@pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0), (300, 1200)])
-def test_goals_do_not_depend_on_the_unit(values, scale, offset):
+def test_goals_do_not_depend_on_the_unit(values):
+    """Rounding decides about some Gaussians of a short search."""
     counts = []
-    for data in (values, scale * values + offset):
-        found = fit(data, gaussians=None, target_psnr=36, iterations=150)
+    for scale, offset in ((1, 0), (1e-6, 0), (300, 1200), (7, 0)):
+        data = scale * values + offset
+        found = fit(data, gaussians=None, target_psnr=40, iterations=150)
         assert found.stopped == "met"
+        assert psnr_of_range(found, data) >= 39.99
         counts.append(len(found.gaussians))
-    assert counts[1] == pytest.approx(counts[0], rel=0.15)
+    assert max(counts) < 1.35 * min(counts)
 
 
 def test_data_without_codes_have_no_psnr_rgb(values):
