@@ -151,7 +151,11 @@ ROUGH = SMALL["roughness"]
         ({f"albedo{k}": np.eye(3)[:, :, None] * (1, 2, 3) for k in range(6)}, {}, "18 channels"),
         (SMALL | {"normal": np.zeros((8, 8))}, {}, "map 'normal': shape .* three channels"),
         ({"albedo": np.full((8, 8, 3), np.nan)}, {}, "map 'albedo': 64 of 64 pixels are not fin"),
-        ({"roughness": eg.Map(ROUGH, space="hsv")}, {}, "map 'roughness': space 'hsv' is unknown"),
+        (
+            {"roughness": eg.Map(ROUGH, space="hsv")},
+            {},
+            "map 'roughness': space 'hsv' is not in ycbcr",
+        ),
         ({"albedo": eg.Map(SMALL["albedo"], weight=0)}, {}, "'albedo': weight is 0; it must be"),
         ({"albedo": eg.Map(SMALL["albedo"], weight=np.nan)}, {}, "weight is nan; it must be above"),
         (SMALL | {"ao": eg.Map(ROUGH, goal=30)}, {}, "map 'albedo' has no goal; give each map one"),

