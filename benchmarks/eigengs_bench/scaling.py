@@ -24,7 +24,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.descent import FitProblem, descend
 from eigengs_dr.fitting.options import PRESETS
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solve import solve
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.resize import center_crop
 

@@ -16,7 +16,7 @@ from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.fitting.descent import FitProblem
 from eigengs_dr.fitting.options import PRESETS, FitOptions
 from eigengs_dr.fitting.refine import trace_steps
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solve import solve
 from eigengs_dr.fitting.start import initialize, mean_picture
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import MAX_PSNR
