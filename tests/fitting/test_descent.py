@@ -8,74 +8,129 @@ import pytest
 from drjit import JitFlag
 
 import eigengs_dr as eg
-from _helpers.sets import Scene, random_scene
-from _helpers.waves import SIDE, SPLATS, default, figures, picture, presets, start
+from _helpers.halves import objective_for, objective_of, squared_error
+from _helpers.sets import Scene, check_equal, random_scene
+from _helpers.waves import METHODS, SIDE, SPLATS, picture, start, still
 from eigengs_dr.backend.arrays import types_in, upload_rows
 from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.control import Perturb
 from eigengs_dr.fitting.descent import (
     MAX_RATE_SCALE,
-    FitProblem,
+    begin,
     descend,
+    last,
+    next_build,
     rate_scale_of,
     rate_table,
-    start_descent,
+    started,
 )
-from eigengs_dr.fitting.options import PRESETS
-from eigengs_dr.fitting.placement.adaptive import residual
-from eigengs_dr.fitting.refine import refine
-from eigengs_dr.fitting.schedule import lr_factor, next_build
+from eigengs_dr.fitting.objective import Pixels
+from eigengs_dr.fitting.optimizer import Adam
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import bin_gaussians
 
+kinds = pytest.mark.parametrize("kind", ["default", "gaussianimage"])
 
-def test_descend_yields_the_start_and_every_step(backend):
+
+def end_of(gaussians, objective, method, steps, **options):
+    """The last set of a descent."""
+    return last(descend(objective, method, begin(gaussians), steps, **options), gaussians)
+
+
+def test_descend_yields_the_set_after_every_step(backend):
     """They stay as they are: else the best set so far gets the colours of the last step."""
-    gaussians, target = start(backend)
+    gaussians, objective = start(backend)
     sets, copies = [], []
-    for current in descend(FitProblem(gaussians, target), default(), 5):
-        sets.append(current)
-        copies.append(current.to_arrays())
-    assert len(sets) == 6
+    for state in descend(objective, still(), begin(gaussians), 5):
+        sets.append(state.gaussians)
+        copies.append(state.gaussians.to_arrays())
+    assert len(sets) == 5
     for name, value in gaussians.to_arrays().items():
         found = [current.to_arrays()[name] for current in sets]
         np.testing.assert_array_equal(found, [copy[name] for copy in copies])
-        np.testing.assert_array_equal(found[0], value)
-        assert name == "background" or not np.array_equal(found[5], value)
+        assert name == "background" or not np.array_equal(found[0], value)
+        assert name == "background" or not np.array_equal(found[4], found[0])
 
 
-@presets
-def test_freezing_changes_nothing(backend, preset):
+def test_no_steps_leave_the_set(backend):
+    gaussians, objective = start(backend)
+    assert end_of(gaussians, objective, eg.DEFAULT, 0).to_arrays().keys()
+    for name, value in gaussians.to_arrays().items():
+        found = end_of(gaussians, objective, eg.DEFAULT, 0).to_arrays()[name]
+        np.testing.assert_array_equal(found, value)
+
+
+@kinds
+def test_freezing_changes_nothing(backend, kind):
     """Over several builds of the lists, which grow and shrink."""
-    gaussians, target = start(backend)
-    schedule = PRESETS[preset].schedule
-    frozen = [g.to_arrays() for g in descend(FitProblem(gaussians, target), schedule, 20)]
-    with dr.scoped_set_flag(JitFlag.KernelFreezing, False):
-        traced = [g.to_arrays() for g in descend(FitProblem(gaussians, target), schedule, 20)]
+    gaussians, objective = start(backend)
+    frozen, traced = [], []
+    for recorded, sets in ((True, frozen), (False, traced)):
+        with dr.scoped_set_flag(JitFlag.KernelFreezing, recorded):
+            sets += [end_of(gaussians, objective, METHODS[kind], 20).to_arrays()]
     for name, value in frozen[-1].items():
         np.testing.assert_allclose(value, traced[-1][name], rtol=1e-5, atol=1e-5)
 
 
+def test_a_part_of_the_steps(backend):
+    """Two parts of a descent without momentum are the whole: rates are those of their steps."""
+    gaussians, objective = start(backend)
+    method = still(
+        optimizer=Plain(), coordinates=Fields(), rates={"color": 5.0}, warm_up=0, controls=()
+    )
+    whole = end_of(gaussians, objective, method, 20)
+    first = end_of(gaussians, objective, method, 20, part=range(12))
+    second = end_of(first, objective, method, 20, part=range(12, 20))
+    np.testing.assert_allclose(second.color.numpy(), whole.color.numpy(), rtol=1e-5, atol=1e-6)
+    assert squared_error(whole, objective) < 0.9 * squared_error(gaussians, objective)
+
+
+@pytest.mark.parametrize("chosen", [False, True])
+def test_rates(backend, chosen):
+    """Half a cosine, which ends near what `decay` leaves; another one before a redistribution."""
+    steps, rates = 200, {"mean": 0.1, "factor": 0.2, "color": 0.3}
+    method = replace(eg.DEFAULT, rates=rates, decay=0.25)
+    factors = method.rate_factors(steps, chosen)
+    table = rate_table(types_in(select(backend)), method, factors).numpy().reshape(steps, 3)
+    lengths = (200,) if chosen else (20, 180)
+    left = [0.25 + 0.75 * 0.5 * (1 + np.cos(np.pi * np.arange(n) / n)) for n in lengths]
+    expected = np.outer(np.concatenate(left), list(rates.values()))
+    np.testing.assert_allclose(table, expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize("warm_up", [0, 4])
-def test_rates(backend, warm_up):
-    """A linear rise times half a cosine, which ends near what `decay` leaves."""
-    steps = 40
-    rates = {"mean": 0.1, "factor": 0.2, "color": 0.3}
-    schedule = default(rates=rates, decay=0.25, warm_up=warm_up)
-    factors = [lr_factor(schedule, step, steps) for step in range(steps)]
-    table = rate_table(types_in(select(backend)), schedule, factors).numpy().reshape(steps, 3)
-    step = np.arange(steps)
-    left = 0.25 + 0.75 * 0.5 * (1 + np.cos(np.pi * step / steps))
-    if warm_up:
-        left *= np.minimum(1, (step + 1) / warm_up)
-    np.testing.assert_allclose(table, np.outer(left, list(rates.values())), rtol=1e-5)
+def test_steps_grow_after_each_start_of_the_optimiser(backend, warm_up):
+    """Without momentum, a first step of Adam is as long as its rate; so are they after a control.
+
+    Colours move by the rate of colours, where their gradient keeps its sign.
+    """
+    gaussians, objective = start(backend)
+    method = replace(
+        eg.DEFAULT,
+        controls=(Perturb(0.0, every=8),),
+        optimizer=Adam(0.0, 0.0, 1e-12),
+        rates={"color": 1e-5},
+        warm_up=warm_up,
+        decay=1.0,
+        rate_exponent=0.0,
+    )
+    colors = [gaussians.to_arrays()["color"]]
+    for state in descend(objective, method, begin(gaussians), 32):
+        colors.append(state.gaussians.to_arrays()["color"])
+    moves = np.median(np.abs(np.diff(np.array(colors, float), axis=0)), axis=(1, 2)) / 1e-5
+    first = min(method.controls[0].steps(32))
+    assert 8 < first < 16
+    for since in (0, first):
+        expected = [min(1, (k + 1) / max(1, warm_up)) for k in range(5)]
+        np.testing.assert_allclose(moves[since : since + 5], expected, atol=0.02)
 
 
 def solved(backend, seed, count):
     """Placed Gaussians with the best colours, and a part of a photo: every step is small."""
     top, left = np.random.default_rng(seed).integers(0, (144, 344))
     photo = eg.sample("coffee")[top : top + 256 : 2, left : left + 256 : 2]
-    fit = eg.fit(photo, gaussians=count, iterations=0, init="adaptive", seed=seed, backend=backend)
-    return fit.gaussians, rgb_to_ycbcr(photo)
+    objective = objective_of(photo, backend)
+    return eg.DEFAULT.place_and_solve(objective, count), objective
 
 
 MANY_AND_LARGE = pytest.mark.parametrize("count", [1200, 30], ids=["many", "large"])
@@ -83,17 +138,16 @@ MANY_AND_LARGE = pytest.mark.parametrize("count", [1200, 30], ids=["many", "larg
 
 
 @MANY_AND_LARGE
-@presets
-def test_lists_that_last_are_as_good_as_lists_of_every_step(backend, preset, count):
+@kinds
+def test_lists_that_last_are_as_good_as_lists_of_every_step(backend, kind, count):
     """A drift of 0 builds lists in every step. Rounding changes most fits by 0.03 dB or less."""
-    schedule, gains = replace(PRESETS[preset].schedule, redistribute_after=0), []
+    method, gains = replace(METHODS[kind], controls=()), []
     for seed in range(9):
-        gaussians, target = solved(backend, seed, count)
+        gaussians, objective = solved(backend, seed, count)
         lasting, fresh = (
-            list(descend(FitProblem(gaussians, target), s, 40))[-1]
-            for s in (schedule, replace(schedule, drift=0.0))
+            end_of(gaussians, objective, m, 40) for m in (method, replace(method, drift=0.0))
         )
-        errors = [np.square(residual(g, target)).mean() for g in (lasting, fresh)]
+        errors = [squared_error(g, objective) for g in (lasting, fresh)]
         gains.append(-10 * np.log10(errors[0] / errors[1]))
     assert abs(np.median(gains)) < 0.03
 
@@ -113,14 +167,15 @@ def test_lists_that_last_hold_what_gaussians_reach(backend, count):
     Just before the next build, lists miss 0.15 and 0.27 of the pairs that they would miss without a
     margin, which are 4 and 6 % of all.
     """
-    gaussians, target = solved(backend, 0, count)
-    schedule, steps, stop = default(redistribute_after=0), 40, 0
-    sets = list(descend(FitProblem(gaussians, target), schedule, steps))
+    gaussians, objective = solved(backend, 0, count)
+    method, steps, stop = still(controls=()), 40, 0
+    states = descend(objective, method, begin(gaussians), steps)
+    sets = [gaussians, *(state.gaussians for state in states)]
     missed = []
     while stop < steps:
         built = sets[stop]
-        stop, moves = next_build(schedule, stop, steps)
-        margin = schedule.variables().reach(gaussians, moves)
+        stop, moves = next_build(method, method.rate_factors(steps), stop, steps)
+        margin = method.coordinates.reach(gaussians, moves)
         needed = pairs_of(bin_gaussians(sets[stop - 1]))
         held = (pairs_of(bin_gaussians(built, *m)) for m in (margin, ()))
         missed.append([len(needed - pairs) / len(needed) for pairs in held])
@@ -128,20 +183,81 @@ def test_lists_that_last_hold_what_gaussians_reach(backend, count):
     assert with_margin < 0.57 * without
 
 
-def test_weights(backend):
-    """What weighs nothing may be anything; ones are no weights."""
-    gaussians, target = start(backend)
-    weight, other = np.ones_like(target), target.copy()
+def test_what_weighs_nothing_may_be_anything(backend):
+    """Equal weights are none."""
+    gaussians, _ = start(backend)
+    target = rgb_to_ycbcr(picture())
+    weight, other = np.ones((SIDE, SIDE), np.float32), target.copy()
     weight[:, SIDE // 2 :], other[:, SIDE // 2 :] = 0, 7
 
     def colors(target, weight=None):
-        *_, last = descend(FitProblem(gaussians, target, weight), default(), 10)
-        return last.to_arrays()["color"]
+        objective = objective_for(gaussians, target, weight)
+        return end_of(gaussians, objective, still(), 10).to_arrays()["color"]
 
     left, plain = (colors(target, w) for w in (weight, np.ones_like(target)))
     np.testing.assert_array_equal(colors(other, weight), left)
     np.testing.assert_array_equal(colors(target), plain)
     assert not np.array_equal(left, plain)
+
+
+@pytest.mark.parametrize("layers", [0, 1, 3])
+@pytest.mark.parametrize("name", ["mean", "factor", "color"])
+def test_the_gradient_is_that_of_finite_differences(backend, name, layers):
+    """A step of plain gradient descent in double precision, with weights of some kinds, and 0."""
+    scene = random_scene()
+    gaussians = replace(scene.on(backend, 64), cutoff=9.0)
+    generator = np.random.default_rng(2)
+    target = generator.uniform(0, 1, (*scene.size[::-1], 3)).astype(np.float32)
+    shape = (*target.shape[:2], layers) if layers else target.shape[:2]
+    weight = generator.uniform(0, 1, shape).astype(np.float32)
+    weight[3:8, 3:8] = 0
+    objective = objective_for(gaussians, target, weight)
+    factors = np.broadcast_to(weight.reshape(*target.shape[:2], -1), target.shape)
+
+    def loss(changed):
+        return (factors * np.square(changed.exact(9.0) - target)).mean()
+
+    method = still(
+        optimizer=Plain(),
+        coordinates=Fields(),
+        rates={name: 1.0},
+        warm_up=0,
+        decay=1.0,
+        rate_exponent=0.0,
+        controls=(),
+    )
+    moved = end_of(gaussians, objective, method, 1).to_arrays()[name]
+    slope = getattr(scene, name) - moved
+    direction = generator.normal(size=slope.shape)
+    ends = [scene._replace(**{name: getattr(scene, name) + s * 1e-5 * direction}) for s in (1, -1)]
+    expected = (loss(ends[0]) - loss(ends[1])) / 2e-5
+    assert (slope * direction).sum() == pytest.approx(expected, rel=1e-4, abs=1e-8)
+
+
+class Plain:
+    """Gradient descent."""
+
+    def start(self, value):
+        return ()
+
+    def step(self, value, gradient, moments, rate, time):
+        return value - rate * gradient, moments
+
+
+class Fields:
+    """The fields of a set as variables, without bounds."""
+
+    def encode(self, gaussians):
+        return {name: getattr(gaussians, name) for name in ("mean", "factor", "color")}
+
+    def decode(self, fixed, variables, size=None):
+        return replace(fixed, **variables)
+
+    def project(self, fixed, variables, size=None):
+        return variables
+
+    def reach(self, fixed, moves):
+        return 0.0, 1.0
 
 
 def factors_of_rates(color, exponent=0.5, backend="llvm"):
@@ -167,23 +283,23 @@ def test_rates_fall_with_the_root_of_the_colour(backend, color, expected):
 
 
 def test_a_descent_starts_with_the_factors_of_its_set(backend):
-    gaussians, schedule = random_scene().on(backend), PRESETS["default"].schedule
-    found = start_descent(gaussians, schedule).rate_scale.numpy()
+    gaussians, method = random_scene().on(backend), eg.DEFAULT
+    found = started(begin(gaussians), method, 0).moving.rate_scale.numpy()
     color = gaussians.to_arrays()["color"].astype(np.float64)
-    expected = factors_of_rates(color[None], schedule.rate_exponent)[0]
+    expected = factors_of_rates(color[None], method.rate_exponent)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-5)
-    assert start_descent(gaussians, replace(schedule, rate_exponent=0.0)).rate_scale is None
+    plain = replace(method, rate_exponent=0.0)
+    assert started(begin(gaussians), plain, 0).moving.rate_scale is None
 
 
 def test_other_runs_change_nothing(backend):
     """Programs of other counts, sizes and rates between two equal runs."""
-    gaussians, target = start(backend)
-    first = figures(refine(FitProblem(gaussians, target), picture(), default(), 10))
+    gaussians, objective = start(backend)
+    first = end_of(gaussians, objective, eg.DEFAULT, 10).to_arrays()
     for count in (200, 50, 1):
-        problem = FitProblem(*start(backend, count))
-        refine(problem, picture(), default(rates=default().rates), 10)
-    refine(FitProblem(gaussians, target), picture(), PRESETS["gaussianimage"].schedule, 10)
-    assert figures(refine(FitProblem(gaussians, target), picture(), default(), 10)) == first
+        end_of(*start(backend, count), still(rates=dict(eg.DEFAULT.rates)), 10)
+    end_of(gaussians, objective, METHODS["gaussianimage"], 10)
+    check_equal(end_of(gaussians, objective, eg.DEFAULT, 10), first)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -192,7 +308,7 @@ def test_all_splats_on_one_pixel(backend, seed):
     mean, factor = np.full((SPLATS, 2), 16.0), np.tile([0.5, 0, 0.5], (SPLATS, 1))
     color = rng.uniform(0, 1e-3, (SPLATS, 3))
     gaussians = Scene(mean, factor, color, np.zeros(3), (SIDE, SIDE)).on(backend, space="ycbcr")
-    result = refine(FitProblem(gaussians, rgb_to_ycbcr(picture())), picture(), default(), 60)
-    assert np.isfinite(figures(result)).all()
-    assert all(np.isfinite(v).all() for v in result.gaussians.to_arrays().values())
-    assert figures(result)[-1] > figures(result)[0] + 1
+    objective = Pixels.plain(rgb_to_ycbcr(picture()), gaussians)
+    end = end_of(gaussians, objective, eg.DEFAULT, 60)
+    assert all(np.isfinite(v).all() for v in end.to_arrays().values())
+    assert squared_error(end, objective) < 0.8 * squared_error(gaussians, objective)

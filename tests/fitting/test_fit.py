@@ -2,27 +2,29 @@
 
 import signal
 from dataclasses import replace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from _helpers.families import small_model
 from _helpers.sets import check_equal
-from _helpers.waves import SIDE, SPLATS, check_sound, figures, picture, presets
-from eigengs_dr.fitting import start as starting
+from _helpers.waves import METHODS, SIDE, SPLATS, check_sound, figures, methods, picture
 from eigengs_dr.fitting.fit import FitInterrupted, fit
-from eigengs_dr.fitting.options import INITS, PRESETS, default_count
-from eigengs_dr.fitting.start import place_grid
+from eigengs_dr.fitting.method import DEFAULT
+from eigengs_dr.fitting.options import default_count
+from eigengs_dr.fitting.place import Adaptive, Grid, Random, gaussians_at, grid_of
 from eigengs_dr.image.color import SPACES
 from eigengs_dr.image.io import sample, save_image
 from eigengs_dr.image.metrics import psnr
 from eigengs_dr.raster.render import render
 
+places = pytest.mark.parametrize("place", [Adaptive(), Grid(), Random()], ids=repr)
+"""The placements of the package."""
 
-@pytest.mark.parametrize("init", INITS)
-def test_fit_improves_on_its_start(backend, init):
-    result = fit(picture(), SPLATS, 60, init=init, backend=backend)
+
+@places
+def test_fit_improves_on_its_start(backend, place):
+    result = fit(picture(), SPLATS, 60, method=replace(DEFAULT, place=place), backend=backend)
     check_sound(result, picture())
     assert figures(result)[-1] > figures(result)[0] + 1
     assert len(result.gaussians) == SPLATS
@@ -67,37 +69,66 @@ def test_zero_iterations_keep_the_solved_start(backend):
 
 def test_more_solve_steps_start_better(backend):
     starts = [
-        figures(fit(picture(), SPLATS, 0, solve_steps=steps, backend=backend))[0]
-        for steps in (0, 2, 20)
+        figures(fit(picture(), SPLATS, 0, method=method, backend=backend))[0]
+        for method in (replace(DEFAULT, solve_steps=steps) for steps in (0, 2, 20))
     ]
     assert starts == sorted(starts)
     assert starts[2] > starts[0] + 5
 
 
-@presets
-def test_one_seed_gives_one_result(backend, preset):
-    eigen = preset == "eigengs"  # which draws nothing
-    init, start = ("auto", small_model(backend)) if eigen else ("random", None)
+def small_start(method, backend):
+    """A start for a method that needs one."""
+    return small_model(backend) if method.needs_model else None
+
+
+@methods
+def test_one_seed_gives_one_result(backend, method):
+    """Others give others, but for the method that draws nothing."""
+    start = small_start(method, backend)
+    if start is None:
+        method = replace(method, place=Random() if method is DEFAULT else method.place)
 
     def run(iterations, seed):
-        return fit(picture(), SPLATS, iterations, init, start, preset, seed=seed, backend=backend)
+        return fit(
+            picture(),
+            start=start,
+            gaussians=SPLATS,
+            iterations=iterations,
+            method=method,
+            seed=seed,
+            backend=backend,
+        )
 
     first, second = run(30, 5), run(30, 5)
     assert figures(first) == figures(second)
     check_equal(second.gaussians, first.gaussians.to_arrays())
-    assert (figures(run(0, 6))[0] != figures(first)[0]) == (not eigen)
-    if preset == "gaussianimage":
+    assert (figures(run(0, 6))[0] != figures(first)[0]) == (start is None)
+    if method is METHODS["gaussianimage"]:
         assert not first.gaussians.to_arrays()["background"].any()
 
 
-@presets
+@pytest.mark.parametrize("options", [{"gaussians": 60}, {"target_psnr": 40}])
+def test_seeds_drive_the_noise(backend, options):
+    """One seed repeats bit for bit, and another gives another result."""
+    image, found = sample("coffee")[100:132, 200:232], []
+    for seed in (0, 0, 1):
+        result = fit(image, iterations=150, seed=seed, backend=backend, **options)
+        found.append((figures(result), result.gaussians.to_arrays()))
+    (first, arrays), (again, same), (other, _) = found
+    assert first == again
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(same[name], values)
+    assert first != other
+
+
+@methods
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
-def test_constant_images(backend, preset, value):
+def test_constant_images(backend, method, value):
     image = np.full((SIDE, SIDE, 3), value, np.float32)
-    start = small_model(backend) if preset == "eigengs" else None
-    result = fit(image, SPLATS, 60, preset=preset, start=start, backend=backend)
+    start = small_start(method, backend)
+    result = fit(image, SPLATS, 60, method=method, start=start, backend=backend)
     check_sound(result, image)
-    if preset == "default":
+    if method is DEFAULT:
         assert figures(result)[0] > 100
 
 
@@ -108,11 +139,11 @@ def test_black_is_exact(backend):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 37), (37, 1), (2, 3)])
-@pytest.mark.parametrize("init", ["adaptive", "grid", "random"])
-def test_narrow_images(backend, shape, init):
+@places
+def test_narrow_images(backend, shape, place):
     image = np.random.default_rng(0).uniform(0, 1, (*shape, 3)).astype(np.float32)
     count = max(1, shape[0] * shape[1] // 2)
-    result = fit(image, count, 12, init=init, backend=backend)
+    result = fit(image, count, 12, method=replace(DEFAULT, place=place), backend=backend)
     check_sound(result, image)
     assert result.image.shape == image.shape
 
@@ -146,16 +177,14 @@ def test_the_image_is_left_alone(backend, color):
     np.testing.assert_array_equal(found.image, expected.image)
 
 
-@presets
+@methods
 @pytest.mark.parametrize("factor", [10, 1000])
-def test_rates_far_too_high(backend, preset, factor):
+def test_rates_far_too_high(backend, method, factor):
     """Nothing but finite numbers, and never worse than the start."""
-    method = PRESETS[preset]
-    rates = {name: rate * factor for name, rate in method.schedule.rates.items()}
-    wild = replace(method, schedule=replace(method.schedule, rates=rates))
-    with patch.dict(PRESETS, {preset: wild}):
-        start = small_model(backend) if preset == "eigengs" else None
-        result = fit(picture(), SPLATS, 100, preset=preset, start=start, backend=backend)
+    start = small_start(method, backend)
+    result = fit(
+        picture(), SPLATS, 100, start=start, method=method.at_rates(factor), backend=backend
+    )
     assert np.isfinite(figures(result)).all()
     check_sound(result, picture())
 
@@ -166,13 +195,10 @@ def test_rates_far_too_high(backend, preset, factor):
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("gaussians", 0, "gaussians is 0; an image of 32x32 takes 1 to 1024"),
+        ("gaussians", 0, "gaussians is 0; it must be at least 1"),
         ("gaussians", -3, "gaussians is -3; it must be at least 1"),
         ("gaussians", SIDE * SIDE + 1, "gaussians is 1025; an image of 32x32 takes 1 to 1024"),
         ("iterations", -1, "iterations is -1; it must be at least 0"),
-        ("solve_steps", -1, "solve_steps is -1"),
-        ("init", "eigen2", "init 'eigen2' is unknown; use one of auto, random, grid, adaptive"),
-        ("preset", "best", "preset 'best' is unknown; use one of default, gaussianimage"),
         ("space", "hsv", "space 'hsv' is unknown; use one of ycbcr, rgb, linear, data"),
         ("backend", "opencl", "backend 'opencl' is unknown"),
         ("image", np.zeros((0, 4, 3)), "image"),
@@ -193,6 +219,21 @@ def test_arguments_out_of_range(name, value, words):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ({"method": "default"}, "method is 'default'; pass a Method, such as eigengs_dr.DEFAULT"),
+        ({"gausians": 5}, "unknown option 'gausians'; did you mean 'gaussians'?"),
+        ({"init": "grid"}, "unknown option 'init'"),
+    ],
+)
+def test_what_is_no_option(option, words):
+    with pytest.raises(TypeError) as error:
+        fit(picture(), **option)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
 def test_the_repr_is_short(backend):
     """It shows figures, and neither pixels nor the trace."""
     text = repr(fit(picture(), SPLATS, 0, backend=backend))
@@ -200,7 +241,7 @@ def test_the_repr_is_short(backend):
 
 
 def test_a_cutoff_stays_with_its_set(backend):
-    result = fit(picture(), SPLATS, 10, cutoff=4, backend=backend)
+    result = fit(picture(), SPLATS, 10, method=replace(DEFAULT, cutoff=4), backend=backend)
     assert result.gaussians.cutoff == 4
     shown = render(result.gaussians).numpy()
     np.testing.assert_array_equal(shown, result.image)
@@ -254,17 +295,22 @@ def test_signals(backend, number):
     assert signal.getsignal(number) is before
 
 
-def place_and_press(image, count, generator):
-    signal.raise_signal(signal.SIGINT)
-    return place_grid(image, count, generator)
+class Pressing:
+    """A placement that presses Ctrl-C."""
+
+    has_colors = False
+
+    def __call__(self, objective, count, cutoff, seed):
+        signal.raise_signal(signal.SIGINT)
+        return gaussians_at(objective, *grid_of(objective.size, count), cutoff)
 
 
 @pytest.mark.parametrize("iterations", [0, 1, 60])
 def test_ctrl_c_before_refinement(backend, iterations):
     """The start is kept, and the caller told."""
-    entry = {"grid": place_and_press}
-    with patch.dict(starting.PLACEMENTS, entry), pytest.raises(FitInterrupted) as interruption:
-        fit(picture(), SPLATS, iterations, init="grid", backend=backend)
+    method = replace(DEFAULT, place=Pressing())
+    with pytest.raises(FitInterrupted) as interruption:
+        fit(picture(), SPLATS, iterations, method=method, backend=backend)
     result = interruption.value.result
     check_sound(result, picture())
     assert len(result.trace) == 1
@@ -290,4 +336,4 @@ def test_progress(backend):
     assert [t[0] for t in told] == [0, 10, 20, 30, 40, 45]
     assert {t[1] for t in told} == {45}
     assert all(row in result.trace for *_, row in told)
-    assert told[-1][2] is result.trace[-1]
+    assert told[-1][2] == result.trace[-1]

@@ -1,18 +1,19 @@
 """Levels of detail: prefixes of a set that make the image too."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.halves import objective_of
 from _helpers.photos import coffee
+from _helpers.waves import METHODS
 from eigengs_dr.codec.packing import MSE_WITHOUT_IMAGE
-from eigengs_dr.fitting.density_control import removal_cost
+from eigengs_dr.fitting.control import Relocate
+from eigengs_dr.fitting.exchange import removal_cost
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.options import PRESETS, FitOptions, level_counts
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.options import level_counts
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import picture_of
 
@@ -24,7 +25,7 @@ def image():
 
 @pytest.fixture(scope="module")
 def result(image):
-    return fit(image, 256, levels=3, iterations=150)
+    return fit(image, level_counts(256, 3), iterations=150)
 
 
 def reached(gaussians, image):
@@ -44,20 +45,43 @@ def reached(gaussians, image):
         (9, 10**9, "levels is 1000000000; 9 Gaussians make 1 to"),
     ],
 )
-def test_bad_levels_are_refused(image, count, levels, message):
+def test_bad_levels_are_refused(count, levels, message):
     with pytest.raises(ValueError, match=message) as caught:
-        fit(image, count, levels=levels)
+        level_counts(count, levels)
     assert "\n" not in str(caught.value)
 
 
-def test_every_level_gains_by_relocation(monkeypatch):
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gaussians": [5, 5, 9]}, "levels 5, 5, 9: numbers of Gaussians must rise"),
+        ({"gaussians": [0, 9]}, "must rise, from 1 or more"),
+        ({"gaussians": []}, "must rise, from 1 or more"),
+        ({"gaussians": np.array([4.5, 9])}, "levels 4.5, 9.0: numbers of Gaussians must be whole"),
+        ({"gaussians": [9, 48 * 48 + 1]}, "gaussians is 2305; an image of 48x48 takes 1 to 2304"),
+        ({"target_psnr": 30}, "gaussians and target_psnr exclude each other"),
+        ({"method": METHODS["gaussianimage"]}, "levels need the placement Adaptive and no start"),
+        ({"start": "a.npz"}, "levels need the placement Adaptive and no start"),
+    ],
+)
+def test_levels_that_cannot_be_fitted_are_refused(image, options, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        fit(image, **{"gaussians": [5, 9], **options})
+    assert "\n" not in str(caught.value)
+
+
+def test_counts_may_be_those_of_numpy(image):
+    one, two = (fit(image, counts, 0) for counts in ([9, 30], np.array([9, 30])))
+    np.testing.assert_array_equal(one.image, two.image)
+
+
+def test_every_level_gains_by_relocation():
     """Of few Gaussians, whose first places are poor: each level gains a decibel here."""
     image, counts = eg.sample("coffee")[200:264, 300:364], [100, 140, 180]
-    found = fit(image, levels=counts, iterations=300).gaussians
-    method = PRESETS["default"]
-    still = replace(method, schedule=replace(method.schedule, relocate_every=0))
-    monkeypatch.setitem(PRESETS, "default", still)
-    left = fit(image, levels=counts, iterations=300).gaussians
+    found, left = (
+        fit(image, counts, iterations=300, method=method).gaussians
+        for method in (eg.DEFAULT, eg.DEFAULT.without(Relocate))
+    )
     for count in counts:
         assert reached(found[:count], image) > reached(left[:count], image) + 0.3
 
@@ -70,10 +94,9 @@ def test_any_number_between_is_better_than_the_level_before(image, result):
 
 
 def test_a_level_is_sorted_by_worth(image, result):
-    target = rgb_to_ycbcr(image)
-    before = 0
+    objective, before = objective_of(image), 0
     for count in level_counts(256, 3):
-        value = removal_cost(result.gaussians[:count], target)[before:]
+        value = removal_cost(result.gaussians[:count], objective)[before:]
         assert (np.diff(value) <= 1e-4 * value.max()).all()
         before = count
 
@@ -86,7 +109,7 @@ def test_the_picture_is_that_of_the_whole_set(image, result):
 
 @pytest.mark.parametrize("color", ["linear", "rgb", "data"])
 def test_other_colours(image, color):
-    found = fit(image, 64, levels=2, iterations=5, space=color)
+    found = fit(image, [16, 64], iterations=5, space=color)
     assert found.gaussians.space == color
     assert np.isfinite(picture_of(found.gaussians[:16])).all()
 
@@ -121,8 +144,19 @@ def test_packed_levels_without_an_image_keep_what_they_have_of_the_whole(result,
 
 def test_levels_keep_the_background(image):
     """What is added later does not change the levels before: one background serves all."""
-    found = fit(image, 64, levels=2, iterations=0).gaussians
-    alone = initialize(image, FitOptions(gaussians=16, init="auto")).gaussians
+    found = fit(image, [16, 64], iterations=0).gaussians
+    alone = eg.DEFAULT.place_and_solve(objective_of(image), 16)
     np.testing.assert_allclose(
         found.to_arrays()["background"], alone.to_arrays()["background"], atol=1e-6
     )
+
+
+def test_levels_with_weights(image):
+    """They spend their Gaussians where the weight is, and pixels without weight do not count."""
+    weight, hidden = np.ones(image.shape[:2], np.float32), image.copy()
+    weight[:, 24:], hidden[:, 24:] = 0, np.nan
+    found = fit(hidden, [40, 120], iterations=60, weight=weight).gaussians
+    plain = fit(image, [40, 120], iterations=60).gaussians
+    for count in (40, 120):
+        left, other = (picture_of(g[:count])[:, :24] for g in (found, plain))
+        assert eg.psnr(left, image[:, :24]) > eg.psnr(other, image[:, :24]) + 1

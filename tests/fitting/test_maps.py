@@ -6,6 +6,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.materials import images
 from eigengs_dr.image.pixels import ImageError
+from eigengs_dr.paper.eigengs import EIGENGS
 
 
 def figures(result, **changed):
@@ -29,7 +30,8 @@ def test_each_map_is_fitted_in_its_space():
 
 def test_a_weight_favours_its_map():
     plain = figures(eg.fit(images(), 40, iterations=40))
-    heavy = figures(eg.fit(images(), 40, iterations=40, weights={"roughness": 8}))
+    rough = eg.Map(images()["roughness"], weight=8)
+    heavy = figures(eg.fit(images() | {"roughness": rough}, 40, iterations=40))
     assert heavy["roughness"] > plain["roughness"] + 0.5
 
 
@@ -48,7 +50,8 @@ def test_equal_channels_of_data_become_one():
 
 def test_goals_of_maps_are_met_by_few():
     goals = {"albedo": 32, "roughness": 30, "normal": 28}
-    result = eg.fit(images(), target_psnr=goals, target_space="rgb", iterations=60)
+    maps = {name: eg.Map(image, goal=goals[name]) for name, image in images().items()}
+    result = eg.fit(maps, iterations=60)
     assert result.stopped == "met"
     found = figures(result)
     assert all(found[name] >= goals[name] - 0.01 for name in goals)
@@ -57,7 +60,7 @@ def test_goals_of_maps_are_met_by_few():
 
 
 def test_levels_are_materials_too():
-    result = eg.fit(images(), 160, iterations=40, levels=2)
+    result = eg.fit(images(), [40, 160], iterations=40)
     level = eg.picture_of(result.gaussians[:40])
     assert eg.psnr(level["albedo"], images()["albedo"]) > 22
 
@@ -104,7 +107,39 @@ def test_packing_without_images(tmp_path):
         eg.pack(result, tmp_path / "m.npz")
 
 
+@pytest.mark.parametrize("space", ["rgb", "ycbcr"])
+def test_the_goal_of_a_fit_is_that_of_maps_without_their_own(space):
+    """In the space of the goal; normals and data have one PSNR alone."""
+    maps = images() | {"roughness": eg.Map(images()["roughness"], goal=34)}
+    result = eg.fit(maps, target_psnr=eg.Goal(26, space, max_gaussians=300), iterations=60)
+    assert result.stopped == "met" and len(result.gaussians) <= 300
+    shown = figures(result)
+    assert shown["roughness"] > 33.5  # of data, its PSNR without rounding counts
+    color = eg.psnr(images()["albedo"], result.image["albedo"], space)
+    assert color > 25.9 and shown["normal"] > 25.5
+
+
+def test_a_map_in_another_space():
+    result = eg.fit({"glow": eg.Map(images()["albedo"], space="rgb")}, 60, iterations=5)
+    assert [m.space for m in result.gaussians.maps] == ["rgb"]
+
+
+def test_weights_of_pixels_hold_for_all_maps():
+    """Pixels without weight may be NaN, also in the first solve that balances the maps."""
+    weight, hidden = np.ones((32, 32)), images()
+    weight[:, 16:] = 0
+    for image in hidden.values():
+        image[:, 16:] = np.nan
+    found = eg.fit(hidden, 60, iterations=60, weight=weight)
+    plain = eg.fit(images(), 60, iterations=60)
+    for name, image in images().items():
+        left, other = (eg.psnr(r.image[name][:, :16], image[:, :16]) for r in (found, plain))
+        assert left > other + 1
+        assert found.maps[name]["psnr_rgb"] == pytest.approx(left, abs=0.05)
+
+
 SMALL = {"albedo": np.zeros((8, 8, 3)), "roughness": np.zeros((8, 8))}
+ROUGH = SMALL["roughness"]
 
 
 @pytest.mark.parametrize(
@@ -116,22 +151,20 @@ SMALL = {"albedo": np.zeros((8, 8, 3)), "roughness": np.zeros((8, 8))}
         ({f"albedo{k}": np.eye(3)[:, :, None] * (1, 2, 3) for k in range(6)}, {}, "18 channels"),
         (SMALL | {"normal": np.zeros((8, 8))}, {}, "map 'normal': shape .* three channels"),
         ({"albedo": np.full((8, 8, 3), np.nan)}, {}, "map 'albedo': 64 of 64 pixels are not fin"),
-        (SMALL, {"space": {"rough": "data"}}, "space names 'rough', which is no map"),
-        (SMALL, {"space": {"roughness": "hsv"}}, "map 'roughness': space 'hsv' is unknown"),
-        (SMALL, {"weights": {"ao": 1}}, "weights names 'ao', which is no map"),
-        (SMALL, {"weights": {"albedo": 0}}, "'albedo' has 0; it must be above 0"),
-        (SMALL, {"target_psnr": {"albedo": 30}}, "target_psnr names albedo; give one number"),
-        (
-            SMALL,
-            {"target_psnr": {"albedo": 30, "roughness": np.nan}},
-            "target_psnr is nan",
-        ),
+        ({"roughness": eg.Map(ROUGH, space="hsv")}, {}, "map 'roughness': space 'hsv' is unknown"),
+        ({"albedo": eg.Map(SMALL["albedo"], weight=0)}, {}, "'albedo': weight is 0; it must be"),
+        ({"albedo": eg.Map(SMALL["albedo"], weight=np.nan)}, {}, "weight is nan; it must be above"),
+        (SMALL | {"ao": eg.Map(ROUGH, goal=30)}, {}, "map 'albedo' has no goal; give each map one"),
+        ({"ao": eg.Map(ROUGH, goal=np.nan)}, {}, "map 'ao': target_psnr is nan"),
+        ({"ao": eg.Map(ROUGH, goal=30)}, {"gaussians": 9}, "exclude each other"),
         (SMALL, {"target_psnr": 30, "gaussians": 9}, "exclude each other"),
-        (SMALL, {"target_psnr": 30, "levels": 2}, "levels and target_psnr exclude each other"),
+        (SMALL, {"target_psnr": 30, "gaussians": [2, 9]}, "exclude each other"),
         (SMALL, {"gaussians": 65}, "gaussians is 65"),
-        (SMALL, {"space": "linear"}, "for maps give the space of each by its name"),
-        (SMALL, {"preset": "gaussianimage"}, "maps need preset 'default' and no start"),
-        (SMALL["albedo"], {"weights": {"a": 1}}, "are for a mapping of images"),
+        (SMALL, {"space": "linear"}, "maps take no start and no space; a Map says the space"),
+        (SMALL, {"start": "set.npz"}, "maps take no start and no space"),
+        (SMALL, {"weight": np.zeros((8, 8))}, "weight is 0 for all pixels"),
+        (SMALL, {"weight": np.ones((8, 9))}, "map 'albedo': weight is for 9x8 pixels, but the im"),
+        (SMALL, {"method": EIGENGS}, "this method starts from a model"),
     ],
 )
 def test_mistakes(maps, settings, words):

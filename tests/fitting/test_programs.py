@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 
 def picture(width, height, seed=0):
@@ -53,10 +54,10 @@ OVERHANGING = [(61, 67, 290), (97, 39, 500)]
 
 
 @pytest.mark.parametrize("sizes", [SIZES, OVERHANGING], ids=["whole", "overhanging"])
-@pytest.mark.parametrize("preset", ["default", "gaussianimage"])
-def test_fits_of_all_sizes_share_their_programs(backend, preset, sizes):
+@pytest.mark.parametrize("method", [eg.DEFAULT, GAUSSIANIMAGE], ids=["default", "gaussianimage"])
+def test_fits_of_all_sizes_share_their_programs(backend, method, sizes):
     def fit(width, height, count):
-        image, options = picture(width, height), {"preset": preset, "backend": backend}
+        image, options = picture(width, height), {"method": method, "backend": backend}
         eg.fit(image, gaussians=count, iterations=30, seed=0, **options)
 
     check_sharing(backend, fit, sizes)

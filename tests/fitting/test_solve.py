@@ -10,7 +10,9 @@ from drjit import JitFlag
 from hypothesis import given
 
 from _helpers.sets import COUNT, SIZE, Scene, check_equal, few, random_scene, scene_of, scenes
-from eigengs_dr.fitting.solve import solve
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.fitting.objective import Data, Pixels
+from eigengs_dr.fitting.solve import solve as solve_objective
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.raster.render import render
 
@@ -24,6 +26,13 @@ def roomy(count=12, channels=3):
     color = rng.uniform(-1, 1, (count, channels))
     arrays = mean, factor, color, np.linspace(0.1, 0.3, channels)
     return Scene(*(a.astype(np.float32).astype(float) for a in arrays))
+
+
+def solve(gaussians, image, steps=10, warm_start=False, background=None, weight=None):
+    """The solve for an image (H, W, C) in the space of the set, with weights."""
+    data = Data(image, image, weight)
+    objective = Pixels.of(data, gaussians.space, types_of(gaussians.mean))
+    return solve_objective(gaussians, objective, steps, warm_start, background)
 
 
 def matrix(scene, cutoff=CUTOFF):
@@ -72,6 +81,49 @@ def test_least_squares_in_double_precision(backend):
     found = solve(scene.on(backend, 64), image, steps=60).to_arrays()
     assert found["color"].dtype == np.float64
     np.testing.assert_allclose(found["color"], best_colors(scene, image)[0], atol=1e-9)
+
+
+def best_weighted(scene, image, weight):
+    """The best colours and background of each channel for weights (H, W, C), in float64."""
+    a, factors = matrix(scene), np.sqrt(weight.astype(float)).reshape(-1, image.shape[2])
+    pixels = image.reshape(-1, image.shape[2]).astype(float)
+    columns = [
+        np.linalg.lstsq(f[:, None] * a, f * p, rcond=None)[0]
+        for f, p in zip(factors.T, pixels.T, strict=True)
+    ]
+    found = np.stack(columns, axis=1)
+    return found[:-1], found[-1]
+
+
+@pytest.mark.parametrize("scale", [1, 1e-4, 1e4])
+@pytest.mark.parametrize("layers", [0, 1, 3])
+def test_weighted_least_squares(backend, layers, scale):
+    """Of pixels, or of their channels; what has no weight may be anything finite."""
+    scene, image, generator = roomy(), noise(), np.random.default_rng(5)
+    shape = (*image.shape[:2], layers) if layers else image.shape[:2]
+    weight = generator.uniform(0.2, 2, shape).astype(np.float32)
+    weight[4:7, 3:9] = 0
+    image[4:7, 3:9] = 50
+    whole = np.broadcast_to(weight.reshape(*image.shape[:2], -1), image.shape)
+    found = solve(scene.on(backend), image, 60, weight=np.float32(scale) * weight).to_arrays()
+    color, background = best_weighted(scene, image, whole)
+    np.testing.assert_allclose(found["color"], color, atol=2e-3)
+    np.testing.assert_allclose(found["background"], background, atol=2e-4)
+
+
+def test_what_zero_steps_give_with_weights(backend):
+    """The weighted mean of the image, for each channel; 0 for a channel without weight."""
+    image, weight = noise(), np.random.default_rng(5).uniform(0, 1, noise().shape)
+    weight[..., 2] = 0
+    found = solve(random_scene().on(backend), image, 0, weight=weight.astype(np.float32))
+    expected = [np.average(image[..., c], weights=weight[..., c]) for c in range(2)]
+    np.testing.assert_allclose(found.to_arrays()["background"], [*expected, 0], rtol=1e-5)
+
+
+def test_equal_weights_are_none(backend):
+    gaussians = random_scene().on(backend)
+    plain = solve(gaussians, noise(), 4).to_arrays()
+    check_equal(solve(gaussians, noise(), 4, weight=np.ones(SIZE[::-1], np.float32)), plain)
 
 
 def test_what_zero_steps_give(backend):
@@ -228,13 +280,16 @@ def test_values_that_all_splats_share(backend):
     check_equal(solve(shared, noise(), 3), solve(gaussians, noise(), 3).to_arrays())
 
 
-@pytest.mark.parametrize("shape", [(17, 22, 1), (22, 17, 3), (17, 22), (16, 22, 3), (17, 22, 4)])
+@pytest.mark.parametrize("shape", [(17, 22, 1), (22, 17, 3), (16, 22, 3), (17, 22, 4)])
 def test_wrong_shape(backend, shape):
-    with pytest.raises(
-        ValueError, match=r"image has shape .*, the set needs \(17, 22, 3\)"
-    ) as error:
-        solve(random_scene().on(backend), np.zeros(shape))
+    with pytest.raises(ValueError, match=r"the image has .*, the set \(22, 17, 3\)") as error:
+        solve(random_scene().on(backend), np.zeros(shape, np.float32))
     assert "\n" not in str(error.value)
+
+
+def test_steps_below_0_are_refused(backend):
+    with pytest.raises(ValueError, match="steps is -1; it must be at least 0"):
+        solve(random_scene().on(backend), noise(), -1)
 
 
 @pytest.mark.parametrize("cutoff", [0.0, 13.0])

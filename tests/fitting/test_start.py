@@ -1,5 +1,7 @@
 """Where a fit starts: from a basis, or from a placement."""
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -7,32 +9,23 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, family, small_model
 from _helpers.halves import picture
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.refine import refine
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.control import Perturb, Relocate
+from eigengs_dr.fitting.place import Grid, Random
 from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.resize import resample
+from eigengs_dr.paper.eigengs import EIGENGS
 
 
-@pytest.mark.parametrize("init", ["grid", "random", "model"])
-def test_other_starts_stay_where_they_were_put(init):
+@pytest.mark.parametrize("place", [Grid(), Random()], ids=repr)
+def test_other_placements_gain_from_relocation(place):
     """They are not placed anew, but they relocate in a long descent."""
-    options = {"gaussians": 60, "init": init}
-    if init == "model":
-        options = {"start": small_model("llvm")}
-    control = initialize(picture(), FitOptions(backend="llvm", **options)).control
-    assert control is not None and not control.redistributes
-
-
-def test_relocation_gains_from_any_start():
     image = eg.sample("coffee")[100:164, 200:264]
-    options = FitOptions(gaussians=200, init="grid")
-    start = initialize(image, options)
+    method = replace(eg.DEFAULT, place=place)
     moved, left = (
-        refine(problem, image, options.method.schedule, 1000).row["psnr_rgb"]
-        for problem in (start, start._replace(control=None))
+        eg.fit(image, 200, 600, method=m).psnr_rgb
+        for m in (method, method.without(Relocate, Perturb))
     )
-    assert moved > left + 0.5
+    assert moved > left + 0.3
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +53,7 @@ def test_fit_at_another_size_solves_again(backend, others):
 def test_fit_by_the_paper(backend, others):
     """Projected colours beside the dense mean image, refined from there."""
     model = small_model(backend)
-    result = eg.fit(others[0], iterations=100, preset="eigengs", start=model, backend=backend)
+    result = eg.fit(others[0], iterations=100, method=EIGENGS, start=model, backend=backend)
     shown = model.encode(others[0], "projected", "dense")
     start = (
         to_planes(eg.render(shown).numpy(), "ycbcr") + model.dense_mean(SIDE, SIDE).reshape(-1, 3).T
@@ -78,7 +71,7 @@ def test_a_fit_goes_on_from_a_set(backend, others, tmp_path):
     """From a set, a fit, a file, or the set of another size."""
     first = eg.fit(others[0], SPLATS, 20, backend=backend)
     first.save(tmp_path / "set.npz")
-    kept = {"iterations": 0, "solve_steps": 0, "backend": backend}
+    kept = {"iterations": 0, "method": replace(eg.DEFAULT, solve_steps=0), "backend": backend}
     for start in (first.gaussians, first, tmp_path / "set.npz", first.gaussians.scaled(64, 64)):
         again = eg.fit(others[0], start=start, **kept)
         np.testing.assert_allclose(again.image, first.image, atol=1e-4)
@@ -95,7 +88,8 @@ def test_a_start_is_left_as_it_is(backend, others):
     arrays["mean"][0] = -1.5, 3
     start = eg.Gaussians.from_arrays(**arrays, size=(start.width, start.height), backend=backend)
     dr.enable_grad(start.mean)
-    still = eg.fit(others[0], start=start, iterations=0, solve_steps=0, backend=backend)
+    kept = {"iterations": 0, "method": replace(eg.DEFAULT, solve_steps=0), "backend": backend}
+    still = eg.fit(others[0], start=start, **kept)
     np.testing.assert_array_equal(still.image, eg.render(start).numpy())
     eg.fit(others[0], start=start, iterations=3, backend=backend)
     assert not dr.any(dr.grad(start.mean) != 0, axis=None)
@@ -104,8 +98,51 @@ def test_a_start_is_left_as_it_is(backend, others):
 def test_data_above_1_start_in_their_own_unit(backend):
     data = 50 * picture()[..., :1]
     first = eg.fit(data, SPLATS, 20, space="data", backend=backend)
-    again = eg.fit(data, start=first, iterations=0, solve_steps=0, space="data", backend=backend)
+    method = replace(eg.DEFAULT, solve_steps=0)
+    again = eg.fit(data, start=first, iterations=0, method=method, backend=backend)
     np.testing.assert_allclose(again.image, first.image, atol=0.01)
+
+
+@pytest.mark.parametrize("space", ["rgb", "linear", "data", "log"])
+def test_the_space_is_that_of_the_start(space):
+    first = eg.fit(picture(), 60, 5, space=space)
+    again = eg.fit(picture(), start=first, iterations=5)
+    assert again.gaussians.space == space
+    assert again.psnr_ycbcr >= first.psnr_ycbcr - 0.01
+
+
+def heap(count, size):
+    """All Gaussians in one place."""
+    mean = np.full((count, 2), 3.0) + np.linspace(0, 1, count)[:, None]
+    factor = np.tile([1.0, 0, 1.0], (count, 1))
+    return eg.Gaussians.from_arrays(mean, factor, np.zeros((count, 3)), size=size, space="ycbcr")
+
+
+def test_a_useless_start_is_placed_anew():
+    image = eg.sample("coffee")[100:164, 200:264]
+    own = eg.fit(image, 150, 300)
+    found = eg.fit(image, start=heap(150, (64, 64)), iterations=300)
+    assert len(found.gaussians) == 150
+    assert found.psnr_ycbcr > own.psnr_ycbcr - 2
+
+
+def test_a_good_start_is_not_placed_anew():
+    """Refined for as long again, it gets better, as it would by more steps."""
+    image = eg.sample("coffee")[100:164, 200:264]
+    first = eg.fit(image, 150, 300)
+    found = eg.fit(image, start=first, iterations=300)
+    assert found.psnr_ycbcr > first.psnr_ycbcr
+
+
+def test_each_image_of_a_batch_decides_about_its_start():
+    """The start suits one of them; the sets are those of single fits, bit for bit."""
+    image = eg.sample("coffee")[100:132, 200:232]
+    other = eg.sample("astronaut")[100:132, 200:232]
+    start = eg.fit(image, 60, 300).gaussians
+    rows = eg.fit_many([image, other], start=start, iterations=100)
+    for row, one in zip(rows, (image, other), strict=True):
+        alone = eg.fit(one, start=start, iterations=100)
+        np.testing.assert_array_equal(row.result.image, alone.image)
 
 
 @pytest.mark.parametrize(
@@ -113,9 +150,9 @@ def test_data_above_1_start_in_their_own_unit(backend):
     [
         ({"gaussians": 50}, "gaussians is 50, but the start has 100"),
         ({"space": "rgb"}, "space is 'rgb', but the start is in 'ycbcr'"),
-        ({"init": "grid"}, "init 'grid' and a start exclude each other"),
-        ({"preset": "eigengs", "start": None}, "preset 'eigengs' starts from a model"),
-        ({"target_psnr": 30.0}, "target_psnr works with .* not with 'default' and 'a start'"),
+        ({"gaussians": [20, 50]}, "levels need the placement Adaptive and no start"),
+        ({"method": EIGENGS, "start": None}, "this method starts from a model; give one as"),
+        ({"target_psnr": 30.0}, "target_psnr needs a method that places .* and no start"),
     ],
 )
 def test_fit_refuses_a_start(backend, options, words, others):
@@ -134,5 +171,7 @@ def test_fit_refuses_what_is_no_start(others):
         eg.fit(others[0], start=maps, space="data")
     with pytest.raises(ValueError, match="the image has 3 channels, but the start has 1; use"):
         eg.fit(others[0], start=maps.gaussians["roughness"], space="data")
+    with pytest.raises(ValueError, match="this method starts from a model"):
+        eg.fit(others[0], start=eg.fit(others[0], 30, 0), method=EIGENGS)
     with pytest.raises(ValueError, match="the start is on backend 'llvm', not on 'cuda'"):
         eg.fit(others[0], start=small_model("llvm"), backend="cuda")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from _helpers.halves import SIDE, fitted, picture
+import eigengs_dr as eg
+from _helpers.halves import SIDE, fitted, objective_for, objective_of, picture
 from _helpers.placements import check_placement, covariances_of, generator, images_and_counts
 from _helpers.plain_placement import (
     plain_blur,
@@ -16,7 +17,10 @@ from _helpers.plain_placement import (
     to_pixels,
 )
 from _helpers.sets import few
-from eigengs_dr.fitting.options import PRESETS, FitOptions
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.objective import Data, Pixels
+from eigengs_dr.fitting.place import Grid
 from eigengs_dr.fitting.placement.adaptive import (
     DENSITY_BLUR,
     DENSITY_EXPONENT,
@@ -29,14 +33,14 @@ from eigengs_dr.fitting.placement.adaptive import (
     redistribute,
     shapes_from_hessian,
 )
-from eigengs_dr.fitting.schedule import first_phase
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import render
 
 
 def placed(image, count, backend="llvm", density=None):
     """Means (N, 2) and factors (N, 3)."""
-    arrays = place_adaptive(image, count, "data", backend, density=density).to_arrays()
+    objective = objective_of(image, backend, "data")
+    arrays = place_adaptive(objective, count, density=density).to_arrays()
     return arrays["mean"], arrays["factor"]
 
 
@@ -135,20 +139,25 @@ def test_density_given_to_adaptive_is_followed(backend):
 
 def test_sets_of_a_batch_are_those_of_its_images(backend):
     batch = generator(7).uniform(0, 1, (3, 30, 33, 3)).astype(np.float32)
-    found = place_adaptive(batch, 60, "data", backend)
+
+    def placed_for(*images):
+        data = [Data(image, image) for image in images]
+        return place_adaptive(Pixels.of(data, "data", types_in(select(backend))), 60)
+
+    found = placed_for(*batch)
     for name in ("mean", "factor"):
         rows = getattr(found, name).numpy().T
         for image, own in zip(batch, np.split(rows, 3), strict=True):
-            alone = place_adaptive(image, 60, "data", backend)
-            np.testing.assert_array_equal(own, getattr(alone, name).numpy().T)
+            np.testing.assert_array_equal(own, getattr(placed_for(image), name).numpy().T)
 
 
 @pytest.mark.parametrize("side", [32, 150])
 def test_rearranged_has_the_count_and_goes_where_the_error_is(side):
     """Also where splats are so far apart that they are placed on a smaller image."""
     image = np.kron(picture(), np.ones((-(-side // SIDE), -(-side // SIDE), 1)))[:side, :side]
-    start = initialize(image.astype(np.float32), FitOptions(gaussians=64, init="grid"))
-    result = redistribute(start.gaussians, 50, start.target, start.target)
+    objective = objective_of(image.astype(np.float32))
+    start = replace(eg.DEFAULT, place=Grid()).place_and_solve(objective, 64)
+    result = redistribute(start, objective, 50)
     left = result.mean.numpy()[0] < side / 2
     assert len(result) == 50
     assert left.mean() > 0.6  # half of the area, most of the error
@@ -156,15 +165,9 @@ def test_rearranged_has_the_count_and_goes_where_the_error_is(side):
 
 
 def test_weights_draw_splats():
-    start, target = fitted()
-    weight = np.ones_like(target)
-    weight[SIDE // 2 :] = 1e-3
-    result = redistribute(start.gaussians, 60, target, target, weight)
+    gaussians, _ = fitted()
+    weight = np.ones((SIDE, SIDE), np.float32)
+    weight[SIDE // 2 :] = 1e-6
+    objective = objective_for(gaussians, rgb_to_ycbcr(picture()), weight)
+    result = redistribute(gaussians, objective, 60)
     assert (result.mean.numpy()[1] < SIDE / 2).mean() > 0.7
-
-
-def test_the_first_phase_is_a_tenth_of_a_short_descent():
-    schedule = PRESETS["default"].schedule
-    steps = (0, 99, 100, 150, 200, 100_000)
-    assert [first_phase(schedule, n) for n in steps] == [0, 0, 10, 15, 20, 20]
-    assert first_phase(replace(schedule, redistribute_after=0), 1000) == 0

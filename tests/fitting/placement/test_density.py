@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.halves import objective_for
 from _helpers.plain_placement import to_canvas, to_pixels
 from _helpers.sets import SIZE, random_scene
 from eigengs_dr.fitting.placement.density import (
@@ -64,9 +65,11 @@ def test_error_is_that_of_the_rendering(backend):
     weight = np.random.default_rng(1).uniform(0, 2, target.shape).astype(np.float32)
     shown = eg.render(gaussians).numpy()
     canvas, _ = to_canvas(target, backend)
-    for factor in (None, weight):
-        expected = np.square((target - shown) * (1 if factor is None else factor)).sum(axis=2)
-        found = to_pixels(canvas, squared_error(gaussians, target, factor))
+    for factor in (None, weight, weight[..., 0]):
+        factors = 1.0 if factor is None else np.atleast_3d(factor)
+        expected = (factors * np.square(target - shown)).sum(axis=2)
+        objective = objective_for(gaussians, target, factor)
+        found = to_pixels(canvas, squared_error(gaussians, objective))
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 

@@ -18,13 +18,14 @@ from eigengs_dr.raster.render import batch_to_tiles
 
 
 def found_peaks(missed, count, weight=None, backend="llvm"):
-    """Mean (n, 2), colour (n, C), image and rank (n,)."""
+    """Mean (n, 2), colour (n, C), image and rank (n,), for an error (H, W, C) and its weights."""
     images = len(missed) if missed.ndim == 4 else 1
     types, grid = types_in(select(backend)), Grid(*missed.shape[-2:-4:-1], images=images)
-    squares = None if weight is None else np.square(weight, dtype=np.float32)
-    tiles = (None if v is None else batch_to_tiles(types, v) for v in (missed, squares))
-    image, squares = tiles
-    peaks = residual_peaks(Canvas.of(types, grid), image, count, squares)
+    curvature = np.ones((*missed.shape[:-1], 1)) if weight is None else weight
+    curvature = curvature.astype(np.float32)
+    slope = (missed * curvature).astype(np.float32)
+    tiles = batch_to_tiles(types, slope), batch_to_tiles(types, curvature)
+    peaks = residual_peaks(Canvas.of(types, grid), *tiles, count)
     return SimpleNamespace(
         mean=peaks.mean.numpy().T,
         color=np.stack([row.numpy() for row in peaks.color], axis=1),
@@ -37,10 +38,12 @@ def plain_peaks(missed, weight=None):
     """Mean and colour of all peaks, the best first."""
     radius = int(np.ceil(TRUNCATION * SIZE))
     taps = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / SIZE))
-    color = missed
+    weight = np.ones_like(missed) if weight is None else weight + 0 * missed
+    slope = missed.astype(float) * weight
     for axis in (0, 1):
-        color = correlate1d(color, taps, axis, mode="constant") / np.square(taps).sum()
-    gain = np.square(color if weight is None else color * weight).sum(axis=2)
+        slope = correlate1d(slope, taps, axis, mode="constant") / np.square(taps).sum()
+    color = np.where(weight > 0, slope / np.where(weight > 0, weight, 1), 0)
+    gain = (color * slope * (weight > 0)).sum(axis=2)
     y, x = np.nonzero((gain == maximum_filter(gain, 3, mode="constant")) & (gain > 0))
     order = np.argsort(-gain[y, x])
     y, x = y[order], x[order]
@@ -57,12 +60,19 @@ def noise(*shape):
     width=st.integers(1, 30),
     channels=st.integers(1, 4),
     share=st.sampled_from([0, 0.3, 1]),
-    weighted=st.booleans(),
+    layers=st.integers(0, 2),
 )
-def test_peaks_are_those_of_a_plain_search(backend, height, width, channels, share, weighted):
-    """On sizes that whole tiles do not fill too; rounding may exchange peaks of equal gain."""
-    missed = noise(height, width, channels)
-    weight = np.random.default_rng(1).uniform(0.5, 2, missed.shape) if weighted else None
+def test_peaks_are_those_of_a_plain_search(backend, height, width, channels, share, layers):
+    """On sizes that whole tiles do not fill too; weights of pixels or channels, a third of them 0.
+
+    Rounding may exchange peaks of equal gain.
+    """
+    missed, generator = noise(height, width, channels), np.random.default_rng(1)
+    weight = None
+    if layers:
+        shape = (height, width, (1, channels)[layers - 1])
+        weight = generator.uniform(0.5, 2, shape) * (generator.uniform(0, 1, shape) > 1 / 3)
+        weight = weight.astype(np.float32)
     mean, color = plain_peaks(missed, weight)
     count = int(share * len(mean))
     found = found_peaks(missed, count, weight, backend)

@@ -6,8 +6,7 @@ import pytest
 import eigengs_dr as eg
 from eigengs_dr.backend.arrays import types_in, upload, upload_rows
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.density_control import MAX_NOISE, SHAPE_SHARE, perturb
-from eigengs_dr.fitting.schedule import Relocation
+from eigengs_dr.fitting.control import MAX_NOISE, SHAPE_SHARE, perturb
 
 COUNT, SIDE = 4000, 48
 
@@ -35,8 +34,8 @@ def perturbed(before, error, strength, seed, own=range(COUNT), backend="llvm", i
     types = types_in(select(backend), 64)
     mean, factor, color = (upload_rows(types.Float, before[k].T) for k in before)
     errors = upload(types.Float, np.broadcast_to(error, images))
-    how = Relocation(0.1, strength, seed)
-    after = perturb(types.Float2(*mean), types.Float3(*factor), color, own, errors, how)
+    rows = types.Float2(*mean), types.Float3(*factor), color
+    after = perturb(*rows, own, errors, strength, seed, images)
     return {"mean": after[0].numpy().T, "factor": after[1].numpy().T}
 
 
@@ -87,3 +86,15 @@ def test_the_error_added_to_an_image():
         moved = perturbed(arrays, error, strength, seed, own=range(1))
         added.append(np.square(image(moved["mean"]) - image(arrays["mean"])).sum())
     assert np.mean(added) == pytest.approx(strength**2 * error, rel=0.2)
+
+
+def test_images_of_a_batch_have_equal_noise():
+    """With equal errors and Gaussians: no image changes that of another."""
+    before = scene(0.1)
+    half = COUNT // 2
+    twice = {name: np.concatenate([rows[:half]] * 2) for name, rows in before.items()}
+    alone = {name: rows[:half] for name, rows in before.items()}
+    one = perturbed(alone, 0.01, 1.0, 5, range(half))
+    two = perturbed(twice, 0.01, 1.0, 5, range(half), images=2)
+    for name, rows in one.items():
+        np.testing.assert_array_equal(two[name], np.concatenate([rows] * 2))

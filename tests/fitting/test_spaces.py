@@ -6,10 +6,10 @@ import pytest
 import eigengs_dr as eg
 from _helpers.errors import one_line
 from _helpers.families import small_model
-from _helpers.waves import SPLATS, check_sound, figures, picture, presets
+from _helpers.waves import SPLATS, check_sound, figures, methods, picture
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.target import BLACK, make_target, read_pixels
+from eigengs_dr.fitting.objective import BLACK, data_of
+from eigengs_dr.fitting.pixels import read_pixels
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.pixels import ImageError
 from eigengs_dr.raster.render import render
@@ -39,24 +39,24 @@ def test_linear_light_places_by_what_one_sees(backend):
 
 
 def test_linear_light_weighs_errors_as_they_show():
-    """Like the root of the slope of the sRGB curve, down to the darkest light."""
+    """Squares count by the slope of the sRGB curve, down to the darkest light."""
     light = np.geomspace(BLACK, 1, 50, dtype=np.float32)[None, :, None].repeat(3, axis=2)
-    weight = make_target(to_coded(light), "linear").weight
+    weight = data_of(to_coded(light), "linear").curvature
     slope = np.gradient(to_coded(light)[0, :, 0], light[0, :, 0])
-    ratio = weight[0, :, 0] / np.sqrt(slope)
-    np.testing.assert_allclose(ratio, ratio.mean(), rtol=0.1)
-    np.testing.assert_array_equal(make_target(0 * light, "linear").weight, weight.max())
+    ratio = weight[0, :, 0] / slope
+    np.testing.assert_allclose(ratio, ratio.mean(), rtol=0.2)
+    np.testing.assert_array_equal(data_of(0 * light, "linear").curvature, weight.max())
 
 
-@presets
+@methods
 @pytest.mark.parametrize("channels", [1, 3])
-def test_data_is_taken_as_it_is(backend, preset, channels):
+def test_data_is_taken_as_it_is(backend, method, channels):
     data = picture()[..., :channels]
-    if preset == "eigengs":
+    if method.needs_model:
         with pytest.raises(ValueError, match="space is 'data', but the start is in 'ycbcr'; use"):
-            fit(data, SPLATS, 3, preset=preset, start=small_model(backend), space="data")
+            fit(data, SPLATS, 3, method=method, start=small_model(backend), space="data")
         return
-    result = fit(data, SPLATS, 60, preset=preset, space="data", backend=backend)
+    result = fit(data, SPLATS, 60, method=method, space="data", backend=backend)
     assert result.gaussians.space == "data"
     assert result.gaussians.channels == channels
     assert result.image.shape == data.shape
@@ -127,7 +127,7 @@ def test_data_of_any_range():
     error = np.sqrt(np.mean((eg.render(result.gaussians).numpy()[..., 0] - heights) ** 2))
     assert error < 3
     np.testing.assert_allclose(result.image[..., 0], heights, atol=30)
-    levels = eg.fit(heights, levels=2, space="data", **SMALL)
+    levels = eg.fit(heights, [75, 300], iterations=100, space="data")
     np.testing.assert_allclose(levels.image[..., 0], heights, atol=60)
 
 
@@ -165,7 +165,7 @@ def test_pack(tmp_path, light, color):
 
 def test_the_image_is_not_copied_in_vain():
     photo = np.random.default_rng(0).random((8, 9, 3)).astype(np.float32)
-    assert read_pixels(photo, FitOptions())[0] is photo
+    assert read_pixels(photo, "ycbcr")[0] is photo
 
 
 @pytest.mark.parametrize("space", ["ycbcr", "rgb"])

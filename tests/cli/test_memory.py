@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from _helpers.process import run_python
-from eigengs_dr.fitting.memory import estimate_memory
+from eigengs_dr.cli.memory import estimate_memory
 
 
 def test_memory_grows_with_every_argument():

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.halves import SIDE, picture
+from _helpers.halves import SIDE, fitted, picture
 from _helpers.photos import coffee
+from eigengs_dr.fitting.control import Redistribute
+from eigengs_dr.fitting.fewest import fewest
 from eigengs_dr.fitting.fit import FitInterrupted, fit
-from eigengs_dr.fitting.options import PRESETS, FitOptions, max_gaussians_for
-from eigengs_dr.fitting.search import search_count
-from eigengs_dr.fitting.start import initialize
+from eigengs_dr.fitting.options import Goal, max_gaussians_for
+from eigengs_dr.fitting.place import Random
+from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 
 def test_two_colours_take_few():
@@ -28,7 +30,7 @@ def test_noise_is_out_of_reach():
     noise = np.random.default_rng(0).uniform(0, 1, (SIDE, SIDE, 3))
     result = fit(noise, target_psnr=45, iterations=100)
     assert result.stopped == "out of reach"
-    assert len(result.gaussians) <= max_gaussians_for(noise) == SIDE * SIDE * 3 // 8
+    assert len(result.gaussians) <= max_gaussians_for(SIDE * SIDE, 3) == SIDE * SIDE * 3 // 8
 
 
 @pytest.mark.parametrize("space", ["ycbcr", "rgb"])
@@ -36,7 +38,7 @@ def test_the_target_is_met_in_its_space(space):
     image = coffee(SIDE)
     plain = fit(image, gaussians=100)
     reached = plain.trace[-1][f"psnr_{space}"]
-    found = fit(image, target_psnr=reached, target_space=space)
+    found = fit(image, target_psnr=Goal(reached, space))
     assert found.stopped == "met"
     assert eg.psnr(image, found.image, space=space) >= reached
     assert len(found.gaussians) <= 115
@@ -109,7 +111,7 @@ def test_interrupted_after_half_its_time_it_is_near_its_goal(goal):
 
 def test_interrupted_it_has_no_more_than_it_may():
     """Although the fit has a surplus."""
-    found = interrupted(coffee(64), 100, target_psnr=60, max_gaussians=100)
+    found = interrupted(coffee(64), 100, target_psnr=Goal(60, max_gaussians=100))
     assert len(found.gaussians) == max(row["gaussians"] for row in found.trace) == 100
 
 
@@ -122,15 +124,12 @@ def test_an_image_that_is_fitted_without_error(space, value):
     assert (len(result.gaussians), result.stopped, result.psnr_rgb) == (1, "met", np.inf)
 
 
-SCHEDULE = PRESETS["default"].schedule
-
-
-def searched(measure, iterations=40, most=1000, image=None, schedule=SCHEDULE, progress=None):
+def searched(measure, iterations=40, most=1000, image=None, method=eg.DEFAULT, progress=None):
     """Search for 0 dB, from 60 splats, where ``measure(gaussians)`` returns decibels."""
-    image = picture() if image is None else image
-    start = initialize(image, FitOptions(gaussians=60, init="adaptive"))
-    row = lambda gaussians: {"decibels": measure(gaussians)}  # noqa: E731
-    return search_count(start, row, "decibels", 0.0, most, schedule, iterations, progress)
+    gaussians, objective = fitted(60, image=image)
+    score = lambda gaussians: [{"decibels": measure(gaussians)}]  # noqa: E731
+    goal = "decibels", 0.0
+    return fewest(objective, method, gaussians, score, goal, most, iterations, progress=progress)
 
 
 def test_a_search_whose_goal_is_not_met_ends():
@@ -152,8 +151,7 @@ def searched_at_rest(measure):
 
     ``measure(gaussians, steps)`` returns decibels, where `steps` lists those of all descents.
     """
-    rates = dict.fromkeys(SCHEDULE.rates, 0.0)
-    still = replace(SCHEDULE, rates=rates, relocate_every=0, surplus=0.0)
+    still = replace(eg.DEFAULT.at_rates(1e-30), controls=(Redistribute(),))
     taken, steps = [0], []
 
     def judge(gaussians):
@@ -161,7 +159,7 @@ def searched_at_rest(measure):
             steps.append(taken[-1] - sum(steps))
         return measure(gaussians, steps)
 
-    result = searched(judge, 1000, schedule=still, progress=lambda step, *_: taken.append(step))
+    result = searched(judge, 1000, method=still, progress=lambda step, *_: taken.append(step))
     assert result.stopped == "met"
     return result, steps
 
@@ -235,20 +233,21 @@ def test_a_search_ends_where_no_place_is_left_to_grow():
     ("settings", "told"),
     [
         ({"gaussians": 10}, "exclude each other"),
-        ({"preset": "gaussianimage"}, "works with preset 'default'"),
-        ({"init": "random"}, "init 'adaptive'"),
+        ({"method": GAUSSIANIMAGE}, "needs a method that places Gaussians by the image"),
+        ({"method": replace(eg.DEFAULT, place=Random())}, "places Gaussians by the image"),
+        ({"method": eg.DEFAULT.without(Redistribute)}, "and redistributes them, such as DEFAULT"),
         ({"target_psnr": 0}, "above 0"),
         ({"target_psnr": np.nan}, "above 0"),
         ({"target_psnr": 101}, "at most 100"),
-        ({"target_space": "lab"}, "use one of rgb, ycbcr"),
-        ({"max_gaussians": 0}, "takes 1 to 1024"),
-        ({"max_gaussians": 2000}, "takes 1 to 1024"),
-        ({"max_gaussians": 50.5}, "max_gaussians is 50.5; it must be .* whole"),
-        ({"target_psnr": None, "max_gaussians": 50}, "belong to target_psnr"),
-        ({"target_psnr": None, "target_space": "ycbcr"}, "belong to target_psnr"),
+        ({"target_psnr": True}, "target_psnr is True; it must be a number"),
+        ({"target_psnr": lambda: Goal(30, "lab")}, "use one of rgb, ycbcr"),
+        ({"target_psnr": lambda: Goal(30, max_gaussians=0)}, "max_gaussians is 0; it must be at"),
+        ({"target_psnr": Goal(30, max_gaussians=2000)}, "takes 1 to 1024"),
+        ({"target_psnr": lambda: Goal(30, max_gaussians=50.5)}, "50.5; it must be a whole number"),
     ],
 )
 def test_what_cannot_be_searched_for_is_said_in_one_line(settings, told):
     with pytest.raises(ValueError, match=told) as caught:
-        fit(picture(), **({"target_psnr": 30} | settings))
+        goal = settings.get("target_psnr", 30)
+        fit(picture(), **(settings | {"target_psnr": goal() if callable(goal) else goal}))
     assert "\n" not in str(caught.value)
