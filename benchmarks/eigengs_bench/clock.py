@@ -18,7 +18,7 @@ from eigengs_dr.fitting.pixels import read_pixels
 from eigengs_dr.fitting.place import Adaptive
 from eigengs_dr.fitting.start import load_start, set_in, start_from, types_for
 from eigengs_dr.image.metrics import MAX_PSNR
-from eigengs_dr.paper.eigengs import EIGENGS
+from eigengs_dr.paper.eigengs import EIGENGS, EigenGSMethod
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 Image = NDArray[np.float32]  # RGB, shape (H, W, 3), 1 is white
@@ -65,8 +65,10 @@ def start(image: Image, options: FitOptions) -> Run:
         placed = method.place_and_solve(objective, count, options.seed)
         return Run(objective, begin(placed, chosen=method.place != Adaptive()))
     objective, begun = start_from(source, objective, method, pixels, moves=True)
-    mean_image = method.mean_image(source, width, height) if method.needs_model else 0.0
-    return Run(objective, begin(begun, chosen=True), mean_image)
+    run = Run(objective, begin(begun, chosen=True))
+    if isinstance(method, EigenGSMethod) and not isinstance(source, eg.Gaussians):
+        return run._replace(mean_image=method.mean_image(source, width, height))
+    return run
 
 
 def follow(

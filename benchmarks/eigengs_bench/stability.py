@@ -6,6 +6,7 @@ Every cell is a call of `eigengs_dr.fit`, as a user makes it.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -70,16 +71,16 @@ def fit_case(
     case: Case, image: Image, name: str, backend: str | None = None, seed: int = 0
 ) -> eg.Fit:
     """Fit the image of a case by the method of a name, from the start of the case if it has one."""
-    method, count, start = METHODS[name], case.gaussians, None
+    method = METHODS[name]
+    begun: dict[str, Any] = {"gaussians": case.gaussians}
     if method.needs_model:
-        count, start = None, eg.EigenGS.load(BASIS, backend)
+        begun = {"start": eg.EigenGS.load(BASIS, backend)}
     elif case.place is not None:
-        count, start = None, _start(case, image, backend)
+        begun = {"start": _start(case, image, backend)}
     return eg.fit(
         image,
-        count,
-        case.iterations,
-        start=start,
+        iterations=case.iterations,
+        **begun,
         space=case.space,
         method=method.at_rates(case.rates),
         seed=seed,
