@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.executor import Executor, completed
-from ..fitting.control import Redistribute
 from ..fitting.objective import Extent
 from ..gaussian.file import SetData
 from ..storage.checkpoint import Checkpoint
@@ -72,8 +71,7 @@ class Run:
         """Place and fit all Gaussians; a long fit places them again where error was left."""
         options = self.settings.options
         steps = options.iterations
-        control = options.method.control(Redistribute)
-        first = sum(control.steps(steps)) if control else 0
+        first = options.method.first_phase(steps)
         mass = self._survey()
         placed = self._place(mass)
         if first:

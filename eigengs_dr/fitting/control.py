@@ -106,19 +106,20 @@ class Surplus:
 class Redistribute:
     """Places all Gaussians anew after the first steps, denser where these left more error.
 
-    Gaussians that the user chose are replaced if the error is then smaller: where a start is
-    useless.
-
     Attributes
     ----------
     after : int
         Most steps before it.
     solve_steps : int
         Steps of the colour solve after it.
+    useless : float
+        Gaussians that the user chose stay, unless they then have so many times the squared error
+        that they would have anew.
     """
 
     after: int = 20
     solve_steps: int = 10
+    useless: float = 2.0
 
     MIN_RATIO = 10
     """Smallest ratio of the steps of a descent to those before a redistribution."""
@@ -149,7 +150,7 @@ class Redistribute:
         anew = redistribute(current, objective, count, self.solve_steps)
         if state.chosen:
             before, after = (dr.sum(squared_error(g, objective))[0] for g in (current, anew))
-            if not after < before:
+            if before <= self.useless * after:
                 return state
         return state.replaced(anew)
 

