@@ -1,15 +1,14 @@
 """A picture with a smooth half and a busy half, and the start of its fit."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from eigengs_dr.backend.arrays import types_of
-from eigengs_dr.fitting import density_control
-from eigengs_dr.fitting.descent import TiledImage
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.placement.adaptive import residual
-from eigengs_dr.fitting.start import initialize
-from eigengs_dr.image.color import rgb_to_ycbcr
-from eigengs_dr.raster.render import batch_to_tiles
+import eigengs_dr as eg
+from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.objective import Data, Pixels, data_of
+from eigengs_dr.raster.render import picture_of, render, to_tensor
 
 SIDE = 32
 
@@ -23,19 +22,40 @@ def picture(seed=0):
     return image.astype(np.float32)
 
 
-def fitted(count=60):
-    """A fit before its refinement, and its target in YCbCr."""
-    image = picture()
-    return initialize(image, FitOptions(gaussians=count, init="adaptive")), rgb_to_ycbcr(image)
+def objective_of(image, backend=None, space="ycbcr", weight=None):
+    """The squared error of an RGB image in a space of colours."""
+    return Pixels.of(data_of(image, space, weight), space, types_in(select(backend)))
 
 
-def squared_error(gaussians, target, weight=1.0):
-    """Sum of the squares of what a rendering misses."""
-    return float(np.square(weight * residual(gaussians, target).astype(np.float64)).sum())
+def objective_for(gaussians, target, weight=None):
+    """The squared error of an image (H, W, C) in the space of a set, with weights."""
+    data = Data(target, target, weight)
+    return Pixels.of(data, gaussians.space, types_of(gaussians.mean))
 
 
-def relocate(gaussians, how, target, weight=None, **part):
-    """A round of relocation for an image (H, W, C)."""
-    types = types_of(gaussians.mean)
-    tiles = (None if v is None else batch_to_tiles(types, v) for v in (target, weight))
-    return density_control.relocate(gaussians, how, TiledImage(*tiles), **part)
+def fitted(count=60, backend=None, image=None):
+    """Placed Gaussians with the best colours, and the objective, in YCbCr."""
+    objective = objective_of(picture() if image is None else image, backend)
+    return eg.DEFAULT.place_and_solve(objective, count), objective
+
+
+def squared_error(gaussians, objective):
+    """``sum h (p - t)^2`` of a rendering, by NumPy in float64."""
+    model, plain = objective.model, replace(gaussians, space="data")  # no conversion to RGB
+    missed = render(plain).numpy().astype(np.float64)
+    missed -= objective.picture(model.target).numpy()
+    if model.curvature is None:
+        return float(np.square(missed).sum())
+    channels = missed.shape[2] * len(model.curvature) // len(model.target)
+    factors = to_pixels(model.curvature, objective.grid, channels)
+    return float((factors * np.square(missed)).sum())
+
+
+def to_pixels(values, grid, channels):
+    """An image (H, W, C) from tile layout, in float64."""
+    return to_tensor(values, grid, channels).numpy().astype(np.float64)
+
+
+def ycbcr_psnr(gaussians, image):
+    """The psnr_ycbcr of a set."""
+    return eg.psnr(picture_of(gaussians), image, "ycbcr")

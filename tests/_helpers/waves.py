@@ -6,16 +6,21 @@ import numpy as np
 import pytest
 
 from _helpers.sets import random_scene
-from eigengs_dr.fitting.descent import FitProblem, descend
-from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.control import Redistribute, Surplus
+from eigengs_dr.fitting.descent import begin, descend
+from eigengs_dr.fitting.method import DEFAULT
+from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import MAX_PSNR, psnr
+from eigengs_dr.paper.eigengs import EIGENGS
+from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 from eigengs_dr.raster.render import picture_of
 
 SIDE, SPLATS = 32, 100
 """Size of the pictures that are fitted, and splats in a fit: one set of kernels."""
 
-presets = pytest.mark.parametrize("preset", PRESETS)
+METHODS = {"default": DEFAULT, "gaussianimage": GAUSSIANIMAGE, "eigengs": EIGENGS}
+methods = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
 
 def picture(height=SIDE, width=SIDE):
@@ -33,25 +38,25 @@ def figures(result):
 
 
 def start(backend, count=SPLATS, seed=0):
-    """Splats at random places, in YCbCr, and the picture there."""
+    """Splats at random places, in YCbCr, and the objective of the picture."""
     scene = random_scene(seed, count, (SIDE, SIDE))
     mean = np.clip(scene.mean, 0, SIDE)
     gaussians = scene._replace(mean=mean, color=0 * scene.color).on(backend, space="ycbcr")
-    return gaussians, rgb_to_ycbcr(picture())
+    return gaussians, Pixels.plain(rgb_to_ycbcr(picture()), gaussians)
 
 
-def default(**changed):
-    """The schedule of the default preset, changed."""
-    return replace(PRESETS["default"].schedule, **changed)
+def still(**changed):
+    """The default method, which here places nothing anew, changed."""
+    return replace(DEFAULT.without(Surplus, Redistribute), **changed)
 
 
 def half_read(backend, count=2):
     """A descent of which some sets were read; they hold arrays that share NumPy's memory."""
-    gaussians, target = start(backend)
-    sets = descend(FitProblem(gaussians, target), default(redistribute_after=0), 5)
+    gaussians, objective = start(backend)
+    states = descend(objective, still(), begin(gaussians), 5)
     for _ in range(count):
-        next(sets)
-    return sets
+        next(states)
+    return states
 
 
 def check_sound(result, image):
