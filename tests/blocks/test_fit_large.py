@@ -14,7 +14,7 @@ from _helpers.process import python_path, run_python
 from _helpers.sets import check_equal
 from eigengs_dr.backend.executor import Done
 from eigengs_dr.blocks.draw import BAND_PIXELS, draw_region, save_region
-from eigengs_dr.fitting.memory import estimate_memory
+from eigengs_dr.cli.memory import estimate_memory
 from eigengs_dr.gaussian.file import read
 from eigengs_dr.storage.checkpoint import read_arrays, write_arrays
 
