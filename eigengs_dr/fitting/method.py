@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arguments import plain_numbers
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from .control import Perturb, Redistribute, Relocate, Surplus
 from .optimizer import Adam, Optimizer
@@ -108,6 +109,8 @@ class Method:
     cutoff: float = CUTOFF
 
     def __post_init__(self) -> None:
+        for name, value in plain_numbers(vars(self), Method.__annotations__).items():
+            object.__setattr__(self, name, value)
         if not 0 < self.cutoff <= MAX_CUTOFF:
             raise ValueError(
                 f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
