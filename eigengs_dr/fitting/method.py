@@ -92,8 +92,9 @@ class Method:
     --------
     >>> from dataclasses import replace
     >>> import eigengs_dr as eg
-    >>> eg.fit(eg.sample("coffee")[:32, :32], 50, 10, method=replace(eg.DEFAULT, cutoff=4.0))
-    Fit(50 Gaussians, 32x32 pixels, 10 iterations, ...)
+    >>> method = replace(eg.DEFAULT, cutoff=4.0)
+    >>> eg.fit(eg.sample("coffee")[:32, :32], 50, 10, method=method).gaussians.cutoff
+    4.0
     """
 
     place: Placement
