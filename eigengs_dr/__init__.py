@@ -4,60 +4,56 @@
 package neither loads Dr.Jit nor sets a Mitsuba variant.
 """
 
+from __future__ import annotations
+
 from .backend import ending
 
 if ending.is_program():  # before the imports, which take half a second
     ending.end_at_signals()
 
-import sys
-from importlib.util import spec_from_file_location
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import Any
+from typing import TYPE_CHECKING
 
 import lazy_loader
 
-from .backend.executor import EXECUTORS
-from .backend.feedback import HTML
+from .backend import notebook
 from .backend.libllvm import select_libllvm
-from .storage.atomic import READERS, Reader
+from .gaussian import packed
+from .version import __version__ as __version__
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from .gaussian.channels import TextureMap
+    from .gaussian.file import SetData
 
 # Dr.Jit looks for libLLVM once, while it is imported; lazy_loader imports it here if EAGER_IMPORT
 # is set.
 select_libllvm()
 
-
-class _Checkout:
-    """Finds the plugins of a checkout, which lie beside the package; an install has them inside.
-
-    Python started in the root of a checkout takes the package from there, also beside an install.
-    """
-
-    FOLDER = Path(__file__).parents[1] / "plugins"
-
-    @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
-        """Return how to import the plugins, and nothing else."""
-        if name != f"{__name__}.plugins" or not (cls.FOLDER / "__init__.py").is_file():
-            return None
-        return spec_from_file_location(
-            name, cls.FOLDER / "__init__.py", submodule_search_locations=[str(cls.FOLDER)]
-        )
+# In a checkout the plugins lie beside the package; an install has them inside.
+if not Path(__file__).with_name("plugins").exists():
+    __path__.append(str(Path(__file__).parents[1]))
 
 
-sys.meta_path.append(_Checkout)  # type: ignore[arg-type]
+# Folders that know nothing of the codec and the viewer use them through these functions.
+def _make_html(value: object) -> str:
+    from .viewer.notebook import to_html
+
+    return to_html(value)
 
 
-def _later(name: str) -> Any:
-    """Return a function of the package, which is imported when it is called."""
-    return lambda *args: resolve_name(f"{__name__}.{name}")(*args)
+def _read_packed(path: Path, sections: int | None) -> SetData:
+    from .codec.egs import read_set
+
+    return read_set(path, sections)
 
 
-# Folders that know nothing of the codec, the viewer and Dask use them through these names.
-READERS[b"\x89EGS"] = Reader(_later("codec.egs:read_set"), _later("codec.egs:maps_of"))
-HTML[:] = [_later("viewer.notebook:to_html")]
-EXECUTORS["distributed"] = _later("cluster.executor:ClusterExecutor")
+def _packed_maps(path: Path) -> tuple[TextureMap, ...]:
+    from .codec.egs import maps_of
+
+    return maps_of(path)
+
+
+notebook.make_html = _make_html
+packed.read_set, packed.read_maps = _read_packed, _packed_maps
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,7 +1,5 @@
 """Mitsuba plugins. `register_plugins` registers them with the current variant and later ones."""
 
-import eigengs_dr  # noqa: F401  finds a working libLLVM before Mitsuba imports Dr.Jit
-
 try:
     import mitsuba  # noqa: F401
 except ImportError as error:

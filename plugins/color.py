@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from eigengs_dr.backend.arrays import Float, upload
+from eigengs_dr.backend.arrays import upload
+from eigengs_dr.backend.types import Float
 from eigengs_dr.image.color import (
     LOG_SLOPE,
     UNBOUNDED,
@@ -47,7 +47,7 @@ PENALTY = 1e3
 """Weight of the equality constraints; the differences of neighbouring samples are at most 1."""
 
 
-@cache
+@cache  # a quadratic program, for every texture of a spectral variant
 def basis() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute the smoothest basis spectra that reproduce the three primaries.
 
@@ -97,7 +97,7 @@ def _hat_colors() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """
     # The scalar variant is the fastest for single values and needs no device. It works whatever
     # the current variant is.
-    scalar: Any = mi.scalar_rgb
+    scalar = mi.scalar_rgb
     half = np.arange(scalar.MI_CIE_MIN, scalar.MI_CIE_MAX + 1e-3, STEP / 2)
     light = np.array([np.array(scalar.cie1931_xyz(x)) * scalar.cie_d65(x) for x in half]).T
     to_srgb = np.array([np.array(scalar.xyz_to_srgb(scalar.Color3f(*row))) for row in np.eye(3)]).T
@@ -109,7 +109,7 @@ def _hat_colors() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return half[::2], colors
 
 
-@cache
+@cache  # of constants
 def mean_weights() -> tuple[float, float, float]:
     """Return the means of R, G and B over the wavelengths, exactly: they are linear in pieces."""
     _, spectra = basis()
@@ -132,7 +132,7 @@ def upload_table() -> Float:
     return upload(mi.Float, intervals.T.astype(np.float32).ravel())
 
 
-def upsample(rgb: Any, wavelengths: Any, table: Float) -> Any:
+def upsample(rgb: mi.Color3f, wavelengths: mi.Spectrum, table: Float) -> mi.Spectrum:
     """Return the reflectance spectrum of a colour, s = b + (r - b) R + (g - b) G.
 
     This form keeps greys exactly grey in floating point. The function evaluates nothing, so

@@ -6,12 +6,12 @@ Mitsuba 3.10 finds the footprints of what the camera sees directly; else the ang
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import rcp
+from eigengs_dr.backend.types import Bool
 
 from .versions import Interaction, footprint_of, has_footprints
 
@@ -20,7 +20,7 @@ PIXEL = 0.4
 blur by 0.29 (a box); at 0.4, one sample of a receding plane came closest to the mean of 1,024."""
 
 
-def pixel_angle(sensor: Any) -> float:
+def pixel_angle(sensor: mi.Sensor) -> float:
     """Return the angle of a pixel in the centre of a perspective image, for ``prefilter``.
 
     The angle is ``2 tan(x_fov / 2) / width``. Rays start at the near clip plane, so keep
@@ -57,7 +57,7 @@ def footprint_inputs() -> tuple[str, ...]:
     return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *own)
 
 
-def seen_metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Any]:
+def seen_metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Bool]:
     """Return the metric of the renderer's footprint, or where there is none, of the cone's.
 
     Parameters
@@ -80,7 +80,7 @@ def seen_metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, An
     return [dr.select(present, e, o) for e, o in zip(entries, others, strict=True)], present | valid
 
 
-def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Any]:
+def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Bool]:
     """Return the metric in which the footprint of a renderer is the unit circle.
 
     With the footprint M, whose columns span a pixel in uv, and the inverse B of ``to_uv``, the
@@ -110,7 +110,7 @@ def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Any]:
     return [n00 * n00 + n10 * n10, n00 * n01 + n10 * n11, n01 * n01 + n11 * n11], present
 
 
-def metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Any]:
+def metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Bool]:
     """Return the metric of the texture plane in which the footprint of a pixel is the unit circle.
 
     At the distance t along the ray direction d, the cone of a pixel has the radius

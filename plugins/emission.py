@@ -15,13 +15,13 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.backend.arrays import Bool, Float
+from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.gaussian.covariance import max_deviation
 from eigengs_dr.raster.evaluate import widen
 from eigengs_dr.raster.lookup.points import (
@@ -151,10 +151,10 @@ class Emission:
         Densities at the centres of the cells, between which they are interpolated linearly.
     """
 
-    cells: Any
-    densities: Any
+    cells: mi.DiscreteDistribution2D
+    densities: mi.Texture2f
 
-    def sample(self, sample: Any, active: Bool) -> tuple[Any, Float]:
+    def sample(self, sample: mi.Point2f, active: Mask) -> tuple[mi.Point2f, Float]:
         """Return positions (Point2f) and their densities for samples of the unit square."""
         cell, _, rest = self.cells.sample(sample, active)
         rows, columns, _ = self.densities.shape
@@ -164,7 +164,7 @@ class Emission:
         p = dr.minimum(p, 2 - p)
         return p, self.density(p, active)
 
-    def density(self, p: Any, active: Bool) -> Float:
+    def density(self, p: mi.Point2f, active: Mask) -> Float:
         """Return the density at positions; 0 outside of the unit square."""
         inside = dr.all((p >= 0) & (p <= 1))
         return dr.select(inside, self.densities.eval(p, active)[0], 0)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 import numpy as np
 
+from eigengs_dr.backend.types import Record
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import rendered_as, to_linear
 from eigengs_dr.raster.render import render
 
 
 def bake_environment(
-    gaussians: Gaussians, width: int | None = None, height: int | None = None, **properties: Any
-) -> dict[str, Any]:
+    gaussians: Gaussians, width: int | None = None, height: int | None = None, **properties: object
+) -> Record:
     """Render a set to the bitmap of an ``envmap``, for `mitsuba.load_dict`.
 
     Parameters

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.backend.arrays import Bool
 from eigengs_dr.backend.recording import collector_off, guest
+from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, sum_at_points
 from eigengs_dr.raster.parameters import KernelParameters
@@ -105,7 +105,7 @@ def gaussian_texture() -> type:
             self.spectra = upload_table() if mi.is_spectral else None
             self.parameters_changed([])
 
-        def traverse(self, callback: Any) -> None:
+        def traverse(self, callback: mi.TraversalCallback) -> None:
             for name, tensor in self.source.tensors.items():
                 callback.put(name, tensor, mi.ParamFlags.Differentiable)
             callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
@@ -144,12 +144,15 @@ def gaussian_texture() -> type:
 
         # --- Lookups -----------------------------------------------------------------------------
 
+        # Mitsuba calls lookups while it records a program: if the collector freed another scene
+        # then, the program would lose that scene's textures, and read freed memory.
+
         @collector_off()
-        def eval(self, si: Interaction, active: Bool = True) -> Any:
+        def eval(self, si: Interaction, active: Mask = True) -> mi.Spectrum:
             color = self._color(si, active)
             if len(color) == 1 or mi.is_monochromatic:
                 return mi.UnpolarizedSpectrum(luminance(color))
-            if not mi.is_spectral:
+            if self.spectra is None:
                 return mi.Color3f(*color)
             if self.raw or rendered_as(self.space) is None:
                 raise ValueError(
@@ -159,11 +162,11 @@ def gaussian_texture() -> type:
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
 
         @collector_off()
-        def eval_1(self, si: Interaction, active: Bool = True) -> Any:
+        def eval_1(self, si: Interaction, active: Mask = True) -> Float:
             return luminance(self._color(si, active))
 
         @collector_off()
-        def eval_3(self, si: Interaction, active: Bool = True) -> Any:
+        def eval_3(self, si: Interaction, active: Mask = True) -> mi.Color3f:
             if self.channels != 3:
                 raise ValueError(
                     f"{_name(self)}: a lookup of three channels, such as a normal map, needs a set "
@@ -172,7 +175,7 @@ def gaussian_texture() -> type:
             return mi.Color3f(*self._color(si, active))
 
         @collector_off()
-        def eval_1_grad(self, si: Interaction, active: Bool = True) -> Any:
+        def eval_1_grad(self, si: Interaction, active: Mask = True) -> mi.Vector2f:
             (x, sx), (y, sy), inside = self.point(si.uv)
             packed = replace(self.table.packed, arranged=None)  # the copies have no gradients
             cells, terms = self.table.lists.cells, gradient_terms(packed.radius)
@@ -186,7 +189,7 @@ def gaussian_texture() -> type:
             m = self.transform.matrix
             return mi.Vector2f(m[0, 0] * du + m[1, 0] * dv, m[0, 1] * du + m[1, 1] * dv)
 
-        def _color(self, si: Interaction, active: Bool) -> list:
+        def _color(self, si: Interaction, active: Mask) -> list:
             """Look up the channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
             where = (self.wrap, self.angle, *np.array(self.to_uv.matrix).flat)
             sums = reused(self.table, where, si, self.inputs, lambda: self._look_up(si))[self.part]
@@ -213,7 +216,7 @@ def gaussian_texture() -> type:
                 sx = sy = type(x)(1)
             return sum_over_footprint(self.table, (x, sx), (y, sy), inside, seen)
 
-        def point(self, uv: Any) -> tuple:
+        def point(self, uv: mi.Point2f) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes; whether uv is finite."""
             u, v = self.transform @ uv
             x = fold(u * self.width, self.width, self.wrap)
@@ -223,15 +226,17 @@ def gaussian_texture() -> type:
         # --- Sampling ----------------------------------------------------------------------------
 
         @collector_off()
-        def sample_position(self, sample: Any, active: Bool = True) -> tuple:
+        def sample_position(self, sample: mi.Point2f, active: Mask = True) -> tuple:
             return self._emission().sample(sample, active)
 
         @collector_off()
-        def pdf_position(self, p: Any, active: Bool = True) -> Any:
+        def pdf_position(self, p: mi.Point2f, active: Mask = True) -> Float:
             return self._emission().density(p, active)
 
         @collector_off()
-        def sample_spectrum(self, si: Interaction, sample: Any, active: Bool = True) -> tuple:
+        def sample_spectrum(
+            self, si: Interaction, sample: mi.Spectrum, active: Mask = True
+        ) -> tuple:
             if not mi.is_spectral:
                 return mi.Color0f(), self.eval(si, active)
             width = mi.MI_CIE_MAX - mi.MI_CIE_MIN
@@ -239,7 +244,7 @@ def gaussian_texture() -> type:
             si.wavelengths = mi.MI_CIE_MIN + width * sample
             return si.wavelengths, self.eval(si, active) * width
 
-        def pdf_spectrum(self, si: Interaction, active: Bool = True) -> Any:
+        def pdf_spectrum(self, si: Interaction, active: Mask = True) -> mi.Spectrum:
             if not mi.is_spectral:
                 return mi.Color0f()
             inside = (si.wavelengths >= mi.MI_CIE_MIN) & (si.wavelengths <= mi.MI_CIE_MAX)
@@ -248,7 +253,7 @@ def gaussian_texture() -> type:
         def spectral_resolution(self) -> float:
             return STEP
 
-        def mean(self) -> Any:
+        def mean(self) -> Float:
             return self._surveyed().mean
 
         def max(self) -> float:
@@ -268,7 +273,7 @@ def gaussian_texture() -> type:
 
         # --- Description -------------------------------------------------------------------------
 
-        def resolution(self) -> Any:
+        def resolution(self) -> mi.ScalarVector2i:
             return mi.ScalarVector2i(self.width, self.height)
 
         def filtered(self) -> bool:
@@ -360,12 +365,12 @@ def register_plugins() -> None:
         _register(mi.variant())
 
 
-@cache
+@cache  # a second callback would register everything twice
 def _follow() -> None:
     mi.detail.add_variant_callback(lambda old, new: _register(new))
 
 
-@cache
+@cache  # once for each variant
 def _register(variant: str) -> None:
     scalar = variant.startswith("scalar")
     register_texture("gaussian_texture", _refuse if scalar else gaussian_texture())

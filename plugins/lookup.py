@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend.arrays import Bool, Float
 from eigengs_dr.backend.detail import indices_of, scope
+from eigengs_dr.backend.types import Bool, Float
 from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.lookup.footprint import arrange, bound_covariance
 from eigengs_dr.raster.lookup.points import (
@@ -124,7 +124,7 @@ def make_table(
     def compute(inputs: Arrays) -> Arrays:
         parameters = decode(inputs)
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
-        found = {
+        found: Arrays = {
             "packed": pack_parameters([*shape, *color]),
             "background": [keep_finite(b) for b in parameters.background],
         }

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eigengs_dr.backend.arrays import types_of, upload
+from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.channels import slices
 from eigengs_dr.gaussian.gaussians import (
@@ -28,10 +29,10 @@ from eigengs_dr.gaussian.gaussians import (
 from eigengs_dr.raster.parameters import KernelParameters
 from eigengs_dr.raster.render import decode_parameters
 
-Arrays = dict[str, Any]
+Arrays = Record
 
 
-def texture_of(gaussians: Gaussians | Fitted, **properties: Any) -> dict[str, Any]:
+def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     """Return a set as the dictionary of a ``gaussian_texture``, for `mitsuba.load_dict`.
 
     Parameters
@@ -68,7 +69,7 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: Any) -> dict[str, An
     }
 
 
-def gaussians_of(parameters: Mapping[str, Any], texture: str, like: Gaussians) -> Gaussians:
+def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians) -> Gaussians:
     """Read a set back from the parameters of a texture, differentiably.
 
     Parameters
@@ -93,7 +94,7 @@ def gaussians_of(parameters: Mapping[str, Any], texture: str, like: Gaussians) -
     return from_tensors(_found(parameters, texture), like)
 
 
-def keep_in_bounds(parameters: Any, texture: str, like: Gaussians) -> None:
+def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians) -> None:
     """Project the parameters of a texture into their bounds, after a step of an optimiser.
 
     The function applies `eigengs_dr.Gaussians.bounded`: means stay in the image, standard
@@ -110,7 +111,7 @@ def keep_in_bounds(parameters: Any, texture: str, like: Gaussians) -> None:
         parameters[f"{texture}.{name}"] = bounded[name]
 
 
-def _found(parameters: Mapping[str, Any], texture: str) -> Arrays:
+def _found(parameters: Mapping[str, object], texture: str) -> Arrays:
     keys = {name: f"{texture}.{name}" for name in FIELDS}
     return {name: parameters[key] for name, key in keys.items() if key in parameters}
 
@@ -145,7 +146,7 @@ class SharedFile:
         self.tables: dict[tuple, Any] = {}
         self.shared = to_tensors(self.gaussians)
 
-    def source(self, name: str | None) -> Source:
+    def source(self, name: str | None) -> TextureParameters:
         """Return a map, or the whole file, as the source of a texture.
 
         Raises
@@ -165,10 +166,12 @@ class SharedFile:
                 f"gaussian_texture: {self.path} {missing} map = one of {', '.join(names)}"
             )
         if name is None:
-            return Source(self.gaussians, self.shared, file=self)
+            return TextureParameters(self.gaussians, self.shared, file=self)
         gaussians = self.gaussians[name]
         tensors = to_tensors(gaussians) | {key: self.shared[key] for key in SHAPES}
-        return Source(gaussians, tensors, file=self, part=slices(maps)[names.index(name)])
+        return TextureParameters(
+            gaussians, tensors, file=self, part=slices(maps)[names.index(name)]
+        )
 
     def parameters(self) -> KernelParameters:
         """Return the parameters of all channels, decoded map by map."""
@@ -204,7 +207,7 @@ SHAPES = ("mean", "factor")
 
 
 @dataclass(eq=False)
-class Source:
+class TextureParameters:
     """The parameters of a texture, and the Gaussians that they stand for.
 
     They are mean (N, 2), factor (N, 3), color (N, C) and background (C,) of a set, in native pixels
@@ -227,7 +230,7 @@ class Source:
 
     start: Gaussians
     read: Arrays
-    weights: Sequence[Any] = ()
+    weights: Sequence[Tensor] = ()
     file: SharedFile | None = None
     part: slice = field(default_factory=lambda: slice(None))
 
@@ -255,7 +258,7 @@ class Source:
         except ValueError as error:
             raise ValueError(f"gaussian_texture: {error}") from error
 
-    def _reconstruct(self, coefficients: Any) -> Gaussians:
+    def _reconstruct(self, coefficients: Tensor) -> Gaussians:
         """Return the set of some coefficients of a model."""
         start, found = self.start, tuple(coefficients.shape)
         expected = (len(self.weights), self.weights[0].shape[1])
@@ -274,7 +277,7 @@ class Source:
         return replace(start, color=types.FloatX(colors), background=types.FloatX(background))
 
 
-def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> Source:
+def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> TextureParameters:
     """Return the coefficients of a model, by default 0, as the source of a texture.
 
     A channel with fewer components than others ignores the rest of its row.
@@ -286,7 +289,7 @@ def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> So
     if coefficients is None:
         coefficients = np.zeros((channels, most), np.float32)
     tensors = {"coefficients": upload(mi.TensorXf, coefficients)}
-    return Source(model.gaussians, tensors, [upload(mi.TensorXf, w) for w in weights])
+    return TextureParameters(model.gaussians, tensors, [upload(mi.TensorXf, w) for w in weights])
 
 
 # ---------------------------------------------------------------------------------------------

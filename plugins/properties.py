@@ -14,7 +14,7 @@ from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.color import SPACES
 
-from .parameters import Source, model_source, shared_file
+from .parameters import TextureParameters, model_source, shared_file
 from .versions import Properties, has_footprints
 
 WRAPS = ("repeat", "mirror", "clamp")
@@ -34,7 +34,7 @@ def _read(props: Properties, key: str, default: object, kind: type, must: str) -
     return kind(value)
 
 
-def source_of(props: Properties) -> Source:
+def source_of(props: Properties) -> TextureParameters:
     """Read the Gaussians from the properties ``filename``, ``model`` or ``mean``, ...
 
     Raises
@@ -65,7 +65,7 @@ def source_of(props: Properties) -> Source:
         source = shared_file(_path(props, "filename"), backend, first or None).source(name or None)
     else:
         gaussians = _from_arrays(props, backend)
-        source = Source(gaussians, to_tensors(gaussians))
+        source = TextureParameters(gaussians, to_tensors(gaussians))
     if source.start.channels not in (1, 3):
         raise ValueError(
             f"gaussian_texture: the set has {source.start.channels} channels; use a set of 1 or 3"
@@ -144,7 +144,7 @@ def wrap_mode(props: Properties) -> str:
     return wrap
 
 
-def to_uv(props: Properties) -> Any:
+def to_uv(props: Properties) -> mi.ScalarTransform3f:
     """Read ``to_uv``, by default the identity.
 
     Parameters
@@ -176,7 +176,7 @@ def to_uv(props: Properties) -> Any:
     return mi.ScalarTransform3f([*rows, [0, 0, 1]])
 
 
-def check_invertible(transform: Any) -> None:
+def check_invertible(transform: mi.ScalarTransform3f) -> None:
     """Raise `ValueError` if a transform of uv is not finite, or maps the plane to a line."""
     matrix = np.array(transform.matrix, np.float64)
     linear = matrix[:2, :2]

@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend.arrays import Bool, Float
+from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.image.color import rendered_as
 
 Texture = Any
@@ -35,7 +35,7 @@ def texture_class() -> type:
     return found
 
 
-def texture_kind() -> Any:
+def texture_kind() -> object:
     """Return the member of `mitsuba.ObjectType` that stands for textures."""
     return _renamed(mi.ObjectType, "Texture", "Field")
 
@@ -64,13 +64,13 @@ def _as_field(texture: Any) -> type:
     kinds = mi.FieldValueType
 
     class SurfaceField(texture):
-        def out_type(self) -> Any:
+        def out_type(self) -> object:
             if self.channels == 1:
                 return kinds.Float
             light = rendered_as(self.space) and not self.raw
             return kinds.Spectrum if mi.is_spectral and light else kinds.Color3
 
-        def domain(self) -> Any:
+        def domain(self) -> object:
             return mi.FieldDomain.Surface
 
         def supports_jit(self) -> bool:
@@ -79,13 +79,13 @@ def _as_field(texture: Any) -> type:
         def supports_surface_queries(self) -> bool:
             return True
 
-        def eval_1(self, si: Interaction, *rest: Any, active: Bool = True) -> Any:
+        def eval_1(self, si: Interaction, *rest: Mask, active: Mask = True) -> object:
             return super().eval_1(si, rest[-1] if rest else active)
 
-        def eval_color3(self, si: Interaction, *rest: Any, active: Bool = True) -> Any:
+        def eval_color3(self, si: Interaction, *rest: Mask, active: Mask = True) -> object:
             return super().eval_3(si, rest[-1] if rest else active)
 
-        def eval_spec(self, si: Interaction, *rest: Any, active: Bool = True) -> Any:
+        def eval_spec(self, si: Interaction, *rest: Mask, active: Mask = True) -> object:
             return super().eval(si, rest[-1] if rest else active)
 
     return SurfaceField

@@ -8,7 +8,7 @@ from contextlib import redirect_stderr
 import pytest
 
 import eigengs_dr as eg
-from eigengs_dr.backend import feedback
+from eigengs_dr.backend import progress as bars
 from eigengs_dr.cli import console
 
 QUICK = {"gaussians": 30, "iterations": 10}
@@ -27,10 +27,10 @@ def photo():
 @pytest.fixture
 def at_once(monkeypatch):
     """Bars appear at once."""
-    monkeypatch.setattr(feedback, "DELAY", 0.0)
+    monkeypatch.setattr(bars, "DELAY", 0.0)
 
 
-@feedback.shows_progress
+@bars.shows_progress
 def slow(steps, progress=None):
     for step in range(steps):
         time.sleep(0.05)

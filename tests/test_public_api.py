@@ -16,7 +16,7 @@ from eigengs_dr.backend.libllvm import candidates
 
 MODULES = [
     module.name
-    for module in pkgutil.walk_packages(eigengs_dr.__path__, "eigengs_dr.")
+    for module in pkgutil.walk_packages(eigengs_dr.__path__[:1], "eigengs_dr.")
     if not module.name.endswith("__main__")  # which runs the command line
 ]
 

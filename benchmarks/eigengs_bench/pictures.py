@@ -40,7 +40,7 @@ NEEDS = {"radii": [CATS], "split": [CATS], "cross": [CATS, NATURAL]}
 CREDIT = "Images: AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
 EVERY = 50  # iterations between two points of a curve
 MAGNIFIED, STRETCHED = 8, 20  # factors of errors before they are added to mid-grey
-MARGIN = 0.08  # around the middle of a picture, in its sides: Gaussians there reach into it
+BORDER = 0.08  # around the middle of a picture, in its sides: Gaussians there reach into it
 CELL, LETTERS = 1.8, 0.42  # sides of a picture, and height of the lines around it, in inches
 
 Cell = tuple[str, NDArray[Any]]  # the line below a picture, and the picture: RGB, not clamped
@@ -312,7 +312,7 @@ def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.
     """Outlines over the middle quarter of a picture, which has room for all of them."""
     height, width = picture.shape[:2]
     away = np.abs(gaussians.to_arrays()["mean"] / (width, height) - 0.5)
-    near = gaussians[(away < 0.25 + MARGIN).all(axis=1)]
+    near = gaussians[(away < 0.25 + BORDER).all(axis=1)]
     large = picture.repeat(4, axis=0).repeat(4, axis=1)
     return overlay(near, large)[height : 3 * height, width : 3 * width]
 

@@ -8,13 +8,15 @@ from inspect import signature
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+from .types import Record
 
-KINDS: dict[Any, type] = {"int": int, "int | None": int, "float": float, "float | None": float}
+Function = TypeVar("Function", bound=Callable[..., object])
+
+KINDS: dict[str, type] = {"int": int, "int | None": int, "float": float, "float | None": float}
 """The type of number that an annotation stands for."""
 
 
-def plain_numbers(values: Mapping[str, Any], annotations: Mapping[str, Any]) -> dict[str, Any]:
+def plain_numbers(values: Mapping[str, object], annotations: Mapping[str, str]) -> Record:
     """Return the numbers among named values as numbers of Python.
 
     Numbers of NumPy would promote Dr.Jit arrays to double precision, and JSON has none of them.
@@ -37,7 +39,7 @@ def plain_numbers(values: Mapping[str, Any], annotations: Mapping[str, Any]) -> 
     }
 
 
-def _plain(name: str, value: Any, kind: type) -> Any:
+def _plain(name: str, value: object, kind: type) -> Any:
     # NumPy registers its numbers with these classes, and its truth values with none.
     if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
         must = "a whole number" if kind is int else "a number"
@@ -49,9 +51,11 @@ def takes_numbers(function: Function) -> Function:
     """Decorate a function whose numbers may be those of NumPy, see `plain_numbers`."""
     arguments = signature(function)
     annotations = {name: p.annotation for name, p in arguments.parameters.items()}
+    if not any(annotation in KINDS for annotation in annotations.values()):
+        return function
 
     @wraps(function)
-    def call(*values: Any, **options: Any) -> Any:
+    def call(*values: object, **options: object) -> object:
         bound = arguments.bind(*values, **options)
         bound.arguments.update(plain_numbers(bound.arguments, annotations))
         return function(*bound.args, **bound.kwargs)

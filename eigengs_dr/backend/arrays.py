@@ -13,36 +13,36 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
+from . import types as kinds
 from .selection import BACKENDS
+from .types import DrJitArray, Rows, Values
 
+# For `eigengs_dr.fitting` alone, until it takes those of `types`: no checker refutes these.
 Float = Any
-"""Floats of Dr.Jit, of the backend and precision of the caller: no static type can name them."""
-
 UInt = Any
-"""Integers of 32 bits of Dr.Jit."""
-
 Bool = Any
-"""A mask of Dr.Jit."""
+
+Kind = TypeVar("Kind", bound=DrJitArray)
+Number = TypeVar("Number", kinds.Float, Rows)
 
 
 class ArrayTypes(NamedTuple):
     """The array types of one backend and one float precision."""
 
-    Int: type
-    UInt: type
-    Bool: type
+    Int: type[kinds.UInt]
+    UInt: type[kinds.UInt]
+    Bool: type[kinds.Bool]
     UInt2: type
-    Float: type
-    Float2: type
-    Float3: type
-    FloatX: type
-    Tensor: type
+    Float: type[kinds.Float]
+    Float2: type[kinds.Rows]
+    Float3: type[kinds.Rows]
+    FloatX: type[kinds.Rows]
+    Tensor: type[kinds.Tensor]
     backend: str
     bits: int
 
@@ -51,7 +51,7 @@ MODULES = tuple(f"drjit.{backend}.ad" for backend in BACKENDS)
 """Modules of Dr.Jit whose arrays have derivatives."""
 
 
-def types_of(array: Float) -> ArrayTypes:
+def types_of(array: DrJitArray) -> ArrayTypes:
     """Return the array types with the backend and the precision of a Dr.Jit array.
 
     Parameters
@@ -83,7 +83,7 @@ def types_in(module: ModuleType, bits: int = 32) -> ArrayTypes:
     return _types(module.__name__, bits)
 
 
-@cache
+@cache  # nearly every function asks
 def _types(module: str, bits: int) -> ArrayTypes:
     suffix = "64" if bits == 64 else ""
     names = ["Int32", "UInt32", "Bool", "Array2u"]
@@ -118,11 +118,7 @@ def release_memory(values: int) -> None:
             trim(0)
 
 
-Values = NDArray[np.generic]
-"""A NumPy array of any dtype that converts to that of its target."""
-
-
-def upload(kind: type, values: Values) -> Float:
+def upload(kind: type[Kind], values: Values) -> Kind:
     """Copy a NumPy array into memory that Dr.Jit owns.
 
     ``kind(values)`` may share NumPy's memory, which may be unaligned. Dr.Jit then replaces packet
@@ -145,7 +141,7 @@ def upload(kind: type, values: Values) -> Float:
     return upload_rows(kind, [values])[0]
 
 
-def upload_rows(kind: type, rows: Iterable[Values]) -> list[Float]:
+def upload_rows(kind: type[Kind], rows: Iterable[Values]) -> list[Kind]:
     """Copy flat NumPy arrays as `upload` does, but wait only once for all copies."""
     targets = []
     for values in rows:
@@ -160,7 +156,7 @@ def upload_rows(kind: type, rows: Iterable[Values]) -> list[Float]:
     return targets
 
 
-def settle(rows: list[Float]) -> list[Float]:
+def settle(rows: list[kinds.Float]) -> list[kinds.Float]:
     """Return rows after their pending scatters, if there are any.
 
     Dr.Jit 1.5 ends the process ("dirty variable") where it scatters several such rows at once, as
@@ -184,7 +180,7 @@ TANH_SMALL = 0.625
 """Below, ``1 - exp(-2 |v|)`` would lose digits."""
 
 
-def rcp(x: Float) -> Float:
+def rcp(x: Number) -> Number:
     """Return ``1 / x``, in double precision to the last bits on every backend.
 
     Parameters
@@ -203,7 +199,7 @@ def rcp(x: Float) -> Float:
     return _with_slope(value, -dr.square(value), x)
 
 
-def rsqrt(x: Float) -> Float:
+def rsqrt(x: Number) -> Number:
     """Return ``1 / sqrt(x)``, in double precision to the last bits on every backend.
 
     Parameters
@@ -222,7 +218,7 @@ def rsqrt(x: Float) -> Float:
     return _with_slope(value, -0.5 * value * dr.square(value), x)
 
 
-def tanh(v: Float) -> Float:
+def tanh(v: kinds.Float) -> kinds.Float:
     """Return the hyperbolic tangent, differentiable, with a relative error of a few last bits.
 
     Parameters
@@ -265,11 +261,11 @@ class Divisor:
         The number s.
     """
 
-    divisor: UInt
-    multiplier: UInt
-    shift: UInt
+    divisor: kinds.UInt
+    multiplier: kinds.UInt
+    shift: kinds.UInt
 
-    def divmod(self, n: UInt) -> tuple[UInt, UInt]:
+    def divmod(self, n: kinds.UInt) -> tuple[kinds.UInt, kinds.UInt]:
         """Return the quotient and the remainder of UInt32 below 2^31."""
         quotient = dr.mul_hi(n + n, self.multiplier) >> self.shift
         return quotient, n - quotient * self.divisor
@@ -282,12 +278,12 @@ def make_divisor(types: ArrayTypes, value: int) -> Divisor:
     return Divisor(*(dr.opaque(types.UInt, v) for v in (value, multiplier, shift)))
 
 
-def _with_slope(value: Float, slope: Float, x: Float) -> Float:
+def _with_slope(value: Number, slope: Number, x: Number) -> Number:
     """Return a value whose derivative by x is `slope`; Dr.Jit's own takes `drjit.rcp`."""
     return dr.replace_grad(value, slope * x) if dr.grad_enabled(x) else value
 
 
-def _polynomial(x: Float, coefficients: tuple[float, ...]) -> Float:
+def _polynomial(x: kinds.Float, coefficients: tuple[float, ...]) -> kinds.Float:
     """Evaluate a polynomial by Horner's rule, from the highest power."""
     result = type(x)(coefficients[0])
     for coefficient in coefficients[1:]:
@@ -295,5 +291,5 @@ def _polynomial(x: Float, coefficients: tuple[float, ...]) -> Float:
     return result
 
 
-def _is_double(x: Float) -> bool:
+def _is_double(x: DrJitArray) -> bool:
     return bool(dr.type_v(x) == dr.VarType.Float64)

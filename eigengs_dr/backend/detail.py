@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
-from .arrays import UInt
+from .types import UInt
 
 
 def llvm_version() -> tuple[int, ...]:
@@ -17,12 +15,12 @@ def llvm_version() -> tuple[int, ...]:
     return tuple(dr.detail.llvm_version())
 
 
-def cuda_device() -> tuple[Any, Any]:
+def cuda_device() -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the version of CUDA that the driver knows, and the capability of the first GPU."""
     return dr.detail.cuda_version(), dr.detail.cuda_compute_capability()
 
 
-def scope(backend: Any) -> int:
+def scope(backend: dr.JitBackend) -> int:
     """Return the number of the current scope of a `drjit.JitBackend`, in this thread.
 
     Dr.Jit puts operations of an earlier scope before those of a later one in a program, and merges
@@ -31,12 +29,12 @@ def scope(backend: Any) -> int:
     return int(dr.detail.scope(backend))
 
 
-def new_scope(backend: Any) -> None:
+def new_scope(backend: dr.JitBackend) -> None:
     """Begin another scope."""
     dr.detail.new_scope(backend)
 
 
-def indices_of(arrays: Any) -> tuple[int, ...]:
+def indices_of(arrays: object) -> tuple[int, ...]:
     """Return the numbers that Dr.Jit gives to the variables in nested arrays while they live."""
     return tuple(dr.detail.collect_indices(arrays))
 

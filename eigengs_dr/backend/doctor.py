@@ -10,10 +10,10 @@ import platform
 import subprocess
 import sys
 from importlib.metadata import requires
-from typing import Any
 
 from . import libllvm
 from .selection import BACKENDS, UNTESTED_ON_GPU, UNTESTED_ON_METAL, version_of
+from .types import Record
 
 TRIAL = """
 import json, sys
@@ -35,7 +35,7 @@ VARIANTS = "import json, mitsuba; print(json.dumps(mitsuba.variants()))"
 """Python program that prints the variants of Mitsuba as JSON."""
 
 
-def report() -> dict[str, Any]:
+def report() -> Record:
     """Try every backend and collect the versions of this machine.
 
     This takes one or two seconds and starts Dr.Jit in other processes only.
@@ -67,7 +67,7 @@ def report() -> dict[str, Any]:
     }
 
 
-def describe(found: dict[str, Any]) -> str:
+def describe(found: Record) -> str:
     """Format a report as text.
 
     Parameters
@@ -114,7 +114,7 @@ def _mitsuba_line(version: str | None, variants: list[str] | None) -> str:
     return f"{version}: cannot be imported{pin}: pip install 'mitsuba>=3.9,<4'"
 
 
-def _try(name: str) -> dict[str, Any]:
+def _try(name: str) -> Record:
     """Run `TRIAL` with a backend, in another process."""
     process = _python(TRIAL, name)
     if process.returncode == 0:
@@ -123,7 +123,7 @@ def _try(name: str) -> dict[str, Any]:
     return {"works": False, "problem": f"the process ended with {how}; {libllvm.INSTALL_ADVICE}"}
 
 
-def _mitsuba() -> dict[str, Any]:
+def _mitsuba() -> Record:
     """Return the version and the variants of Mitsuba."""
     if importlib.util.find_spec("mitsuba") is None:
         return {"version": None, "variants": None}

@@ -2,8 +2,8 @@
 
 A `KeyboardInterrupt` may be raised in any line: in an import it becomes an error that blames the
 installation, in Dr.Jit an abort. So the program raises none. It deletes its temporary files and
-ends, but in blocks that end their work by themselves, see `eigengs_dr.backend.feedback`. What uses
-the package as a library has the signals as they were.
+ends, but in blocks that end their work by themselves, see `eigengs_dr.backend.interrupts`. What
+uses the package as a library has the signals as they were.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import sys
 TYPE_CHECKING = False  # `typing` and `contextlib` take longer than all else before the first line
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from typing import Any
 
 NAME = "eigengs-dr"
 """Name of the program; every line on standard error starts with it."""
@@ -52,7 +51,7 @@ def end_at_signals() -> None:
             signal.signal(number, end_program)
 
 
-def end_program(number: int, frame: Any) -> None:
+def end_program(number: int, frame: object) -> None:
     """End the process as the handler of a signal; what is under way is deleted first."""
     _ignore_signals()
     for undo in reversed([*_undo.values()]):

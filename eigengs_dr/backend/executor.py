@@ -1,16 +1,18 @@
 """Where tasks run: in this process, or on the workers of a cluster.
 
-Functions that take ``client`` ask `executor_for` for an `Executor`. This module knows no cluster:
-who does puts its executor into `EXECUTORS`.
+Functions that take ``client`` ask `eigengs_dr.cluster.client.executor_for` for an `Executor`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
-Function = Callable[[Any, Any], Any]
+Task = TypeVar("Task")
+Value = TypeVar("Value")
+
+Function = Callable[[Task, Any], Value]
 """``function(task, shared)``, a function of a module."""
 
 
@@ -23,8 +25,8 @@ class Done(NamedTuple):
 
     Attributes
     ----------
-    task : Any
-    value : Any
+    task : object
+    value : object
         What the function returned.
     lost : str
         One line, if the task ended its worker so often that it is given up; the value is then
@@ -49,7 +51,7 @@ class Executor(Protocol):
     workers: int
 
     def map(
-        self, function: Function, tasks: Iterable[Any], shared: Any = None
+        self, function: Function[Task, Value], tasks: Iterable[Task], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task, and yield the results.
 
@@ -60,7 +62,7 @@ class Executor(Protocol):
         tasks : iterable
             Tasks of NumPy arrays, paths, numbers, bytes, and records of these. They are drawn when
             workers become free, a few ahead.
-        shared : Any
+        shared : object
             What all tasks use; it travels once.
 
         Yields
@@ -77,27 +79,29 @@ class Executor(Protocol):
         """
 
 
-EXECUTORS: dict[str, Callable[[Any], Executor]] = {}
-"""What makes an `Executor` of a client, by the package that defines the class of the client;
-`eigengs_dr` puts that of Dask here."""
-
-
 class LocalExecutor:
     """The `Executor` of this process: one task after the other, without copies."""
 
     workers = 1
 
     def map(
-        self, function: Function, tasks: Iterable[Any], shared: Any = None
+        self, function: Function[Task, Value], tasks: Iterable[Task], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`."""
+        from .recording import exclusive  # loads Dr.Jit, which the help of commands does not need
+
         for task in tasks:
-            yield Done(task, function(task, shared))
+            with exclusive():  # a task may use Dr.Jit, beside other threads of the caller
+                value = function(task, shared)
+            yield Done(task, value)
 
 
 def completed(
-    executor: Executor, function: Function, tasks: Iterable[Any], shared: Any = None
-) -> Generator[tuple[Any, Any], None, None]:
+    executor: Executor,
+    function: Function[Task, Value],
+    tasks: Iterable[Task],
+    shared: Any = None,
+) -> Generator[tuple[Task, Value], None, None]:
     """Run tasks none of which may fail.
 
     Parameters
@@ -108,7 +112,7 @@ def completed(
 
     Yields
     ------
-    task, value : Any
+    task, value : object
         See `Done`.
 
     Raises
@@ -121,34 +125,3 @@ def completed(
             if lost:
                 raise ClusterError(f"a part of the work cannot be done: {lost}")
             yield task, value
-
-
-def executor_for(client: Any = None) -> Executor:
-    """Return the executor of a client.
-
-    Parameters
-    ----------
-    client : distributed.Client, Executor or None
-        None stands for this process.
-
-    Returns
-    -------
-    Executor
-
-    Raises
-    ------
-    TypeError
-        If no executor is known for the type of the client.
-    ClusterError
-        If the workers of the client cannot be used.
-    """
-    if client is None:
-        return LocalExecutor()
-    kind = type(client)
-    if make := EXECUTORS.get(kind.__module__.partition(".")[0]):
-        return make(client)
-    if isinstance(client, Executor):
-        return client
-    raise TypeError(
-        f"client is a {kind.__module__}.{kind.__name__}; pass a distributed.Client, or None"
-    )

@@ -13,7 +13,9 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from .types import Record
 
 ALLOWED = {"fit": 0.05, "gradients": 1e-3, "texture": 1e-3, "scene": 5e-3}
 """Largest difference of the figures of a trial, by its name: decibels for "fit", else a share of
@@ -93,7 +95,7 @@ def run_trial(name: str, backend: str) -> Trial:
     except subprocess.TimeoutExpired:
         return Trial(0.0, [], f"no end after {TRIAL_SECONDS:.0f} s")
     if process.returncode == 0:
-        answer: dict[str, Any] = json.loads(process.stdout.splitlines()[-1])
+        answer: Record = json.loads(process.stdout.splitlines()[-1])
         return Trial(answer["seconds"], answer["figures"])
     lines = process.stderr.splitlines()
     return Trial(0.0, [], f"exit code {process.returncode}: {lines[-1] if lines else ''}"[:200])

@@ -30,11 +30,12 @@ from typing import Any
 import drjit as dr
 
 from .detail import new_scope
+from .types import DrJitArray
 
 Program = Callable[..., Any]
 """A function of Dr.Jit arrays."""
 
-Shape = Any
+Shape = tuple | None
 """What is left of a value without its arrays: None for an array; the type and the value of a
 constant; the type, the names and the shapes of the parts of a list, a dictionary or a dataclass."""
 
@@ -172,8 +173,8 @@ def record(function: Program) -> Program:
     atexit.register(programs.clear)
 
     @wraps(function)
-    def call(*arguments: Any) -> Any:
-        arrays: list[Any] = []
+    def call(*arguments: object) -> object:
+        arrays: list[DrJitArray] = []
         _flatten(arguments, arrays)
         sizes = [dr.width(array) for array in arrays]  # they may be numbers in a program
         if max(sizes) > LARGEST_RECORDED or _is_guest():
@@ -187,7 +188,7 @@ def record(function: Program) -> Program:
     return call
 
 
-def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Any], Program]:
+def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Program], Program]:
     """Freeze a function by `drjit.freeze`, once for each shape of its arguments.
 
     Parameters
@@ -203,12 +204,12 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, An
     call : callable
         Takes the arguments of `function`; `exclusive`, with the collector off.
     """
-    programs: dict[Shape, Any] = {}
+    programs: dict[Shape, Program] = {}
     results: dict[Shape, Shape] = {}
 
-    def freeze(shape: Shape) -> Any:
-        def trace(flat: list[Any]) -> list[Any]:
-            arrays: list[Any] = []
+    def freeze(shape: Shape) -> Program:
+        def trace(flat: list[DrJitArray]) -> list[DrJitArray]:
+            arrays: list[DrJitArray] = []
             results[shape] = _flatten(function(*_build(shape, iter(flat))), arrays)
             return arrays
 
@@ -216,10 +217,10 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, An
         return dr.freeze(lambda flat: trace(flat), warn_after=MANY_RECORDINGS)
 
     @wraps(function)
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: object) -> object:
         global _calls
         with exclusive(), collector_off():
-            arrays: list[Any] = []
+            arrays: list[DrJitArray] = []
             shape = _flatten(arguments, arrays)
             program = programs.pop(shape, None) or freeze(shape)
             programs[shape] = program  # now the last one
@@ -239,7 +240,7 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, An
     return programs, call
 
 
-def _flatten(value: Any, arrays: list[Any]) -> Shape:
+def _flatten(value: Any, arrays: list[DrJitArray]) -> Shape:
     """Append the arrays of a value to a list, and return all else: its shape.
 
     Raises
@@ -254,7 +255,7 @@ def _flatten(value: Any, arrays: list[Any]) -> Shape:
     if value is None or kind in CONSTANTS:
         return kind, value
     if is_dataclass(kind):
-        names: Any = _field_names(kind)
+        names: tuple = _field_names(kind)
         parts = [getattr(value, name) for name in names]
     elif kind is dict:
         names, parts = tuple(value), list(value.values())
@@ -265,12 +266,12 @@ def _flatten(value: Any, arrays: list[Any]) -> Shape:
     return kind, names, tuple(_flatten(part, arrays) for part in parts)
 
 
-@cache
+@cache  # asked at every call of a frozen program
 def _field_names(kind: type) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind))
 
 
-def _build(shape: Shape, arrays: Iterator[Any]) -> Any:
+def _build(shape: Shape, arrays: Iterator[DrJitArray]) -> Any:
     """Return the value that `_flatten` took apart."""
     if shape is None:
         return next(arrays)

@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from . import gpu
-from .feedback import warn
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path, too_old
+from .messages import warn
+from .types import Record
 
 BACKENDS = ("llvm", "cuda", "metal")
 
@@ -105,13 +105,13 @@ def _has(dr: ModuleType, name: str) -> bool:
     return kind is not None and bool(dr.has_backend(kind))
 
 
-@cache
+@cache  # the second call is silent
 def _announce(backend: str, state: str) -> None:
     """Warn of the state of a backend, once in a process."""
     warn(f"backend {backend}: {state}; compare with backend 'llvm'")
 
 
-@cache
+@cache  # it asks a file, or compares fits, and warns once
 def _cuda_agrees() -> bool:
     """Whether cuda may be the default: a fit agrees with llvm; warn if it does not."""
     from .detail import cuda_device
@@ -126,7 +126,7 @@ def _cuda_agrees() -> bool:
     return right
 
 
-def describe(backend: str | None = None) -> dict[str, Any]:
+def describe(backend: str | None = None) -> Record:
     """Return the hardware and the versions that a measurement depends on.
 
     Parameters

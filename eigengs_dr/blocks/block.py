@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import Float, types_in
-from ..backend.recording import exclusive
 from ..backend.selection import select
 from ..fitting.control import Redistribute, Relocate
 from ..fitting.descent import State, begin, descend, last
@@ -136,7 +135,6 @@ class FitTask(NamedTuple):
     part: range
 
 
-@exclusive()
 def measure_extent(task: PlaceTask, settings: Settings) -> Extent:
     """Return the smallest and the largest value of a block, and their sum; refuse bad pixels."""
     pixels, space = task.window.read()[task.block.core], settings.space
@@ -148,7 +146,6 @@ def measure_extent(task: PlaceTask, settings: Settings) -> Extent:
     return Extent.of(values_in(pixels, space))
 
 
-@exclusive()
 def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     """Measure how many Gaussians a block needs, relative to others, before any fit."""
     objective = _objective(task, settings)
@@ -177,7 +174,6 @@ def _mass(canvas: Canvas, density: Float, block: Block) -> float:
     return float(pixels[block.core].sum(dtype=np.float64))
 
 
-@exclusive()
 def place(task: PlaceTask, settings: Settings) -> Arrays:
     """Place and shape the Gaussians of a block.
 
@@ -214,7 +210,6 @@ StepDone = Callable[[int], None]
 """``step_done(step)`` every 10 steps of a fit. It may raise an error to end the fit."""
 
 
-@exclusive()
 def find_density(task: FitTask, settings: Settings, step_done: StepDone | None = None) -> Arrays:
     """Fit the Gaussians of a window for some steps; return the density that their errors ask for.
 
@@ -240,7 +235,6 @@ def find_density(task: FitTask, settings: Settings, step_done: StepDone | None =
     }
 
 
-@exclusive()
 def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = None) -> Arrays:
     """Take some steps of the fit of a window, and return the Gaussians of its block.
 

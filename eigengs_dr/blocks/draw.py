@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..backend.doors import door
+from ..backend.types import Values
 from ..fitting.objective import Affine
-from ..gaussian.file import SetData, crop
+from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.region import crop
 from ..image.color import rendered_as
 from ..image.formats import TIFF_SUFFIXES
 from ..image.io import bits_of, dtype_of, to_file, write_pixels
@@ -25,7 +27,7 @@ from .windows import TILE_SIDE, Source, Window, write_tiles
 BAND_PIXELS = 1 << 22
 """Pixels of a band of a picture that is drawn at once; one takes some 100 bytes."""
 
-Picture = NDArray[Any]
+Picture = Values
 
 
 def draw(data: SetData, backend: str | None = None) -> Picture:
@@ -48,12 +50,17 @@ def _load(data: SetData, backend: str | None) -> Gaussians:
     return Gaussians.from_data(data, backend)
 
 
+@door
+def _pixels_of(data: SetData, backend: str | None) -> Picture:
+    return render(_load(data, backend)).numpy()
+
+
 def draw_region(
     data: SetData,
     region: tuple[int, int, int, int],
     size: tuple[int, int],
     backend: str | None = None,
-    kind: Any = np.uint8,
+    kind: type[np.generic] = np.uint8,
 ) -> Iterator[Picture]:
     """Draw a region of a set at any size, in bands of rows from top to bottom.
 
@@ -84,7 +91,7 @@ def draw_region(
     for first in range(0, height, rows):
         band = width, min(rows, height - first)
         part = crop(data, (0, first / scale[1]), band, scale)
-        yield to_file(render(_load(part, backend)).numpy(), rendered_as(data.space), kind)
+        yield to_file(_pixels_of(part, backend), rendered_as(data.space), kind)
 
 
 def save_region(
@@ -164,7 +171,7 @@ def compare_tasks(
 
 
 def compare(
-    task: CompareTask, shared: Any = None, *, affine: Affine, codes: bool
+    task: CompareTask, shared: None = None, *, affine: Affine, codes: bool
 ) -> tuple[float, float]:
     """Return the sums of the squared errors of a part in the spaces of psnr_ycbcr and psnr_rgb.
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import os
 import time
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
 from ..backend.arguments import takes_numbers
-from ..backend.executor import executor_for
-from ..backend.feedback import defer_interrupts, shows_progress
+from ..backend.interrupts import defer_interrupts
+from ..backend.progress import shows_progress
 from ..backend.selection import select
+from ..cluster.client import executor_for
 from ..fitting.method import DEFAULT, Method
 from ..fitting.objective import restored
 from ..fitting.options import FitOptions, named_options
@@ -73,7 +74,7 @@ class LargeFit:
 @shows_progress
 @takes_numbers
 def fit_large(
-    image: Any,
+    image: object,
     output: str | os.PathLike[str] | None = None,
     *,
     gaussians: int | None = None,
@@ -84,7 +85,7 @@ def fit_large(
     seed: int = 0,
     backend: str | None = None,
     progress: Any = None,
-    client: Any = None,
+    client: object = None,
     encoding: str | None = None,
 ) -> LargeFit:
     """Fit an image of any size block by block, in the memory of one block.
@@ -165,7 +166,7 @@ def fit_large(
     source = open_source(image, rendered_as(space) is None, encoding)
     blocks, settings = plan(source, options, block)
     select(backend)
-    keep: Any = nullcontext()
+    keep: AbstractContextManager = nullcontext()
     if output is not None:
         check_suffix(output)
         require_writable(output)

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gaussian.file import CUTOFF, SetData, crop, reaches
+from ..gaussian.file import CUTOFF, SetData
+from ..gaussian.region import crop, reaches
 
 HALO_SPACINGS = 5.0
 """Width of a halo, in mean distances of the Gaussians. The Gaussians near a border overlap those of

@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..backend.feedback import warn
+from ..backend.messages import warn
+from ..backend.types import Record, Values
+from ..gaussian.file import MAX_SET_SIDE
 from ..image.header import transparency_note
 from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
 from ..image.pixels import encoding_of
@@ -23,10 +25,7 @@ from ..image.reading import TIFF, decode, read_header, reader_of
 from ..image.remote import is_copied
 from ..image.tiff import has_windows, read_window
 
-MAX_SIDE = 1 << 16
-"""Longest side of a set of Gaussians, in pixels."""
-
-Pixels = NDArray[Any]
+Pixels = Values
 """Pixels (h, w) or (h, w, channels) of any type."""
 
 
@@ -92,7 +91,7 @@ class Source:
     height: int
     channels: int
     name: str
-    identity: dict[str, Any]
+    identity: Record
     pixels: Any
     keep_grey: bool
     encoding: str = "srgb"
@@ -154,7 +153,7 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     return Source(shape[1], shape[0], channels, name, identity, pixels, keep_grey, encoding)
 
 
-def _identity(path: Path) -> dict[str, Any]:
+def _identity(path: Path) -> Record:
     """Return what tells a file from others, and from itself when it has changed."""
     try:
         state = path.stat()
@@ -196,8 +195,10 @@ def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixe
 
 
 def _check_sides(name: str, shape: tuple[int, ...]) -> None:
-    if not all(1 <= side <= MAX_SIDE for side in shape[:2]):
-        raise ImageError(f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SIDE:,}")
+    if not all(1 <= side <= MAX_SET_SIDE for side in shape[:2]):
+        raise ImageError(
+            f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SET_SIDE:,}"
+        )
 
 
 def _read_part(path: str, rows: slice, columns: slice) -> Pixels:

@@ -14,7 +14,9 @@ import click
 
 from ..backend.ending import INTERRUPTED, NAME
 from ..backend.executor import ClusterError
-from ..backend.feedback import printable, progress_bar, terminate_as_interrupt
+from ..backend.interrupts import terminate_as_interrupt
+from ..backend.messages import printable
+from ..backend.progress import progress_bar
 from ..backend.selection import BackendError
 
 MISSED = 1
@@ -100,7 +102,7 @@ def bar(quiet: bool) -> Iterator[Callable[..., None]]:
     """
     with progress_bar(False if quiet else None) as show:
 
-        def show_printable(label: str, *values: Any) -> None:
+        def show_printable(label: str, *values: object) -> None:
             if show:
                 show(printable(label), *values)
 

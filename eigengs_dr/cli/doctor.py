@@ -5,15 +5,21 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 import click
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..backend import doctor as machine
 from ..backend.gpu import ALLOWED, Comparison, compare
 from ..backend.selection import BACKENDS
+from ..backend.types import Floats, Record
 from . import options
+
+if TYPE_CHECKING:
+    import eigengs_dr as eg
 from .console import MISSED, say, table
 
 
@@ -80,9 +86,9 @@ def _describe(comparisons: list[Comparison], device: str) -> list[str]:
 # ---------------------------------------------------------------------------------------------
 
 
-def _run_trial(name: str, backend: str) -> dict[str, Any]:
+def _run_trial(name: str, backend: str) -> Record:
     """Run a trial twice, the second time with compiled programs; return its time and figures."""
-    trials: dict[str, Callable[[str], Any]] = {
+    trials: dict[str, Callable[[str], ArrayLike]] = {
         "fit": _fit,
         "gradients": _gradients,
         "texture": _texture,
@@ -94,14 +100,14 @@ def _run_trial(name: str, backend: str) -> dict[str, Any]:
     return {"seconds": time.perf_counter() - started, "figures": figures.ravel().tolist()}
 
 
-def _picture() -> Any:
+def _picture() -> Floats:
     """Return a picture of waves and an edge, (48, 64, 3) in [0, 1]."""
     y, x = np.mgrid[0:48, 0:64] / 64
     waves = [0.5 + 0.4 * np.sin(a * x + b * y) for a, b in ((9, 4), (5, -13), (17, 3))]
     return np.stack(waves, axis=-1) * np.where(x + y > 0.9, 0.6, 1.0)[..., None]
 
 
-def _fit(backend: str) -> Any:
+def _fit(backend: str) -> list[float]:
     """Return the PSNRs of a fit."""
     import eigengs_dr as eg
 
@@ -109,7 +115,7 @@ def _fit(backend: str) -> Any:
     return [row["psnr_rgb"] for row in result.trace] + [result.psnr_ycbcr]
 
 
-def _set(backend: str) -> Any:
+def _set(backend: str) -> eg.Gaussians:
     """Return a set that is not fitted, so that it is the same on every backend."""
     import eigengs_dr as eg
 
@@ -127,7 +133,7 @@ def _set(backend: str) -> Any:
     )
 
 
-def _gradients(backend: str) -> Any:
+def _gradients(backend: str) -> Floats:
     """Return the derivatives of a weighted sum of the pixels by all parameters."""
     import drjit as dr
 
@@ -142,7 +148,7 @@ def _gradients(backend: str) -> Any:
     return np.concatenate([np.ravel(dr.grad(p).numpy()) for p in parameters])
 
 
-def _mitsuba(backend: str) -> Any:
+def _mitsuba(backend: str) -> ModuleType:
     """Import Mitsuba with the plugins, and set the variant of a backend."""
     from ..plugins import register_plugins  # first: its error says what to install
 
@@ -154,7 +160,7 @@ def _mitsuba(backend: str) -> Any:
     return mi
 
 
-def _texture(backend: str) -> Any:
+def _texture(backend: str) -> Floats:
     """Return lookups of a texture, at points and filtered."""
     mi = _mitsuba(backend)
     import drjit as dr
@@ -170,7 +176,7 @@ def _texture(backend: str) -> Any:
     return np.concatenate([np.ravel(texture.eval(si).numpy()) for texture in textures])
 
 
-def _scene(backend: str) -> Any:
+def _scene(backend: str) -> Floats:
     """Return the pixels of a rectangle with the texture, under an even light."""
     mi = _mitsuba(backend)
     from ..plugins import texture_of

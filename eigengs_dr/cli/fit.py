@@ -218,14 +218,13 @@ def _settings(
 
 def _method(preset: str, init: str | None) -> Method:
     """Return the method of a name, perhaps with the placement of another name."""
-    from ..fitting.place import Adaptive, Grid, Random
+    from ..fitting.place import Adaptive, Grid, Placement, Random
     from ..paper.eigengs import EIGENGS
     from ..paper.gaussianimage import GAUSSIANIMAGE
 
     method = {"default": eg.DEFAULT, "gaussianimage": GAUSSIANIMAGE, "eigengs": EIGENGS}[preset]
-    if init is None:
-        return method
-    return replace(method, place={"adaptive": Adaptive(), "grid": Grid(), "random": Random()}[init])
+    places: dict[str, Placement] = {"adaptive": Adaptive(), "grid": Grid(), "random": Random()}
+    return method if init is None else replace(method, place=places[init])
 
 
 def _default_count(path: Path | str) -> int:

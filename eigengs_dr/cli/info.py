@@ -11,18 +11,19 @@ import click
 
 import eigengs_dr as eg
 
-from ..backend.feedback import printable
+from ..backend.messages import printable
 from ..backend.selection import select
+from ..backend.types import Record
 from ..gaussian import file as set_file
 from ..gaussian.file import SetData
+from ..gaussian.packed import is_packed
 from ..storage import npz
-from ..storage.atomic import reader_of
 from . import options
 from .console import about, table
 from .outputs import check_outputs, name_pictures
 from .scene import explained, load_mitsuba
 
-Facts = dict[str, Any]
+Facts = Record
 
 
 @click.command()
@@ -65,7 +66,7 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     from ..eigenbasis.eigengs import SHIPPED
 
     file = SHIPPED.get(str(file), file)
-    packed = bool(reader_of(file))
+    packed = is_packed(file)
     found = set_file.FORMAT if packed else npz.format_of(file)
     kinds = {set_file.FORMAT: "image", set_file.MATERIAL: "material", model_file.FORMAT: "model"}
     if found not in kinds:
@@ -188,7 +189,7 @@ def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) 
 
 def _draw(file: Path, kind: str, picture: Path) -> None:
     """Write the picture of a set, of its maps side by side, or of a model."""
-    from ..image.resize import join_pictures
+    from ..image.sheet import join_pictures
     from ..viewer.pictures import component_sheet
 
     shown: Any

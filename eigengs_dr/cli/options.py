@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import click
 
-from ..backend.feedback import printable
+from ..backend.messages import printable
 from ..backend.selection import BACKENDS
+from ..backend.types import Record
 from ..image.color import SPACES
 from ..image.pixels import ENCODINGS
 from ..image.remote import is_url
@@ -22,10 +23,15 @@ EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 MAX_PIXELS = 1 << 29
 """Pixels of the largest picture to render, except into TIFF files; it takes 3 bytes a pixel."""
 
-MAX_SIDE = 1 << 17
+MAX_RENDERED_SIDE = 1 << 17
 """Longest side of a picture to render into a TIFF file."""
 
-Option = Callable[[Callable[..., Any]], Callable[..., Any]]
+Command = Callable[..., object]
+
+Kind = click.ParamType | type | Callable[[str], object]
+"""What a value of an option is."""
+
+Option = Callable[[Command], Command]
 """What adds an option to a command."""
 
 # Each function below parses the text of an option or an argument; its name stands in the help.
@@ -64,7 +70,7 @@ def size(text: str) -> tuple[int, int]:
 
 def scale(text: str) -> float:
     """Parse a factor on a size."""
-    if not 0 < (factor := float(text)) <= MAX_SIDE:
+    if not 0 < (factor := float(text)) <= MAX_RENDERED_SIDE:
         raise click.BadParameter(f"{text}: expected a number above 0, such as 2 or 0.5")
     return factor
 
@@ -136,15 +142,17 @@ def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, 
 
     A picture that is written by parts may be larger than one that is held in memory.
     """
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise click.UsageError(f"{width}x{height}: expected sides of 1 to {MAX_SIDE:,} pixels")
+    if not (1 <= width <= MAX_RENDERED_SIDE and 1 <= height <= MAX_RENDERED_SIDE):
+        raise click.UsageError(
+            f"{width}x{height}: expected sides of 1 to {MAX_RENDERED_SIDE:,} pixels"
+        )
     if width * height > MAX_PIXELS and not by_parts:
         most = f"at most {MAX_PIXELS:,} pixels, or a .tif file"
         raise click.UsageError(f"{width}x{height}: expected {most}")
     return width, height
 
 
-def value(name: str, metavar: str | None, kind: Any, text: str, default: object = None) -> Option:
+def value(name: str, metavar: str | None, kind: Kind, text: str, default: object = None) -> Option:
     """Make an option that takes a value of a type of click, or one that a function parses."""
     return click.option(name, metavar=metavar, type=kind, help=text, default=default)
 
@@ -167,7 +175,7 @@ def output(text: str, metavar: str, required: bool = True) -> Option:
 
 def maps(text: str) -> Option:
     """Make the option that names image files of maps."""
-    many: Any = {"multiple": True, "type": map_file, "callback": by_name}
+    many: Record = {"multiple": True, "type": map_file, "callback": by_name}
     return click.option("--map", "maps", metavar="NAME[:SPACE]=FILE", help=text, **many)
 
 
@@ -215,10 +223,10 @@ class Run(NamedTuple):
 def shared(*names: str) -> Option:
     """Add options of `SHARED` to a command, which gets them as its first argument, a `Run`."""
 
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(command: Command) -> Command:
         @click.pass_context
         @wraps(command)
-        def call(context: click.Context, /, **given: Any) -> Any:
+        def call(context: click.Context, /, **given: Any) -> object:
             return command(Run(context, **{name: given.pop(name) for name in names}), **given)
 
         for name in reversed(names):

@@ -13,11 +13,12 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from ..backend.selection import backend_of, name_of, select
+from ..backend.types import Record
 from ..storage.atomic import atomic_write
 from . import options
 from .console import MISSED, bar, table
@@ -45,7 +46,7 @@ def definition(text: str) -> tuple[str, str]:
 variant_option = options.value(
     "--variant", "NAME", str, "Of Mitsuba.  [default: cuda_ad_rgb with a GPU, else llvm_ad_rgb]"
 )
-many: Any = {"multiple": True, "callback": lambda context, option, given: dict(given)}
+many: Record = {"multiple": True, "callback": lambda context, option, given: dict(given)}
 definitions_option = click.option(
     "-D", "definitions", type=definition, metavar="KEY=VALUE", help="Set a <default>.", **many
 )

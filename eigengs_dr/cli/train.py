@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from ..backend.selection import select
+from ..backend.types import Record
 from . import options
 from .console import INTERRUPTED, bar, open_cluster, say
 from .outputs import check_outputs, name_outputs, name_pictures
@@ -75,7 +76,7 @@ def train(
         run.context.exit(INTERRUPTED)
     if picture:
         save_image(picture, component_sheet(result.model, result.basis))
-    found: dict[str, Any] = dict.fromkeys(MEASURED) | result.figures
+    found: Record = dict.fromkeys(MEASURED) | result.figures
     record = {"input": folder, "output": output, "most_components": settings.components} | found
     run.write_report(vars(settings) | record)
     components = "+".join(map(str, found["components"]))

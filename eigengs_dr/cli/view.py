@@ -12,8 +12,8 @@ import eigengs_dr as eg
 
 from ..backend.selection import select
 from ..gaussian import file as set_file
+from ..gaussian.packed import is_packed
 from ..storage import npz
-from ..storage.atomic import reader_of
 from . import options
 from .console import about
 from .outputs import check_outputs, claim, name_outputs
@@ -84,7 +84,7 @@ def _load(
     from ..viewer.view import check_count
 
     file = SHIPPED.get(str(file), file)
-    sections = egs.section_counts(file) if reader_of(file) else []
+    sections = egs.section_counts(file) if is_packed(file) else []
     if not sections and npz.format_of(file) == model_file.FORMAT:
         if levels is not None or name is not None:
             raise ValueError(f"{file}: is a model; leave --levels and --map out")

@@ -10,7 +10,7 @@ import logging
 import re
 import threading
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from pathlib import Path
@@ -25,9 +25,9 @@ from distributed.comm import CommClosedError
 from distributed.protocol.pickle import dumps, loads
 from distributed.scheduler import KilledWorker
 
-from .. import __version__
-from ..backend.executor import ClusterError, Done, Function
-from ..backend.feedback import defer_interrupts, terminate_as_interrupt
+from ..backend.executor import ClusterError, Done, Function, Task, Value
+from ..backend.interrupts import defer_interrupts, terminate_as_interrupt
+from ..version import __version__
 from .local import local_cluster
 from .worker import package_versions, run_task, share
 
@@ -145,14 +145,14 @@ class ClusterExecutor:
             self.workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
 
     def map(
-        self, function: Function, tasks: Iterable[Any], shared: Any = None
+        self, function: Function[Task, Value], tasks: Iterable[Task], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`.
 
         A worker that ends takes all of its tasks with it. So tasks that Dask gives up are tried
         again at the end, one at a time; a task is lost for its own fault only.
         """
-        suspects: deque[Any] = deque()
+        suspects: deque[Task] = deque()
         with self._explained(), terminate_as_interrupt():
             # A task, not `scatter`: the scheduler repeats it if the workers that hold it are lost.
             constant = self._submit("share", share, dumps((function, shared)), package_versions())
@@ -167,10 +167,10 @@ class ClusterExecutor:
                 yield from ended
 
     def _run(
-        self, name: str, tasks: Iterable[Any], constant: Future, limit: int
+        self, name: str, tasks: Iterable[object], constant: Future, limit: int
     ) -> Generator[Done, None, None]:
         """Run tasks, `limit` of them at once."""
-        under_way: dict[Future, Any] = {}
+        under_way: dict[Future, object] = {}
         waiting = iter(tasks)
         ended = self._watch(under_way)
         try:
@@ -198,7 +198,7 @@ class ClusterExecutor:
     def _watch(self, futures: Iterable[Future]) -> as_completed:
         return as_completed(list(futures), loop=self.client.loop, timeout=NO_WORKER_SECONDS)
 
-    def _submit(self, name: str, function: Any, *arguments: Any) -> Future:
+    def _submit(self, name: str, function: Callable, *arguments: object) -> Future:
         """Submit a task; Dask learns from those of the same name how long it takes."""
         with _SUBMIT_LOCK, dask.config.set(LARGE_TASKS):
             return self.client.submit(function, *arguments, key=f"{name}-{uuid4()}")
@@ -238,7 +238,7 @@ class ClusterExecutor:
             ) from None
 
 
-def _done(task: Any, future: Future) -> Done:
+def _done(task: object, future: Future) -> Done:
     """Return what became of a task; one whose worker ended with the result runs again."""
     try:
         return Done(task, loads(future.result()))

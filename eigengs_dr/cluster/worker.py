@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, cached_property
 from importlib.metadata import version
-from typing import Any
 
 from distributed import Worker, get_worker
 from distributed.protocol.pickle import dumps, loads
@@ -22,9 +21,6 @@ from threadpoolctl import threadpool_limits
 from ..backend.executor import ClusterError
 from ..backend.recording import exclusive, release_later
 from ..backend.selection import BackendError, describe
-
-_TASK_LOCK = threading.Lock()
-"""Numbers of threads belong to the process, as all threads and workers of it do."""
 
 
 class Shared:
@@ -42,7 +38,7 @@ class Shared:
         self.data, self.versions = data, versions
 
     @cached_property
-    def value(self) -> tuple[Any, Any]:
+    def value(self) -> tuple[Callable, object]:
         """The function and its second argument."""
         function, shared = loads(self.data)
         return function, shared
@@ -83,7 +79,7 @@ def run_task(task: bytes, shared: Shared) -> bytes:
         What the function raises.
     """
     worker = get_worker()
-    with _unwatched(worker), _TASK_LOCK, limited_threads(worker.state.nthreads):
+    with _unwatched(worker), limited_threads(worker.state.nthreads):
         check_versions(shared.versions)
         function, constant = shared.value
         try:
@@ -121,22 +117,22 @@ def _unwatched(worker: Worker) -> Iterator[None]:
 def limited_threads(count: int) -> Iterator[None]:
     """Let BLAS and Dr.Jit use so many threads during a block, and Dr.Jit keep no memory after it.
 
+    The block is `exclusive`: numbers of threads belong to the process, as all workers in it do.
+
     Dr.Jit's pool ignores OMP variables and takes every core, so two workers would use each core
     twice. It keeps freed memory for reuse, and a worker that Dask pauses for its memory, by default
     at 80 % of its limit, would never go on.
     """
     import drjit as dr
 
-    with threadpool_limits(count):
-        with exclusive():
-            before = dr.thread_count()
-            dr.set_thread_count(count)
+    with exclusive(), threadpool_limits(count):
+        before = dr.thread_count()
+        dr.set_thread_count(count)
         try:
             yield
         finally:
-            with exclusive():
-                dr.set_thread_count(before)
-                dr.flush_malloc_cache()
+            dr.set_thread_count(before)
+            dr.flush_malloc_cache()
 
 
 def package_versions() -> dict[str, str]:
@@ -144,7 +140,7 @@ def package_versions() -> dict[str, str]:
     return {name: version(name) for name in ("drjit", "numpy")}
 
 
-@cache
+@cache  # of the process; asked for every task
 def _llvm_version() -> str:
     try:
         return str(describe("llvm")["versions"]["libllvm"])

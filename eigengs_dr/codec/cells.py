@@ -12,11 +12,9 @@ from functools import cache
 
 import numpy as np
 from constriction import stream
-from numpy.typing import NDArray
 
+from ..backend.types import Integers
 from .range_coder import Coder, categorical
-
-IntArray = NDArray[np.int64]
 
 EVENNESS = (1, 2, 4, 8, 16, 64)
 """Parameters of the distribution that a file may name: 1 for any number, 64 nearly for halves."""
@@ -25,7 +23,7 @@ MAX_MODELLED = 15
 """Largest number of Gaussians whose halves have that distribution; larger ones are rare."""
 
 
-def code_cells(coder: Coder, cells: IntArray, levels: int, evenness: int) -> IntArray:
+def code_cells(coder: Coder, cells: Integers, levels: int, evenness: int) -> Integers:
     """Code the cells of Gaussians in any order; return them in the order of `morton_encode`.
 
     Parameters
@@ -53,7 +51,7 @@ def code_cells(coder: Coder, cells: IntArray, levels: int, evenness: int) -> Int
     return morton_decode(np.repeat(prefix, number), levels)
 
 
-def _code_halves(coder: Coder, number: IntArray, evenness: int, upper: IntArray) -> IntArray:
+def _code_halves(coder: Coder, number: Integers, evenness: int, upper: Integers) -> Integers:
     """Code how many of each `number` of Gaussians lie in the second half."""
     result = np.zeros_like(number)
     kind = np.where(number > MAX_MODELLED, 1, number)
@@ -66,7 +64,7 @@ def _code_halves(coder: Coder, number: IntArray, evenness: int, upper: IntArray)
     return result
 
 
-def _any_number(coder: Coder, number: IntArray, upper: IntArray) -> IntArray:
+def _any_number(coder: Coder, number: Integers, upper: Integers) -> Integers:
     """Code integers from 0 to `number`, which may be large."""
     if number.max() < 1 << 20:
         return coder.uniform(number + 1, upper)
@@ -78,7 +76,7 @@ def _any_number(coder: Coder, number: IntArray, upper: IntArray) -> IntArray:
     return np.minimum(result, number)
 
 
-@cache
+@cache  # a tree of cells asks for small n again and again
 def _beta_binomial(n: int, evenness: int) -> stream.model.Model:
     """Return the model of the number of n Gaussians in a half."""
     chances = [1.0]
@@ -87,7 +85,7 @@ def _beta_binomial(n: int, evenness: int) -> stream.model.Model:
     return categorical(np.array(chances))
 
 
-def morton_encode(cells: IntArray, levels: int) -> IntArray:
+def morton_encode(cells: Integers, levels: int) -> Integers:
     """Return the bits of columns and rows (N, 2) in turn, highest first, as integers (N,)."""
     code = np.zeros(len(cells), np.int64)
     for level in range(levels):
@@ -96,7 +94,7 @@ def morton_encode(cells: IntArray, levels: int) -> IntArray:
     return code
 
 
-def morton_decode(codes: IntArray, levels: int) -> IntArray:
+def morton_decode(codes: Integers, levels: int) -> Integers:
     """Return the columns and rows (N, 2) of integers (N,): the inverse of `morton_encode`."""
     x = y = np.zeros_like(codes)
     for level in range(levels):
@@ -119,7 +117,7 @@ MAX_LEVELS = 24
 """Largest number of levels of `hilbert_encode`; an index then fits 48 bits."""
 
 
-def hilbert_encode(points: IntArray, levels: int) -> IntArray:
+def hilbert_encode(points: Integers, levels: int) -> Integers:
     """Return the Hilbert indices of points.
 
     Parameters

@@ -22,8 +22,10 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.types import Integers
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
 from ..gaussian.file import CUTOFF, SetData, check
+from ..gaussian.packed import MAGIC
 from ..image.color import MAX_CHANNELS, SPACES
 from ..storage.atomic import atomic_write
 from ..storage.memory import check_content
@@ -34,12 +36,7 @@ from .gaussian_model import GaussianCoder
 from .quantization import Steps, Symbols, dequantize
 from .range_coder import Decoder, Encoder
 
-IntArray = NDArray[np.int64]
-
 SUFFIX = ".egs"
-
-MAGIC = b"\x89EGS"
-"""First bytes of a file. The first byte is no ASCII character, so no text file starts with it."""
 
 VERSION, MAPS_VERSION = 3, 4
 """Versions of the format, for a set without maps and with a table of maps. Versions 1
@@ -161,7 +158,7 @@ def _map_table(maps: Sequence[TextureMap]) -> bytes:
     return b"".join(parts)
 
 
-def section_to_bytes(section: Symbols, steps: Steps, corner: IntArray, levels: int) -> bytes:
+def section_to_bytes(section: Symbols, steps: Steps, corner: Integers, levels: int) -> bytes:
     """Return the bytes of a section; sort its Gaussians in Hilbert-curve order.
 
     Parameters
@@ -185,7 +182,7 @@ def section_to_bytes(section: Symbols, steps: Steps, corner: IntArray, levels: i
     return HEAD.pack(count, len(body), section_check(count, body)) + body
 
 
-def _cells(cells: IntArray, levels: int, evenness: int) -> Encoder:
+def _cells(cells: Integers, levels: int, evenness: int) -> Encoder:
     """Return an encoder that has coded cells, with one of the parameters `EVENNESS`."""
     coder = Encoder()
     code_cells(coder, cells, levels, EVENNESS[evenness])
@@ -274,7 +271,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
             raise ValueError(f"{path}: {error}") from None
 
 
-def _read_header(file: BinaryIO) -> tuple[int, int, IntArray, EgsContent]:
+def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
     """Return the levels, the number of sections, the first cell, and a content without sections.
 
     Headers that `to_bytes` never writes are refused; `Gaussians.load` checks the rest.

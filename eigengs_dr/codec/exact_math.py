@@ -8,9 +8,8 @@ quotients, square roots and shifts of exponents, which IEEE 754 rounds correctly
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ..backend.types import Doubles
 
 _EXP2 = (
     1.0,
@@ -38,7 +37,7 @@ _SIN = (
 """Taylor coefficients of ``sin(2 pi x) / x`` in ``x^2``."""
 
 
-def in_order(rows: Array) -> Array:
+def in_order(rows: Doubles) -> Doubles:
     """Return the sum of rows (K, n), one after another, as libraries do not promise."""
     total = np.zeros(rows.shape[1])
     for row in rows:
@@ -46,14 +45,14 @@ def in_order(rows: Array) -> Array:
     return total
 
 
-def exp2(x: Array) -> Array:
+def exp2(x: Doubles) -> Doubles:
     """Return ``2^x`` with a relative error of 1e-11; x is clipped to +-1000."""
     x = np.clip(x, -1000.0, 1000.0)
     whole = np.rint(x)
     return np.ldexp(_polynomial(_EXP2, x - whole), whole.astype(np.int32))
 
 
-def log2(x: Array) -> Array:
+def log2(x: Doubles) -> Doubles:
     """Return the logarithm to base 2 of numbers above 0 with an error of 1e-10."""
     mantissa, exponent = np.frexp(x)
     low = mantissa < 0.7071067811865476
@@ -63,19 +62,19 @@ def log2(x: Array) -> Array:
     return exponent + 2.8853900817779268 * t * series  # 2 / ln 2
 
 
-def sin_turns(x: Array) -> Array:
+def sin_turns(x: Doubles) -> Doubles:
     """Return ``sin(2 pi x)`` with an error of 1e-8."""
     x = x - np.rint(x)
     x = np.where(np.abs(x) > 0.25, np.copysign(0.5, x) - x, x)
     return x * _polynomial(_SIN, x * x)
 
 
-def cos_turns(x: Array) -> Array:
+def cos_turns(x: Doubles) -> Doubles:
     """Return ``cos(2 pi x)`` with an error of 1e-8."""
     return sin_turns(x + 0.25)
 
 
-def angle_in_turns(y: Array, x: Array) -> Array:
+def angle_in_turns(y: Doubles, x: Doubles) -> Doubles:
     """Return the angle of (x, y) in turns, in [-0.5, 0.5], with an error of 1e-10."""
     far, near = np.maximum(np.abs(x), np.abs(y)), np.minimum(np.abs(x), np.abs(y))
     t = near / np.where(far > 0, far, 1.0)
@@ -88,7 +87,7 @@ def angle_in_turns(y: Array, x: Array) -> Array:
     return np.where(y < 0, -angle, angle)
 
 
-def _polynomial(coefficients: tuple[float, ...] | list[float], x: Array) -> Array:
+def _polynomial(coefficients: tuple[float, ...] | list[float], x: Doubles) -> Doubles:
     """Return ``sum_k c_k x^k`` by Horner's rule."""
     total = np.full(np.shape(x), coefficients[-1])
     for c in coefficients[-2::-1]:

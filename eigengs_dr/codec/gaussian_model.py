@@ -19,8 +19,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..backend.types import Doubles, Integers
 from .exact_math import angle_in_turns, cos_turns, in_order, log2, sin_turns
 from .quantization import (
     SCALE_STEP,
@@ -34,9 +34,6 @@ from .quantization import (
 )
 from .range_coder import Coder, categorical
 from .weights import CLASSES, MIN_WIDTH, Model, Weights, fit_weights
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 STRIDES = (8, 4, 2, 1)
 """Distances of the passes after the first one, along the curve."""
@@ -60,16 +57,16 @@ class Pass(NamedTuple):
         Weights of the neighbours, whose sum is 1: they fall with the square of the distance.
     """
 
-    rows: IntArray
-    known: IntArray
-    weight: Array
+    rows: Integers
+    known: Integers
+    weight: Doubles
 
-    def mean(self, values: Array) -> Array:
+    def mean(self, values: Doubles) -> Doubles:
         """Return the weighted means of values (N,) of the neighbours, shape (n,)."""
         return in_order(self.weight * values[self.known])
 
 
-def passes_of(cells: IntArray) -> list[Pass]:
+def passes_of(cells: Integers) -> list[Pass]:
     """Divide Gaussians, in the order of the curve, into passes; cells have the shape (N, 2)."""
     index = np.arange(len(cells))
     first = index[:: 2 * STRIDES[0]]
@@ -84,13 +81,13 @@ def passes_of(cells: IntArray) -> list[Pass]:
     return [found for found in passes if len(found.rows)]
 
 
-def squared_distance(one: IntArray, other: IntArray) -> Array:
+def squared_distance(one: Integers, other: Integers) -> Doubles:
     """Return the squares of the distances of cells, shape (..., 2)."""
     away = (one - other).astype(np.float64)
     return away[..., 0] * away[..., 0] + away[..., 1] * away[..., 1]
 
 
-def crowding(cells: IntArray) -> list[Array]:
+def crowding(cells: Integers) -> list[Doubles]:
     """Return logarithms, shape (N,), that tell how near other Gaussians are.
 
     The numbers of Gaussians in a small and in a large window, and the square of the distance to the
@@ -102,7 +99,7 @@ def crowding(cells: IntArray) -> list[Array]:
     return [*map(log2, counts), log2(nearer + 1)]
 
 
-def _count(cells: IntArray, reach: int) -> Array:
+def _count(cells: Integers, reach: int) -> Doubles:
     """Count Gaussians in windows of ``2 reach + 1`` squares, of ``2^reach`` cells or more."""
     shift, side = reach, 2 * reach + 1
     while int(np.prod((cells.max(axis=0) >> shift) + 1)) > COARSE * len(cells) + 256:
@@ -142,11 +139,11 @@ class Directions:
         Numbers of directions.
     """
 
-    def __init__(self, passes: list[Pass], length: Array, turns: IntArray) -> None:
+    def __init__(self, passes: list[Pass], length: Doubles, turns: Integers) -> None:
         self.passes, self.length, self.turns = passes, length, turns
         self.u, self.v = np.zeros(len(turns)), np.zeros(len(turns))
 
-    def code(self, coder: Coder, sharpness: IntArray, given: IntArray) -> IntArray:
+    def code(self, coder: Coder, sharpness: Integers, given: Integers) -> Integers:
         """Code the directions, integers from 0 to ``turns - 1``."""
         result = np.zeros_like(self.turns)
         for part in self.passes:
@@ -157,7 +154,7 @@ class Directions:
             self._learn(rows, result[rows])
         return result
 
-    def fit(self, given: IntArray) -> IntArray:
+    def fit(self, given: Integers) -> Integers:
         """Return the sharpness of each class for which directions take the fewest bits."""
         self._learn(np.arange(len(given)), given)
         chances = np.stack([sector_chances(k) for k in range(256)])
@@ -171,11 +168,11 @@ class Directions:
             np.add.at(counts, (label[many], sector[many]), 1)
         return np.asarray((counts @ bits.T).argmin(axis=1))
 
-    def _learn(self, rows: IntArray, turn: IntArray) -> None:
+    def _learn(self, rows: Integers, turn: Integers) -> None:
         angle, length = turn / self.turns[rows], self.length[rows]
         self.u[rows], self.v[rows] = length * cos_turns(angle), length * sin_turns(angle)
 
-    def _look(self, part: Pass) -> tuple[IntArray, IntArray]:
+    def _look(self, part: Pass) -> tuple[Integers, Integers]:
         """Return the directions of the neighbours of a pass, and the classes."""
         u, v = part.mean(self.u), part.mean(self.v)
         ahead = np.rint(angle_in_turns(v, u) * self.turns[part.rows]).astype(np.int64)
@@ -184,8 +181,8 @@ class Directions:
 
 
 def _code_pass(
-    coder: Coder, turns: IntArray, labels: IntArray, sharpness: IntArray, given: IntArray
-) -> IntArray:
+    coder: Coder, turns: Integers, labels: Integers, sharpness: Integers, given: Integers
+) -> Integers:
     """Code directions relative to those of the neighbours."""
     sector, few = np.zeros_like(turns), turns < SECTORS
     wanted = _sector(given, turns)
@@ -199,23 +196,23 @@ def _code_pass(
     return (first + coder.uniform(last - first, place)) % turns
 
 
-def _sector(turn: IntArray, turns: IntArray) -> IntArray:
+def _sector(turn: Integers, turns: Integers) -> Integers:
     """Return the sectors of directions relative to those of the neighbours."""
     return (2 * SECTORS * turn + turns) // (2 * turns) % SECTORS
 
 
-def _first(sector: IntArray, turns: IntArray) -> IntArray:
+def _first(sector: Integers, turns: Integers) -> Integers:
     """Return the first direction of a sector; of sector 0, it is before that of the neighbours."""
     return -(-(2 * sector - 1) * turns // (2 * SECTORS))
 
 
-def sector_chances(sharpness: int) -> Array:
+def sector_chances(sharpness: int) -> Doubles:
     """Return the probabilities of the sectors, up to a factor: highest at 0."""
     away = np.minimum(np.arange(SECTORS), SECTORS - np.arange(SECTORS)) * 0.25
     return np.asarray(1 / (1 + sharpness / SHARPNESS * away * away))
 
 
-Features = Callable[[Pass], tuple[Array, Array]]
+Features = Callable[[Pass], tuple[Doubles, Doubles]]
 """The features of centres and of widths, shape (F, n), for the n Gaussians of a pass."""
 
 
@@ -234,7 +231,7 @@ class GaussianCoder:
     """
 
     def __init__(
-        self, coder: Coder, cells: IntArray, model: Model | None = None, rich: bool = True
+        self, coder: Coder, cells: Integers, model: Model | None = None, rich: bool = True
     ) -> None:
         self.coder, self.cells, self.rich = coder, cells, rich
         self.known, self.model = iter(model.weights) if model else None, model or Model()
@@ -261,7 +258,7 @@ class GaussianCoder:
         place = [self.coder.uniform(parts[:, axis], given.part[:, axis]) for axis in range(2)]
         return Symbols(self.cells, np.stack(place, axis=1), color, scale, stretch, turn)
 
-    def _numbers(self, features: Features, step: Array, given: IntArray) -> IntArray:
+    def _numbers(self, features: Features, step: Doubles, given: Integers) -> Integers:
         """Code one kind of numbers, pass by pass."""
         result = np.zeros_like(given)
         weights = next(self.known) if self.known else self._fit(features, step, given)
@@ -275,7 +272,7 @@ class GaussianCoder:
             self.values[rows] = result[rows] * unit
         return result
 
-    def _fit(self, features: Features, step: Array, given: IntArray) -> Weights:
+    def _fit(self, features: Features, step: Doubles, given: Integers) -> Weights:
         """Find the weights for numbers that are all known, and note them in the model."""
         self.values = given * step
         both = zip(*(features(part) for part in self.passes), strict=True)
@@ -285,7 +282,7 @@ class GaussianCoder:
         self.model.weights.append(found)
         return found
 
-    def _color_features(self, color: IntArray, k: int, part: Pass) -> tuple[Array, Array]:
+    def _color_features(self, color: Integers, k: int, part: Pass) -> tuple[Doubles, Doubles]:
         """Return the features of channel k: the channel near by, and the two channels before it."""
         rows, here = part.rows, self.values
         center, width = [part.mean(here)], [np.ones(len(rows)), part.mean(np.abs(here))]
@@ -295,7 +292,9 @@ class GaussianCoder:
             width += [np.abs(other[rows]), np.abs(part.mean(other))]
         return np.stack(center), np.stack([*width, *(near[rows] for near in self.crowding[:2])])
 
-    def _scale_features(self, bright: Array, step: Array, part: Pass) -> tuple[Array, Array]:
+    def _scale_features(
+        self, bright: Doubles, step: Doubles, part: Pass
+    ) -> tuple[Doubles, Doubles]:
         """Return the features of s: small Gaussians are where many are."""
         rows, one = part.rows, np.ones(len(part.rows))
         center = [one, bright[rows], *(near[rows] for near in self.crowding)]
@@ -303,8 +302,8 @@ class GaussianCoder:
         return np.stack(center), np.stack([one, step[rows]])
 
     def _stretch_features(
-        self, bright: Array, s: Array, step: Array, part: Pass
-    ) -> tuple[Array, Array]:
+        self, bright: Doubles, s: Doubles, step: Doubles, part: Pass
+    ) -> tuple[Doubles, Doubles]:
         """Return the features of l."""
         rows, one = part.rows, np.ones(len(part.rows))
         center = [one, bright[rows], s[rows], self.crowding[1][rows], part.mean(self.values)]

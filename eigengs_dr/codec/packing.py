@@ -12,9 +12,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.arguments import takes_numbers
 from ..backend.arrays import types_of
-from ..backend.recording import exclusive
+from ..backend.doors import door
 from ..fitting.fit import Fit
 from ..fitting.maps import Map, read_maps
 from ..fitting.objective import values_in
@@ -66,8 +65,7 @@ class PackResult(NamedTuple):
     steps: Steps
 
 
-@exclusive()
-@takes_numbers
+@door
 def pack(
     gaussians: Gaussians | Fit,
     output: str | os.PathLike[str],

@@ -22,12 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.types import Doubles, Floats, Integers
 from ..gaussian.covariance import log_shapes
 from .exact_math import cos_turns, exp2, in_order, sin_turns
-
-Array = NDArray[np.floating]
-Double = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MAX_SYMBOL = 1 << 23
 """Bound of the integers; finer steps are not worth storing. Two cells differ by less than twice the
@@ -80,24 +77,24 @@ class Symbols(NamedTuple):
         Direction, from 0 to ``Shapes.turns - 1``.
     """
 
-    cell: IntArray
-    part: IntArray
-    color: IntArray
-    scale: IntArray
-    stretch: IntArray
-    turn: IntArray
+    cell: Integers
+    part: Integers
+    color: Integers
+    scale: Integers
+    stretch: Integers
+    turn: Integers
 
     def select(self, chosen: slice | NDArray[np.integer]) -> Symbols:
         """Return the Gaussians of a slice or of indices."""
         return Symbols(*(part[chosen] for part in self))
 
 
-def precision(color: IntArray) -> Double:
+def precision(color: Integers) -> Doubles:
     """Return Q, shape (N,), for colours (N, C) in steps."""
     return np.maximum(np.sqrt(in_order(np.square(color.T.astype(np.float64)))), MIN_PRECISION)
 
 
-def turns_of(stretch: Double, fineness: Double) -> IntArray:
+def turns_of(stretch: Doubles, fineness: Doubles) -> Integers:
     """Return the number of directions for stretches l and the Q of Gaussians, both (N,)."""
     with np.errstate(all="ignore"):
         wide = exp2(2 * LOG2E * stretch)
@@ -105,7 +102,7 @@ def turns_of(stretch: Double, fineness: Double) -> IntArray:
     return np.clip(turns, 1, MAX_TURNS).astype(np.int64)
 
 
-def factors_of(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Double) -> Double:
+def factors_of(scale: Integers, stretch: Integers, turn: Integers, fineness: Doubles) -> Doubles:
     """Return the factors a, b, c, shape (N, 3), for integers and Q, by exact arithmetic."""
     length = stretch * (STRETCH_STEP / fineness)
     angle = turn / turns_of(length, fineness)
@@ -117,7 +114,7 @@ def factors_of(scale: IntArray, stretch: IntArray, turn: IntArray, fineness: Dou
         return np.stack([a * size, odd * sin_turns(angle) / a * size, size / a], axis=1)
 
 
-def parts_of(factor: Array, fineness: Array, cell: float) -> IntArray:
+def parts_of(factor: Floats, fineness: Floats, cell: float) -> Integers:
     """Return the parts of the sides of each cell, shape (N, 2)."""
     with np.errstate(all="ignore"):
         unit = fineness * (cell / MEAN_STEP)
@@ -125,7 +122,7 @@ def parts_of(factor: Array, fineness: Array, cell: float) -> IntArray:
     return np.clip(np.nan_to_num(parts, nan=1.0), 1, MAX_PARTS).astype(np.int64)
 
 
-def quantize(arrays: dict[str, Array], steps: Steps, dead_zone: float = 0.0) -> Symbols:
+def quantize(arrays: dict[str, Floats], steps: Steps, dead_zone: float = 0.0) -> Symbols:
     """Round Gaussians to integers.
 
     Parameters
@@ -171,7 +168,7 @@ def quantize(arrays: dict[str, Array], steps: Steps, dead_zone: float = 0.0) -> 
     )
 
 
-def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
+def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Floats]:
     """Return mean (N, 2), factor (N, 3) and color (N, C) for integers.
 
     Numbers of hostile files may overflow to infinity or zero.
@@ -188,13 +185,13 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Array]:
         }
 
 
-def _place(values: Array, parts: IntArray) -> tuple[IntArray, IntArray]:
+def _place(values: Floats, parts: Integers) -> tuple[Integers, Integers]:
     """Return the cells of coordinates, and the parts of the cells."""
     cell = _whole("mean", np.floor(values))
     return cell, np.clip((values - cell) * parts, 0, parts - 1).astype(np.int64)
 
 
-def _whole(name: str, counts: Array) -> IntArray:
+def _whole(name: str, counts: Floats) -> Integers:
     """Round numbers of steps to integers; for errors see `quantize`."""
     if not (np.abs(counts) < MAX_SYMBOL).all():
         raise ValueError(

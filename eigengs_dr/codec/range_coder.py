@@ -12,13 +12,10 @@ from functools import cache
 
 import numpy as np
 from constriction import stream
-from numpy.typing import NDArray
 
+from ..backend.types import Doubles, Integers
 from ..storage.npz import BadValue
 from .exact_math import exp2, log2
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 REACH = 64
 """Half the number of symbols of a table; a number beyond them is escaped."""
@@ -44,7 +41,7 @@ TAILS = (2, 4, 8)
 UNIFORM = stream.model.Uniform()
 
 
-def categorical(probabilities: Array) -> stream.model.Model:
+def categorical(probabilities: Doubles) -> stream.model.Model:
     """Return a model of the integers from 0, with these probabilities up to a factor."""
     return stream.model.Categorical(np.asarray(probabilities, float), perfect=False)
 
@@ -52,11 +49,11 @@ def categorical(probabilities: Array) -> stream.model.Model:
 class Coder:
     """What both directions share: distributions made of `UNIFORM` and tables."""
 
-    def code(self, model: stream.model.Model, values: IntArray, *sizes: IntArray) -> IntArray:
+    def code(self, model: stream.model.Model, values: Integers, *sizes: Integers) -> Integers:
         """Code integers by one model of the library, and the sizes that it takes for each."""
         raise NotImplementedError
 
-    def uniform(self, sizes: IntArray, values: IntArray) -> IntArray:
+    def uniform(self, sizes: Integers, values: Integers) -> Integers:
         """Code integers from 0 to ``sizes - 1``, all equally likely; sizes up to 2^20."""
         result = np.zeros(len(sizes), np.int64)
         free = sizes > 1  # a range coder has no distribution of one value
@@ -64,7 +61,7 @@ class Coder:
             result[free] = self.code(UNIFORM, values[free], sizes[free].astype(np.int32))
         return result
 
-    def numbers(self, center: Array, width: Array, tails: int, values: IntArray) -> IntArray:
+    def numbers(self, center: Doubles, width: Doubles, tails: int, values: Integers) -> Integers:
         """Code integers with Student's distribution around centres.
 
         Parameters
@@ -95,13 +92,13 @@ class Coder:
             high[rows] += side * self._unbounded(side * (top[rows] - edge))
         return base + (high << shift) + self._low_bits(shift, low)
 
-    def _unbounded(self, values: IntArray) -> IntArray:
+    def _unbounded(self, values: Integers) -> Integers:
         """Code integers from 0 on: the number of bits, then the bits."""
         bits = np.frexp((values + 1).astype(np.float64))[1].astype(np.int64) - 1
         bits = self.uniform(np.full(len(values), MAX_BITS), bits)
         return (1 << bits) + self._low_bits(bits, values + 1 - (1 << bits)) - 1
 
-    def _low_bits(self, bits: IntArray, values: IntArray) -> IntArray:
+    def _low_bits(self, bits: Integers, values: Integers) -> Integers:
         """Code integers of known numbers of bits, all equally likely."""
         result = np.zeros(len(bits), np.int64)
         for first in range(0, int(bits.max(initial=0)), CHUNK):
@@ -117,7 +114,7 @@ class Encoder(Coder):
     def __init__(self) -> None:
         self._coder = stream.queue.RangeEncoder()
 
-    def code(self, model: stream.model.Model, values: IntArray, *sizes: IntArray) -> IntArray:
+    def code(self, model: stream.model.Model, values: Integers, *sizes: Integers) -> Integers:
         """Write integers; see `Coder.code`."""
         self._coder.encode(values.astype(np.int32), model, *sizes)
         return values
@@ -135,7 +132,7 @@ class Decoder(Coder):
             raise BadValue("the codes are no whole number of words")
         self._coder = stream.queue.RangeDecoder(np.frombuffer(data, "<u4").astype(np.uint32))
 
-    def code(self, model: stream.model.Model, values: IntArray, *sizes: IntArray) -> IntArray:
+    def code(self, model: stream.model.Model, values: Integers, *sizes: Integers) -> Integers:
         """Read as many integers as there are values; see `Coder.code`."""
         try:
             found = self._coder.decode(model, *(sizes or (len(values),)))
@@ -144,12 +141,12 @@ class Decoder(Coder):
         return np.asarray(found, np.int64)
 
 
-def _shift(kind: IntArray) -> IntArray:
+def _shift(kind: Integers) -> Integers:
     """Return the low bits of numbers of a class of widths, which have no table."""
     return np.maximum(0, -(-kind // PER_OCTAVE) - 3)
 
 
-@cache
+@cache  # some hundred models, each asked for with every number of its class
 def _student(label: int, tails: int) -> stream.model.Model:
     """Return the model of the high parts of numbers of a class, see `Coder.numbers`."""
     kind, offset = divmod(label, OFFSETS)
@@ -161,7 +158,7 @@ def _student(label: int, tails: int) -> stream.model.Model:
     return categorical(np.maximum(np.diff(below), 1e-7))
 
 
-def _student_cdf(t: Array, tails: int) -> Array:
+def _student_cdf(t: Doubles, tails: int) -> Doubles:
     """Return Student's distribution function for 2, 4 or 8 degrees of freedom."""
     x = t / np.sqrt(tails + t * t)
     square = x * x

@@ -6,14 +6,11 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..backend.types import Doubles, Integers
 from ..storage.npz import BadValue
 from .exact_math import in_order
 from .range_coder import TAILS
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MIN_WIDTH = 0.1
 """Smallest width of a distribution, in steps."""
@@ -39,8 +36,8 @@ class Weights(NamedTuple):
         One of `eigengs_dr.codec.range_coder.TAILS`.
     """
 
-    center: Array
-    width: Array
+    center: Doubles
+    width: Doubles
     tails: int
 
 
@@ -57,7 +54,7 @@ class Model:
     """
 
     weights: list[Weights] = field(default_factory=list)
-    sharpness: IntArray = field(default_factory=lambda: np.zeros(CLASSES, np.int64))
+    sharpness: Integers = field(default_factory=lambda: np.zeros(CLASSES, np.int64))
 
 
 def feature_counts(channels: int) -> list[tuple[int, int]]:
@@ -67,7 +64,7 @@ def feature_counts(channels: int) -> list[tuple[int, int]]:
 
 
 def fit_weights(
-    center: Array, width: Array, values: Array, step: Array, rich: bool = True
+    center: Doubles, width: Doubles, values: Doubles, step: Doubles, rich: bool = True
 ) -> Weights:
     """Return the weights for which numbers take few bits.
 
@@ -97,26 +94,26 @@ def fit_weights(
     return Weights(found, stored_width(parts * best[0]), best[1])
 
 
-def _fit_width(features: Array, error: Array, spread: Array) -> Array:
+def _fit_width(features: Doubles, error: Doubles, spread: Doubles) -> Doubles:
     """Return weights above 0 of features above 0 whose sum is near the absolute errors."""
     from scipy.optimize import nnls  # decoders need not wait for this import
 
     return np.asarray(nnls(features / spread[:, None], error / spread)[0])
 
 
-def _bits(error: Array, width: Array, tails: int) -> float:
+def _bits(error: Doubles, width: Doubles, tails: int) -> float:
     """Return about the bits that errors in steps take with a distribution."""
     t = error / width
     density = np.log2(width) + 0.5 * (tails + 1) * np.log2(1 + t * t / tails)
     return float(density.sum()) + len(t) * {2: 1.5, 4: 1.415, 8: 1.369}[tails]
 
 
-def stored_center(weights: Array) -> Array:
+def stored_center(weights: Doubles) -> Doubles:
     """Round weights to half precision, as in files."""
     return np.clip(np.nan_to_num(weights), -6e4, 6e4).astype(np.float16).astype(np.float64)
 
 
-def stored_width(weights: Array) -> Array:
+def stored_width(weights: Doubles) -> Doubles:
     """Round weights above 0 to half precision with two bits after the first, as in files."""
     half = np.clip(np.nan_to_num(weights), 0, 4e4).astype("<f2").view("<u2")
     return ((half + 0x80) & 0xFF00).astype("<u2").view("<f2").astype(np.float64)

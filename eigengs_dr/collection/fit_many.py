@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
-from ..backend.feedback import shows_progress
+from ..backend.progress import shows_progress
 from ..backend.selection import select
 from ..fitting.fit import Fit, fit_images
 from ..fitting.objective import is_codes

@@ -19,6 +19,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from ..backend.types import Record
 from ..gaussian.gaussians import Gaussians
 from ..storage.atomic import atomic_write, remove_stale
 from ..storage.locks import lock_folder
@@ -99,7 +100,7 @@ STATUSES = ("done", "skipped", "failed")
 KEYS = [*(field.name for field in fields(ImageRow) if field.name != "result"), "options"]
 """Keys of a row."""
 
-Row = dict[str, Any]
+Row = Record
 
 
 @contextmanager

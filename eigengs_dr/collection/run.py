@@ -18,12 +18,15 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ..backend.executor import Executor, executor_for
-from ..backend.feedback import defer_interrupts, warn
+from ..backend.executor import Executor
+from ..backend.interrupts import defer_interrupts
+from ..backend.messages import warn
+from ..backend.recording import exclusive
+from ..cluster.client import executor_for
 from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians
@@ -33,7 +36,7 @@ from ..image.pixels import EncodedImage
 from ..storage.atomic import refuse_url, require_writable
 from ..storage.settings import Settings
 from .manifest import ImageRow, Manifest, RowProgress, RunInterrupted, open_manifest
-from .sources import Images, Source, list_sources, plan_output
+from .sources import Images, RunImage, list_sources, plan_output
 
 WRITERS = 2
 """Threads that compress and write results: 5,000 Gaussians take 6 ms."""
@@ -103,7 +106,7 @@ def run_images(
     overwrite: bool,
     job: Job,
     progress: RowProgress | None = None,
-    client: Any = None,
+    client: object = None,
 ) -> list[ImageRow]:
     """Run a job; for arguments, rows and errors see `eigengs_dr.fit_many`.
 
@@ -121,9 +124,9 @@ def run_images(
         if progress:
             progress(len(rows), total, row)
 
-    def with_work() -> Iterator[Source]:
+    def with_work() -> Iterator[RunImage]:
         for source in sources:
-            planned: Source | ImageRow = source
+            planned: RunImage | ImageRow = source
             if source.error:
                 planned = source.row("failed", error=source.error)
             elif manifest:
@@ -179,14 +182,14 @@ def make_folder(output: str | os.PathLike[str]) -> Path:
 #  In this process: groups of images
 # ---------------------------------------------------------------------------------------------
 
-Decoded = tuple[Source, EncodedImage | Exception]
+Decoded = tuple[RunImage, EncodedImage | Exception]
 """An image that was read, or why it cannot be read."""
 
-Writing = tuple[Source, ImageRow, "Future[None] | None"]
+Writing = tuple[RunImage, ImageRow, "Future[None] | None"]
 """An image, and its file if that is being written."""
 
 
-def run_here(sources: Iterable[Source], job: Job) -> Generator[Finished, None, None]:
+def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None, None]:
     """Work on groups of images, and write each result while the next ones are computed.
 
     Yields
@@ -224,7 +227,7 @@ def run_here(sources: Iterable[Source], job: Job) -> Generator[Finished, None, N
         yield from (_finish(*entry) for entry in writing)
 
 
-def _decode(source: Source, job: Job) -> Decoded:
+def _decode(source: RunImage, job: Job) -> Decoded:
     """Read one image. An array is copied: its owner may overwrite it."""
     try:
         if job.keep_grey:
@@ -234,7 +237,7 @@ def _decode(source: Source, job: Job) -> Decoded:
         return source, error
 
 
-def _is_file(source: Source) -> bool:
+def _is_file(source: RunImage) -> bool:
     return source.path is not None
 
 
@@ -262,7 +265,9 @@ def _groups(decoded: Iterable[Decoded], job: Job) -> Iterator[list[Decoded]]:
         yield group
 
 
-def _work_on(group: list[Decoded], job: Job) -> Iterator[tuple[Source, ImageRow, Gaussians | None]]:
+def _work_on(
+    group: list[Decoded], job: Job
+) -> Iterator[tuple[RunImage, ImageRow, Gaussians | None]]:
     """Yield the rows of a group, with the Gaussians to write."""
     started = time.perf_counter()
     results = _results([image for _, image in group], job)
@@ -286,17 +291,18 @@ def _figures_of(row: ImageRow) -> FitFigures | None:
     return FitFigures(row.psnr_ycbcr, row.psnr_rgb, row.iterations or 0, name)
 
 
-def _results(images: list[Any], job: Job) -> list[Any]:
+def _results(images: list, job: Job) -> list:
     """Return the results of a group; if it fails, its images say one by one what is wrong."""
     if isinstance(images[0], Exception):
         return images
     try:
-        return list(job.work(images))
+        with exclusive():  # for a group, so that other threads wait for no folder
+            return list(job.work(images))
     except FAILURES as error:
         return [error] if len(images) == 1 else [_results([image], job)[0] for image in images]
 
 
-def _failed(source: Source, error: Exception) -> ImageRow:
+def _failed(source: RunImage, error: Exception) -> ImageRow:
     """Return the row of an image that failed; its result is the error."""
     name, text = str(source.path or source.name), str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename is not None:
@@ -310,7 +316,7 @@ def _is_written(entry: Writing) -> bool:
     return entry[2] is None or entry[2].done()
 
 
-def _finish(source: Source, row: ImageRow, file: Future[None] | None) -> Finished:
+def _finish(source: RunImage, row: ImageRow, file: Future[None] | None) -> Finished:
     """Wait for the file of a result; a file that cannot be written is an error of the image."""
     try:
         if file:
@@ -344,7 +350,7 @@ done."""
 
 
 def run_on_workers(
-    sources: Iterable[Source], job: Job, executor: Executor, total: int | None, keep: bool
+    sources: Iterable[RunImage], job: Job, executor: Executor, total: int | None, keep: bool
 ) -> Generator[Finished, None, None]:
     """Work on images by an executor.
 
@@ -370,7 +376,7 @@ def run_on_workers(
     ClusterError
         If the cluster is lost.
     """
-    again: list[Source] = []
+    again: list[RunImage] = []
     chunks = _cut(sources, job, total, executor.workers), ([source] for source in again)
     for last, tasks in enumerate(chunks):
         with closing(executor.map(run_chunk, tasks, (job, keep, Path.cwd()))) as ended:
@@ -385,14 +391,14 @@ def run_on_workers(
                         yield entry
 
 
-def _lost(source: Source, lost: str) -> Finished:
+def _lost(source: RunImage, lost: str) -> Finished:
     """Return an image whose chunk has ended its worker."""
     error = f"{source.path or source.name}: {lost}"
     return Finished(source.place, source.row("failed", error=error), may_pass=True)
 
 
 def run_chunk(
-    chunk: list[Source], shared: tuple[Job, bool, Path]
+    chunk: list[RunImage], shared: tuple[Job, bool, Path]
 ) -> tuple[list[Finished], list[str]]:
     """Work on the images of a chunk, on a worker; return what became of them, and its warnings.
 
@@ -409,20 +415,20 @@ def run_chunk(
     return finished, [str(n.message) for n in caught if issubclass(n.category, UserWarning)]
 
 
-def _absolute(source: Source, folder: Path) -> Source:
+def _absolute(source: RunImage, folder: Path) -> RunImage:
     """Name files from the root: a worker runs in another folder."""
     image = folder / source.image if isinstance(source.image, Path) else source.image
     return source._replace(image=image, output=source.output and folder / source.output)
 
 
 def _cut(
-    sources: Iterable[Source], job: Job, total: int | None, workers: int
-) -> Iterator[list[Source]]:
+    sources: Iterable[RunImage], job: Job, total: int | None, workers: int
+) -> Iterator[list[RunImage]]:
     """Cut the images into chunks.
 
     The last ones are shorter, so that all workers end at about the same time.
     """
-    chunk: list[Source] = []
+    chunk: list[RunImage] = []
     work = 0
     for source in sources:
         if source.path is None:  # a copy, as its owner may reuse it
@@ -439,7 +445,7 @@ def _cut(
         yield chunk
 
 
-def _work_of(source: Source, steps: int) -> int:
+def _work_of(source: RunImage, steps: int) -> int:
     """Return the pixels of an image times its steps, as far as they are known."""
     steps += FIRST_STEPS
     if source.path is None:

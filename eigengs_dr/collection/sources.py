@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..backend.types import Record
 from ..gaussian.file import read_figures, read_head
 from ..image.folder import list_images
 from ..image.remote import is_url, stem_of
@@ -19,7 +20,7 @@ Images = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | ArrayLike]
 """A folder, a glob, a URL of one of them, or any iterable of image files, their URLs and arrays."""
 
 
-class Source(NamedTuple):
+class RunImage(NamedTuple):
     """One image of a run.
 
     Attributes
@@ -52,7 +53,7 @@ class Source(NamedTuple):
         return ImageRow(self.name, status, self.path, self.output, **figures)
 
 
-def list_sources(images: Images) -> Iterable[Source]:
+def list_sources(images: Images) -> Iterable[RunImage]:
     """Name the images of a run.
 
     Parameters
@@ -63,7 +64,7 @@ def list_sources(images: Images) -> Iterable[Source]:
 
     Returns
     -------
-    iterable of Source
+    iterable of RunImage
         A list, if `images` has a length; else an iterator that reads `images` when it is read. In
         an iterator, an image whose name is taken has an error.
 
@@ -87,9 +88,9 @@ def list_sources(images: Images) -> Iterable[Source]:
     return sources
 
 
-def _name_each(images: Iterable[Any]) -> Iterator[Source]:
+def _name_each(images: Iterable) -> Iterator[RunImage]:
     """Name images one by one; a name that is taken is an error of the image."""
-    taken: dict[str, Any] = {}
+    taken: Record = {}
     for place, image in enumerate(images):
         is_file = isinstance(image, (str, os.PathLike))
         item = Path(image) if is_file and not is_url(image) else image
@@ -98,15 +99,15 @@ def _name_each(images: Iterable[Any]) -> Iterator[Source]:
         if name in taken:
             error = f"{item if is_file else name}: {taken[name]} has this name too; rename one"
         taken.setdefault(name, item if is_file else f"image {place}")
-        yield Source(place, name, item, error=error)
+        yield RunImage(place, name, item, error=error)
 
 
-def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source | ImageRow:
+def plan_output(source: RunImage, manifest: Manifest, overwrite: bool) -> RunImage | ImageRow:
     """Give a source its output file, or return its row if there is no work on it.
 
     Parameters
     ----------
-    source : Source
+    source : RunImage
     manifest : Manifest
         The manifest of the output folder.
     overwrite : bool
@@ -129,7 +130,7 @@ def plan_output(source: Source, manifest: Manifest, overwrite: bool) -> Source |
     if overwrite or row.get("status") == "failed":
         return source
     width, height = head.size
-    figures: dict[str, Any] = {"width": width, "height": height, "gaussians": head.gaussians}
+    figures: Record = {"width": width, "height": height, "gaussians": head.gaussians}
     if fit := read_figures(output):
         figures |= {k: v for k, v in fit._asdict().items() if k != "source"}
     return source.row("skipped", **figures)

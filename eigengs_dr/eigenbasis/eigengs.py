@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arguments import takes_numbers
-from ..backend.feedback import shows_progress, to_html
-from ..backend.recording import exclusive
+from ..backend.notebook import to_html
+from ..backend.progress import shows_progress
+from ..backend.types import Record
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from ..image.pixels import EncodedImage
@@ -29,7 +30,7 @@ from .pca.truncation import TruncationCurve, curve_from_eigenvalues, name_compon
 if TYPE_CHECKING:  # what trains, encodes and runs over many images is imported where it is called
     from ..collection.manifest import ImageRow
     from ..collection.sources import Images
-    from ..image.folder import Source
+    from ..image.folder import TrainingImages
     from .encoder import Encoder
     from .pca.basis import Eigenbasis
 
@@ -81,7 +82,7 @@ class EigenGS:
     @takes_numbers
     def fit(
         cls,
-        basis: Eigenbasis | Source,
+        basis: Eigenbasis | TrainingImages,
         gaussians: int = 5000,
         frequency_aware: bool | str = "auto",
         seed: int = 0,
@@ -156,7 +157,6 @@ class EigenGS:
             return None
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
-    @exclusive()
     @takes_numbers
     def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
         """Find the coefficients of an image by least squares on the rendered components.
@@ -190,7 +190,6 @@ class EigenGS:
         """
         return self.encoder.project(check_image(image, copy=False), target_psnr)
 
-    @exclusive()
     def reconstruct(
         self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
     ) -> Gaussians:
@@ -210,7 +209,6 @@ class EigenGS:
         """
         return self.encoder.reconstruct(coefficients, size)
 
-    @exclusive()
     @takes_numbers
     def encode(
         self,
@@ -255,7 +253,7 @@ class EigenGS:
         mean: str = "gaussians",
         target_psnr: float | None = None,
         progress: Any = None,
-        client: Any = None,
+        client: object = None,
     ) -> list[ImageRow]:
         """Encode many images; a bad image is a row with its error and does not end the run.
 
@@ -319,7 +317,7 @@ class EigenGS:
             raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
         return cls(**read_members(path, backend))
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Record:
         """Leave the encoder here: what it has computed holds arrays of Dr.Jit."""
         return {key: value for key, value in self.__dict__.items() if key != "encoder"}
 
@@ -331,7 +329,6 @@ class EigenGS:
         return Encoder(self.gaussians, self.weights, self.mean_image, self.low)
 
 
-@exclusive()
 def _encode_all(
     images: list[EncodedImage], model: EigenGS, options: tuple[str, str, float | None]
 ) -> list[Gaussians]:
@@ -339,6 +336,6 @@ def _encode_all(
     return [model.encode(image, *options) for image in images]
 
 
-@cache
+@cache  # a file of the package does not change
 def _shipped(name: str, backend: str | None) -> EigenGS:
     return EigenGS(**read_members(SHIPPED[name], backend))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, solve_triangular
 
+from ..backend.doors import class_of_doors
 from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET, to_planes
@@ -27,6 +28,7 @@ Planes = NDArray[np.float32]
 Columns = NDArray[np.float64]
 
 
+@class_of_doors
 @dataclass(frozen=True, eq=False)
 class Encoder:
     """What images of one model share, and the functions that need it.

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.types import Record
 from ..gaussian.file import CUTOFF, SetData, check
 from ..gaussian.gaussians import Gaussians
 from ..storage import npz
@@ -63,7 +64,7 @@ def write_model(path: str | os.PathLike[str], model: EigenGS) -> None:
     npz.write(path, FORMAT, VERSION, members)
 
 
-def read_members(path: str | os.PathLike[str], backend: str | None) -> dict[str, Any]:
+def read_members(path: str | os.PathLike[str], backend: str | None) -> Record:
     """Read a file, and return the arguments of `eigengs_dr.EigenGS`; see `EigenGS.load`."""
     version = npz.read_version(path, FORMAT, VERSION)
     arrays = npz.read(path, FORMAT, VERSION, LAYOUT_V1 if version < 2 else LAYOUT)
@@ -104,7 +105,7 @@ def to_members(model: EigenGS) -> dict[str, NDArray]:
     return members
 
 
-def from_members(arrays: dict[str, NDArray], backend: str | None) -> dict[str, Any]:
+def from_members(arrays: dict[str, NDArray], backend: str | None) -> Record:
     """Check the arrays of a file and convert them to the arguments of `eigengs_dr.EigenGS`.
 
     Errors as for `check_members`.

@@ -8,12 +8,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.feedback import defer_interrupts, warn
+from ..backend.interrupts import defer_interrupts
+from ..backend.messages import warn
+from ..backend.types import Record
 from ..image.folder import list_images
 from ..image.io import ImageError, check_image
 from ..image.metrics import psnr
@@ -57,7 +59,7 @@ class Training(NamedTuple):
 
     model: EigenGS
     basis: Eigenbasis
-    figures: dict[str, Any]
+    figures: Record
 
 
 def train(
@@ -66,7 +68,7 @@ def train(
     settings: TrainOptions,
     backend: str | None = None,
     progress: StageProgress = lambda stage, done, total: None,
-    client: Any = None,
+    client: object = None,
 ) -> Training:
     """Train a model on a folder of images and write it.
 
@@ -148,7 +150,7 @@ class Run(NamedTuple):
     progress: StageProgress
     interrupted: Callable[[], bool]
     held_out: Sequence[Path | str]
-    client: Any = None
+    client: object = None
 
     def stop_if_interrupted(self) -> None:
         """Raise `Interrupted` after Ctrl-C."""
@@ -163,7 +165,7 @@ def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
     if (path := checkpoint.folder / "basis.npz").exists():
         return Eigenbasis.load(path)
 
-    def advance(done: int, total: int | None, row: dict[str, Any]) -> None:
+    def advance(done: int, total: int | None, row: Record) -> None:
         run.progress("components", done, len(files))
         run.stop_if_interrupted()
 
@@ -196,7 +198,7 @@ def _model(basis: Eigenbasis, run: Run) -> EigenGS:
     run.progress("weights", 0, 1)
     saved = time.perf_counter()
 
-    def advance(step: int, steps: int, row: dict[str, Any]) -> None:
+    def advance(step: int, steps: int, row: Record) -> None:
         if steps:
             run.progress("shapes", step, steps)
 

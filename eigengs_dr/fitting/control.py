@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import Float, make_divisor, types_of
+from ..backend.arrays import Float, make_divisor, types_of, upload
 from ..raster.kernels import sum_by_image
-from .exchange import among, exchange, exchange_levels
-from .placement.adaptive import redistribute
+from .exchange import among, blend, exchange, exchange_levels
+from .placement.adaptive import place_adaptive, redistribute
 from .placement.density import squared_error
+from .solvers.conjugate_gradient import solve
 
 if TYPE_CHECKING:
     from .descent import State
@@ -147,8 +148,12 @@ class Redistribute:
         if objective.levels or objective.part:
             return state
         current, count = dr.detach(state.gaussians), state.count + state.surplus
-        anew = redistribute(current, objective, count, self.solve_steps)
-        if state.chosen:
+        if not state.chosen:
+            anew = redistribute(current, objective, count, self.solve_steps)
+        else:
+            anew = solve(
+                place_adaptive(objective, count, current.cutoff), objective, self.solve_steps
+            )
             before, after = (dr.sum(squared_error(g, objective))[0] for g in (current, anew))
             if before <= self.useless * after:
                 return state
@@ -242,6 +247,55 @@ class Perturb:
 
 def _ends(own: slice) -> tuple[int, int]:
     return own.start, own.stop
+
+
+@dataclass(frozen=True)
+class Retreat:
+    """Returns to where the optimiser started, at lower rates, if the error has risen since.
+
+    It comes before the other controls. The steps of its checks double, so that rates which are far
+    too high do little harm.
+
+    Attributes
+    ----------
+    factor : float
+        Factor of all learning rates after a return.
+    first : int
+        Steps before the first check.
+    """
+
+    factor: float = 0.4
+    first: int = 10
+
+    def steps(self, iterations: int) -> list[int]:
+        """Return the steps of the checks.
+
+        Examples
+        --------
+        >>> Retreat().steps(300)
+        [10, 20, 40, 80, 160]
+        """
+        return [self.first << k for k in range(32) if self.first << k < iterations]
+
+    def __call__(
+        self, state: State, objective: Pixels, step: int, iterations: int, key: int
+    ) -> State:
+        """Return the state, or for images whose error has risen, the one to return to."""
+        if objective.levels or objective.part or state.fixed is None:
+            return state
+        images, current = objective.grid.images, dr.detach(state.gaussians)
+        errors = [
+            sum_by_image(squared_error(g, objective), objective.grid)
+            for g in (state.fixed, current)
+        ]
+        before, after = (error.numpy() for error in errors)
+        risen = ~(after <= before)
+        if not risen.any():
+            return state
+        returns = upload(types_of(current.mean).Float, np.repeat(risen, state.total))
+        current = blend(state.fixed, current, returns)
+        speed = np.array(state.speed or [1.0] * images) * np.where(risen, self.factor, 1.0)
+        return replace(state.replaced(current), speed=tuple(speed.tolist()))
 
 
 SHAPE_SHARE = 0.5

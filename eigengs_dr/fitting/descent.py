@@ -41,6 +41,8 @@ class Moving(NamedTuple):
         The state of the optimiser for each variable.
     time : Float, shape (1,)
         Steps since the optimiser started.
+    speed : Float, shape (1,) or (N,)
+        Factor of all learning rates.
     packed : Float
         The parameters of the set for the kernels.
     rate_scale : Float or None
@@ -50,6 +52,7 @@ class Moving(NamedTuple):
     variables: Variables
     moments: dict[str, tuple]
     time: Float
+    speed: Float
     packed: Float
     rate_scale: Float | None
 
@@ -70,8 +73,11 @@ class State:
         Whether the user chose the Gaussians: controls then move them only for the better.
     squares : Float or None, shape (images,)
         The sums of ``h (p - t)^2`` that a control has measured before this step.
+    speed : tuple of float
+        Factor of all learning rates, for each image; () for 1.
     fixed : Gaussians or None
-        The set whose variables move; None until the next step, which starts the optimiser.
+        The set at which the optimiser started, whose variables move; None until the next step,
+        which starts the optimiser.
     moving : Moving or None
     since : int
         The step at which the optimiser started.
@@ -86,6 +92,7 @@ class State:
     surplus: int = 0
     chosen: bool = False
     squares: Float | None = None
+    speed: tuple[float, ...] = ()
     fixed: Gaussians | None = None
     moving: Moving | None = None
     since: int = 0
@@ -94,8 +101,7 @@ class State:
 
     def replaced(self, gaussians: Gaussians) -> State:
         """Return the state with another set, from which the optimiser starts anew."""
-        nothing = {"fixed": None, "moving": None, "lists": ()}
-        return replace(self, gaussians=gaussians, **nothing)
+        return replace(self, gaussians=gaussians, fixed=None, moving=None, lists=())
 
     @property
     def total(self) -> int:
@@ -134,7 +140,6 @@ def descend(
     """
     part = range(iterations) if part is None else part
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
-    changes = sorted({*(step for _, steps in acts for step in steps), part.stop})
     factors, largest = method.rate_factors(iterations, state.chosen), 0
     rates = rate_table(objective.types, method, factors)
     with release_later(state), freeze_program(step_program(objective, method)) as take_step:
@@ -145,9 +150,8 @@ def descend(
             if state.moving is None:
                 state = started(state, method, step, objective.grid.images)
             if not state.lists or step >= state.until:
-                end = next(change for change in changes if change > step)
-                state = _listed(state, objective, method, factors, step, end)
-            largest = max(largest, len(state.fixed))
+                state = _listed(state, objective, method, factors, step, part.stop)
+            largest = max(largest, len(state.gaussians))
             moving, moved = take_step(
                 largest,
                 state.moving,
@@ -190,7 +194,13 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
         color = [row + zeros for row in gaussians.color]
         scale = rate_scale_of(color, method.rate_exponent, images)
         dr.eval(scale)
-    moving = Moving(variables, moments, dr.opaque(types.Float, 0), pack(gaussians), scale)
+    speed = upload(types.Float, np.array(state.speed or (1.0,)))
+    if len(state.speed) > 1:
+        image, _ = make_divisor(types, state.total).divmod(dr.arange(types.UInt, len(gaussians)))
+        speed = dr.gather(types.Float, speed, image)
+        dr.eval(speed)
+    time = dr.opaque(types.Float, 0)
+    moving = Moving(variables, moments, time, speed, pack(gaussians), scale)
     return replace(state, fixed=gaussians, moving=moving, since=step, lists=())
 
 
@@ -204,7 +214,8 @@ def _listed(
 ) -> State:
     """Make the tile lists of the current set; they last until `end`, or until it moved too far."""
     assert state.fixed is not None and state.moving is not None
-    until, moves = next_build(method, factors, step, end, state.since)
+    slowed = [factor * max(state.speed, default=1.0) for factor in factors]
+    until, moves = next_build(method, slowed, step, end, state.since)
     pad, growth = method.coordinates.reach(state.fixed, moves)
     if state.moving.rate_scale is not None:
         pad *= state.moving.rate_scale
@@ -324,7 +335,7 @@ def _move(
     Float, coordinates = type(moving.packed), method.coordinates
     slopes = _pull_back(coordinates, fixed, moving.variables, gradient, size)
     time = moving.time + 1
-    warm = dr.minimum(time * (1 / max(1, method.warm_up)), 1)
+    warm = dr.minimum(time * (1 / max(1, method.warm_up)), 1) * moving.speed
     variables, moments = {}, {}
     for k, name in enumerate(method.rates):
         rate = dr.gather(Float, rates, index * len(method.rates) + k) * warm
@@ -335,7 +346,7 @@ def _move(
         )
     variables = coordinates.project(fixed, variables, size)
     moved = coordinates.decode(fixed, variables, size)
-    return Moving(variables, moments, time, pack(moved), moving.rate_scale), moved
+    return Moving(variables, moments, time, moving.speed, pack(moved), moving.rate_scale), moved
 
 
 def _sum_level(parts: Float, lists: TileLists, channels: int, count: int) -> list:

@@ -238,7 +238,20 @@ def in_order(gaussians: Gaussians, images: int = 1) -> Gaussians:
     """
     grid = Grid(gaussians.width, gaussians.height, images=images)
     canvas = Canvas.of(types_of(gaussians.mean), grid)
-    return take(gaussians, order_along_hilbert(canvas, gaussians.mean))
+    x, y = gaussians.mean
+    return take(gaussians, order_along_hilbert(canvas, (x, y)))
+
+
+def blend(one: Gaussians, other: Gaussians, share: Float) -> Gaussians:
+    """Return the Gaussians of one set where a share (N,) is 1, and of another where it is 0.
+
+    Backgrounds do not move in a descent, so both have the same.
+    """
+    rows = {}
+    for name in ("mean", "factor", "color"):
+        a, b = (getattr(g, name) for g in (one, other))
+        rows[name] = type(a)([dr.select(share > 0, u, v) for u, v in zip(a, b, strict=True)])
+    return replace(other, **rows)
 
 
 def _core(objective: Pixels, part: Part) -> Float:

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.arguments import takes_numbers
-from ..backend.feedback import defer_interrupts, shows_progress, to_html
-from ..backend.recording import exclusive
+from ..backend.doors import door
+from ..backend.interrupts import defer_interrupts
+from ..backend.notebook import to_html
+from ..backend.progress import shows_progress
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians, scale_channels
@@ -123,7 +124,7 @@ class FitInterrupted(KeyboardInterrupt):
 
 @named_options
 @shows_progress
-@takes_numbers
+@door
 def fit(
     image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map],
     gaussians: int | Sequence[int] | None = None,
@@ -261,7 +262,6 @@ def fit(
     return replace(found, source=source)
 
 
-@exclusive()
 def fit_images(
     images: Sequence[PixelsOrPath],
     options: FitOptions,
@@ -293,8 +293,9 @@ def fit_images(
                 start = fitted(start, data[0].affine)
             moves = options.iterations > 0
             objective, begun = start_from(start, objective, options.method, pixels[0], moves)
-            if options.method.needs_model:
-                mean_image = options.method.mean_image(start, width, height)
+            base = objective.pictures[0].base
+            if base is not None:
+                mean_image = objective.picture(base).numpy()
 
         def score(gaussians: Gaussians) -> list[Row]:
             seconds = (time.perf_counter() - started) / len(images)
@@ -312,7 +313,6 @@ def fit_images(
     return _finished(found, affines, mean_image, started, seconds_init)
 
 
-@exclusive()
 def fit_maps(
     images: list[MapImage],
     options: FitOptions,

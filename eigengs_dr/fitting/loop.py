@@ -154,7 +154,7 @@ def refine(
         to end the refinement.
     interrupted : callable, optional
         Called before every step; True ends the refinement. See
-        `eigengs_dr.backend.feedback.defer_interrupts`.
+        `eigengs_dr.backend.interrupts.defer_interrupts`.
 
     Returns
     -------

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import Float, types_of
-from ..backend.recording import exclusive, record
+from ..backend.recording import record
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import (
     RGB_TO_YCBCR,
@@ -43,7 +43,6 @@ Row: TypeAlias = dict[str, Any]
 """A row of a trace: its numbers by name, and under "maps" those of every map."""
 
 
-@exclusive()
 def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float64]:
     """Compute the PSNRs of a set, as `eigengs_dr.psnr` does of its picture.
 
@@ -102,7 +101,9 @@ def _squared_errors(
         return [values[k * channels : (k + 1) * channels] for k in range(length)]
 
     pixels, inside = read(rendered), pixels_inside(types, grid)
-    floats, codes, areas = [], [], []
+    floats: list[Float] = []
+    codes: list[Float] = []
+    areas: list[Float] = []
     for space, first, image, scale, offset, weight, base in pictures:
         a, b = spread(scale, owner), spread(offset, owner)
         totals = [types.Float(0)] * 3

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..backend.arguments import plain_numbers
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
-from .control import Perturb, Redistribute, Relocate, Surplus
+from .control import Perturb, Redistribute, Relocate, Retreat, Surplus
 from .optimizer import Adam, Optimizer
 from .place import Adaptive, Placement
 from .solvers.conjugate_gradient import solve
@@ -47,11 +47,13 @@ class Model(Protocol):
     def gaussians(self) -> Gaussians:
         """Gaussians at the native size of the model."""
 
-    def encode(self, image: NDArray[np.float32], colors: str = "exact") -> Gaussians:
+    def encode(
+        self, image: NDArray[np.float32], colors: str = "exact", mean: str = "gaussians"
+    ) -> Gaussians:
         """Return the set of an image at the size of the image."""
 
     def dense_mean(self, width: int, height: int) -> NDArray[np.float32]:
-        """Return the pixels (height, width, C) of the mean image, in the space of the set."""
+        """Return the pixels (height, width, C) that a set of the mean "dense" lacks."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ class Method:
 
 DEFAULT = Method(
     place=Adaptive(),
-    controls=(Surplus(), Redistribute(), Relocate(), Perturb()),
+    controls=(Retreat(), Surplus(), Redistribute(), Relocate(), Perturb()),
     optimizer=Adam(0.9, 0.9, 1e-12),
     rates={"mean": 0.4, "factor": 0.22, "color": 0.0115},
     coordinates=Relative(),

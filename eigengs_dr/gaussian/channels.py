@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..image.color import SPACES, decode, from_sum, to_picture
 from ..storage.npz import BadValue
 
-MAX_CHANNELS = 16
+MAX_MAP_CHANNELS = 16
 """Largest number of channels of all maps together: a program holds the sums of all channels of a
 block of pixels in registers."""
 
@@ -89,9 +89,9 @@ def check_maps(maps: Sequence[TextureMap], channels: int) -> None:
     if not maps or len(set(names)) < len(names):
         raise BadValue(f"maps are {', '.join(names) or 'none'}; give each name once")
     total = sum(m.channels for m in maps)
-    if total > MAX_CHANNELS:
+    if total > MAX_MAP_CHANNELS:
         raise BadValue(
-            f"the maps have {total} channels, at most {MAX_CHANNELS} share shapes; make two "
+            f"the maps have {total} channels, at most {MAX_MAP_CHANNELS} share shapes; make two "
             "materials"
         )
     if total != channels:

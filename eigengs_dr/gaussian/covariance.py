@@ -11,12 +11,11 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import Float, rsqrt
+from ..backend.arrays import rsqrt
+from ..backend.types import Float, Floats
 
-Array = NDArray[np.floating]
 
-
-def factor_from_covariance(xx: Array, xy: Array, yy: Array) -> NDArray[np.float64]:
+def factor_from_covariance(xx: Floats, xy: Floats, yy: Floats) -> NDArray[np.float64]:
     """Return the factors of covariances: ``F^T F = Sigma^-1``.
 
     Parameters
@@ -33,7 +32,7 @@ def factor_from_covariance(xx: Array, xy: Array, yy: Array) -> NDArray[np.float6
     return np.stack([a, -xy / yy * a, 1 / np.sqrt(yy)], axis=-1).astype(np.float64)
 
 
-def max_deviation(a: Array, b: Array, c: Array) -> NDArray[np.float64]:
+def max_deviation(a: Floats, b: Floats, c: Floats) -> NDArray[np.float64]:
     """Return the largest standard deviation of each Gaussian: the root of the larger eigenvalue.
 
     Parameters
@@ -52,7 +51,7 @@ def max_deviation(a: Array, b: Array, c: Array) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(middle + root), np.float64)
 
 
-def outline(factor: Array, points: int = 25) -> NDArray[np.float64]:
+def outline(factor: Floats, points: int = 25) -> NDArray[np.float64]:
     """Return points of the ellipses at one standard deviation, relative to the mean.
 
     Parameters
@@ -80,7 +79,7 @@ def outline(factor: Array, points: int = 25) -> NDArray[np.float64]:
 # ---------------------------------------------------------------------------------------------
 
 
-def log_shapes(factor: Array) -> NDArray[np.float64]:
+def log_shapes(factor: Floats) -> NDArray[np.float64]:
     """Return the matrix logarithms ``1/2 log(F^T F) = [[s + u, v], [v, s - u]]``.
 
     Parameters

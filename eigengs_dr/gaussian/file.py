@@ -1,4 +1,4 @@
-"""The file of a set of Gaussians, the checks of a set, its maps, and the part of a region."""
+"""The file of a set of Gaussians, the checks of a set, and its maps."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..backend.feedback import printable
+from ..backend.messages import printable
+from ..backend.types import Arrays
 from ..image.color import MAX_CHANNELS, SPACES
 from ..image.formats import SUFFIXES
 from ..storage import npz
-from ..storage.atomic import reader_of
 from ..storage.npz import BadValue, Field
-from .channels import MAX_CHANNELS as MAX_MAPS
-from .channels import TextureMap, check_maps, find_map
+from . import packed
+from .channels import MAX_MAP_CHANNELS, TextureMap, check_maps, find_map
 
 FORMAT = "eigengs_dr.gaussians"
 MATERIAL = "eigengs_dr.material"
@@ -35,7 +34,7 @@ MAX_CUTOFF = 12.0
 """Largest cutoff, in standard deviations. The fast exponential needs a bound, and ``exp(-72)`` is
 below single precision."""
 
-MAX_SIDE = 1 << 16
+MAX_SET_SIDE = 1 << 16
 """Largest side of a set in pixels: a mean in single precision then has 1/128 pixel or less."""
 
 MAX_SUM = 1e18
@@ -64,10 +63,10 @@ CUTOFF_FIELD = {"cutoff": Field("f8", 0)}
 """What version 2 added."""
 
 MAPS: dict[str, Field] = {
-    "names": Field("U", 1, MAX_MAPS),
-    "spaces": Field("U", 1, MAX_MAPS),
-    "channels": Field("i8", 1, MAX_MAPS),
-    "weights": Field("f8", 1, MAX_MAPS),
+    "names": Field("U", 1, MAX_MAP_CHANNELS),
+    "spaces": Field("U", 1, MAX_MAP_CHANNELS),
+    "channels": Field("i8", 1, MAX_MAP_CHANNELS),
+    "weights": Field("f8", 1, MAX_MAP_CHANNELS),
 }
 """Arrays of a file with maps, in the place of the space."""
 
@@ -76,8 +75,6 @@ FIGURES: dict[str, Field] = {"figures": Field("f8", 1, 3), "source": Field("U", 
 
 MAX_SOURCE = 64
 """Characters of the name of an image that a file keeps: its last."""
-
-Arrays = dict[str, NDArray[Any]]
 
 
 class SetData(NamedTuple):
@@ -228,10 +225,7 @@ def _properties(found: Arrays) -> tuple[tuple[int, int], str, float, tuple[Textu
 
 def maps_of(path: Path) -> tuple[TextureMap, ...]:
     """Return the maps of a file, ``.npz`` or ``.egs``; none for one image. Errors as `read`."""
-    if reader := reader_of(path):
-        maps: tuple[TextureMap, ...] = reader.read_maps(path)
-        return maps
-    return read_head(path).maps
+    return packed.read_maps(path) if packed.is_packed(path) else read_head(path).maps
 
 
 def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
@@ -276,8 +270,8 @@ def read_figures(path: Path) -> FitFigures | None:
 def read(path: Path, sections: int | None = None) -> SetData:
     """Read and check a set; parameters and errors as for `eigengs_dr.Gaussians.load`."""
     with _errors_of(path):
-        if reader := reader_of(path):
-            data: SetData = reader.read_set(path, sections)
+        if packed.is_packed(path):
+            data = packed.read_set(path, sections)
         elif sections is not None:
             raise BadValue("has no sections; pass sections only for .egs files")
         else:
@@ -292,7 +286,7 @@ def check(data: SetData) -> None:
 
     This one function decides for files that are read and written, and for arrays. Shapes must fit
     each other, the space and the maps. Values must be finite, a and c positive, colours within
-    `MAX_SUM`, sides from 1 to `MAX_SIDE` pixels, and the cutoff in (0, `MAX_CUTOFF`].
+    `MAX_SUM`, sides from 1 to `MAX_SET_SIDE` pixels, and the cutoff in (0, `MAX_CUTOFF`].
     """
     arrays, size, space, cutoff, maps = data
     mean, factor, color = arrays["mean"], arrays["factor"], arrays["color"]
@@ -324,8 +318,8 @@ def check(data: SetData) -> None:
 
 def check_sides(size: tuple[int, ...]) -> None:
     """Raise `BadValue` unless a size is two sides that a set can have."""
-    if len(size) != 2 or not all(1 <= side <= MAX_SIDE for side in size):
-        raise BadValue(f"size is {size}, expected two sides from 1 to {MAX_SIDE}")
+    if len(size) != 2 or not all(1 <= side <= MAX_SET_SIDE for side in size):
+        raise BadValue(f"size is {size}, expected two sides from 1 to {MAX_SET_SIDE}")
 
 
 def _check_properties(
@@ -385,50 +379,3 @@ def check_index_range(
             f"an image of {width}x{height} pixels and {channels} channels has {values:,} values, "
             f"the limit is {MAX_VALUES:,}: scale it down or work on parts of it"
         )
-
-
-def crop(
-    data: SetData,
-    corner: tuple[float, float],
-    size: tuple[int, int],
-    scale: tuple[float, float] = (1.0, 1.0),
-) -> SetData:
-    """Return the Gaussians that touch a region, as a set of the region's own size.
-
-    Parameters
-    ----------
-    data : SetData
-        See `eigengs_dr.gaussian.file.read`.
-    corner : (float, float)
-        x and y of the upper left corner of the region, in native pixels of the set.
-    size : (int, int)
-        Width and height of the region in pixels of the result.
-    scale : (float, float), optional
-        Pixels of the result for a native pixel, along x and y.
-
-    Returns
-    -------
-    SetData
-        It renders as the region does in the whole set, up to rounding. The Gaussians keep their
-        order. The set may be empty: then the region shows the background alone.
-    """
-    mean = data.arrays["mean"]
-    seen = np.ones(len(mean), bool)
-    for axis, reach in enumerate(reaches(data)):
-        half = 0.5 * size[axis] / scale[axis]
-        away = np.abs(mean[:, axis] - np.float32(corner[axis] + half))
-        seen &= away <= reach * np.float32(1.001) + np.float32(half + 1)
-    arrays = {name: values[seen] for name, values in data.arrays.items() if name != "background"}
-    arrays["background"] = data.arrays["background"]
-    x, y = scale
-    arrays["mean"] = ((arrays["mean"].astype(np.float64) - corner) * scale).astype(np.float32)
-    arrays["factor"] = (arrays["factor"] / np.array([x, y, y])).astype(np.float32)
-    return data._replace(arrays=arrays, size=size)
-
-
-def reaches(data: SetData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return how far from its mean each Gaussian reaches along x and along y, in native pixels."""
-    a, b, c = data.arrays["factor"].T
-    # The covariance (F^T F)^-1 has the entries xx = (1 + (b / c)^2) / a^2 and yy = 1 / c^2.
-    across = data.cutoff * np.hypot(np.float32(1), b / c) / a
-    return across.astype(np.float32), (data.cutoff / c).astype(np.float32)

@@ -16,24 +16,22 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..backend.arguments import takes_numbers
-from ..backend.arrays import Float, UInt, settle, types_in, types_of, upload, upload_rows
-from ..backend.feedback import to_html
-from ..backend.recording import exclusive
+from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
+from ..backend.doors import class_of_doors, door
+from ..backend.notebook import to_html
 from ..backend.selection import BackendError, select
-from ..image.color import check_size
+from ..backend.types import Float, FloatLike, Rows, Tensor, UInt
+from ..image.pixels import check_size
 from ..storage.npz import BadValue
 from .channels import TextureMap, find_map
 from .file import CUTOFF, Arrays, SetData, check, read, write
-
-Rows = Float
-"""Several rows of Dr.Jit floats: an Array2f, Array3f or ArrayXf."""
 
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
 between pixel centres, where it has no gradient."""
 
 
+@class_of_doors
 @dataclass(repr=False, eq=False)
 class Gaussians:
     """N two-dimensional Gaussians and a constant background: an image of any size.
@@ -86,7 +84,6 @@ class Gaussians:
     maps: tuple[TextureMap, ...] = ()
 
     @classmethod
-    @takes_numbers
     def from_arrays(
         cls,
         mean: ArrayLike,
@@ -130,7 +127,6 @@ class Gaussians:
         return cls.from_data(SetData(arrays, size, space, cutoff, tuple(maps)), backend, dtype)
 
     @classmethod
-    @exclusive()
     def from_data(
         cls, data: SetData, backend: str | None = None, dtype: DTypeLike = np.float32
     ) -> Gaussians:
@@ -163,7 +159,6 @@ class Gaussians:
         size = self.width, self.height
         return SetData(self.to_arrays(), size, self.space, self.cutoff, self.maps)
 
-    @exclusive()
     def to_arrays(self) -> Arrays:
         """Return mean (N, 2), factor (N, 3), color (N, C) and background (C,) as NumPy arrays."""
 
@@ -199,7 +194,6 @@ class Gaussians:
         """Number of channels."""
         return len(self.color)
 
-    @exclusive()
     def __getitem__(self, selection: Any) -> Gaussians:
         """Select Gaussians by a slice, an integer array or a boolean mask, or a map by its name.
 
@@ -231,8 +225,6 @@ class Gaussians:
         color, background = kind(list(self.color)[own]), kind(list(self.background)[own])
         return replace(self, color=color, background=background, space=found.space, maps=())
 
-    @exclusive()
-    @takes_numbers
     def scaled(self, width: int, height: int) -> Gaussians:
         """Scale the picture to another native size, in pixels; differentiable.
 
@@ -265,7 +257,6 @@ class Gaussians:
             height=height,
         )
 
-    @exclusive()
     def bounded(self, size: tuple[Float, Float] | None = None) -> Gaussians:
         """Clip every parameter to its bounds.
 
@@ -285,7 +276,7 @@ class Gaussians:
         longer = dr.float64_array_t(types.Float)(dr.maximum(*size))
         low, high = types.Float(0.5 / longer), 1 / MIN_DEVIATION
 
-        def inside(x: Float, low: Float, high: Float, otherwise: Float) -> Float:
+        def inside(x: Float, low: FloatLike, high: FloatLike, otherwise: FloatLike) -> Float:
             return dr.select(dr.isfinite(x), dr.clip(x, low, high), otherwise)
 
         a, b, c = self.factor
@@ -312,7 +303,6 @@ class Gaussians:
         write(path, self.data())
 
     @classmethod
-    @takes_numbers
     def load(
         cls,
         path: str | os.PathLike[str],
@@ -376,7 +366,7 @@ def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
     return [row + dr.zeros(type(row), len(gaussians)) for row in rows]
 
 
-@exclusive()
+@door
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     """Join sets and add their backgrounds: the result renders as the sum of the sets.
 
@@ -475,8 +465,8 @@ FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}
 """Parameters of a set, with their numbers of columns; 0 means the number of channels."""
 
 
-@exclusive()
-def to_tensors(gaussians: Gaussians) -> dict[str, Rows]:
+@door
+def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return the parameters of a set as tensors; differentiable.
 
     Parameters
@@ -507,8 +497,8 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Rows]:
     return tensors
 
 
-@exclusive()
-def from_tensors(tensors: Mapping[str, Rows], like: Gaussians) -> Gaussians:
+@door
+def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """Create a set from tensors; differentiable. The inverse of `to_tensors`.
 
     Parameters
@@ -551,10 +541,21 @@ def from_tensors(tensors: Mapping[str, Rows], like: Gaussians) -> Gaussians:
         expected = (columns,) if name == "background" else (count, columns)
         if tuple(tensor.shape) != expected or not count:
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {expected}")
-    return replace(like, **{name: _columns_of(getattr(like, name), t) for name, t in given.items()})
+
+    def rows(name: str) -> Rows:
+        old: Rows = getattr(like, name)
+        return _columns_of(old, given[name]) if name in given else old
+
+    return replace(
+        like,
+        mean=rows("mean"),
+        factor=rows("factor"),
+        color=rows("color"),
+        background=rows("background"),
+    )
 
 
-def _columns_of(like: Rows, tensor: Rows) -> Rows:
+def _columns_of(like: Rows, tensor: Tensor) -> Rows:
     """Return the columns of a tensor as a nested array with the type of `like`."""
     types = types_of(like)
     number = tensor.shape[-1]

@@ -6,7 +6,8 @@
 - ``pixels``: what pixels are, sRGB or light, and the checks of an image
 - ``folder``: many images, in blocks
 - ``color``: YCbCr, linear light, sRGB, codes of light above 1, normals, images of a family
-- ``resize``: other sizes, and pictures side by side
+- ``resize``: other sizes
+- ``sheet``: pictures side by side, with text
 - ``metrics``: PSNR, SSIM, MS-SSIM
 - ``strips``: rows of an image by threads
 - ``hilbert``: a curve through the cells of a square

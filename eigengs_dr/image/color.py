@@ -8,17 +8,17 @@ colour space, and a row for each channel.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from operator import index
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = Any
-"""Floats of NumPy, or a flat, nested or tensor array of floats of Dr.Jit."""
+Samples = Any
+"""Floats of NumPy, of Python, or a flat, nested or tensor array of floats of Dr.Jit: no type of
+these fits all operations that a function does."""
 
-Function = Callable[..., Array]
+Function = Callable[..., Samples]
 
 FloatImage = NDArray[np.floating]
 """Floats of NumPy."""
@@ -114,7 +114,7 @@ def ycbcr_to_rgb(image: FloatImage) -> FloatImage:
     return (image - YCBCR_OFFSET.astype(image.dtype)) @ YCBCR_TO_RGB.T.astype(image.dtype)
 
 
-def to_linear(coded: Array) -> Array:
+def to_linear(coded: Samples) -> Samples:
     """Decode sRGB to linear light: ``x / 12.92``, above 0.04045 ``((x + 0.055) / 1.055)^2.4``.
 
     The function works elementwise and keeps the precision. Values and derivatives are finite
@@ -151,7 +151,7 @@ def to_linear(coded: Array) -> Array:
     return select(coded <= 0.04045, coded * (1 / 12.92), curved)
 
 
-def to_coded(linear: Array) -> Array:
+def to_coded(linear: Samples) -> Samples:
     """Encode linear light as sRGB: ``12.92 x``, above 0.0031308 ``1.055 x^(1 / 2.4) - 0.055``.
 
     This is the inverse of `to_linear`. The constants of the standard leave a step of 3e-8 between
@@ -197,7 +197,7 @@ def to_picture(space: str, rendered: FloatImage) -> FloatImage:
     return rendered
 
 
-def from_sum(space: str, summed: Array) -> Array:
+def from_sum(space: str, summed: Samples) -> Samples:
     """Convert the sums of Gaussians to what a rendering holds, where decoding colours cannot.
 
     Parameters
@@ -224,7 +224,7 @@ def rendered_as(space: str) -> str | None:
     return "srgb" if space in ("ycbcr", "rgb") else "linear"
 
 
-def decode(space: str, channels: Sequence[Array]) -> list[Array]:
+def decode(space: str, channels: Sequence[Samples]) -> list[Samples]:
     """Convert YCbCr channels to RGB, and return the channels of other spaces unchanged.
 
     Parameters
@@ -257,7 +257,7 @@ def decode(space: str, channels: Sequence[Array]) -> list[Array]:
     return [a * y + b * cb + c * cr + d for (a, b, c), d in zip(matrix, black, strict=True)]
 
 
-def _functions(array: Array) -> tuple[Function, Function, Function]:
+def _functions(array: Samples) -> tuple[Function, Function, Function]:
     """Return select, maximum and power for a NumPy or a Dr.Jit array; refuse integers of NumPy."""
     if not isinstance(array, np.ndarray | np.generic | float):
         import drjit as dr  # loads libLLVM
@@ -319,7 +319,7 @@ def to_log(light: FloatImage) -> FloatImage:
     return np.asarray(coded / math.log1p(LOG_SLOPE), light.dtype)
 
 
-def from_log(codes: Array) -> Array:
+def from_log(codes: Samples) -> Samples:
     """Decode `to_log`; negative codes give light above -0.01.
 
     Parameters
@@ -340,7 +340,7 @@ def from_log(codes: Array) -> Array:
     return (dr.exp2(dr.minimum(codes * (factor / math.log(2)), 126)) - 1) * (1 / LOG_SLOPE)
 
 
-def to_pu21(light: Array) -> Array:
+def to_pu21(light: Samples) -> Samples:
     """Encode linear light so that equal differences are about equally visible, also above 1.
 
     The code is logarithmic in bright light and nearly linear in the dark. Light is clamped to
@@ -381,7 +381,7 @@ SHORTEST = 1e-6
 """Squared length below which a vector has no direction; it stays nearly zero."""
 
 
-def renormalize(codes: Array) -> Array:
+def renormalize(codes: Samples) -> Samples:
     """Scale the vectors of a normal map to the length 1.
 
     Parameters
@@ -409,7 +409,7 @@ def renormalize(codes: Array) -> Array:
     return type(codes)(dr.select(axis == 0, x, dr.select(axis == 1, y, z)), codes.shape)
 
 
-def unit_codes(channels: Sequence[Array]) -> list[Array]:
+def unit_codes(channels: Sequence[Samples]) -> list[Samples]:
     """Return the codes of the unit vectors along three channels of codes; see `renormalize`."""
     vector = [2 * channel - 1 for channel in channels]
     square = sum((v * v for v in vector[1:]), vector[0] * vector[0])
@@ -426,27 +426,6 @@ def unit_codes(channels: Sequence[Array]) -> list[Array]:
 
 BASIS_SPACES = ("ycbcr", "rgb")
 """Colour spaces of a family."""
-
-
-def check_size(size: Iterable[int]) -> tuple[int, int]:
-    """Return a size, (width, height) in pixels, as two integers.
-
-    Parameters
-    ----------
-    size : (int, int)
-
-    Raises
-    ------
-    ValueError
-        If `size` is not a pair of integers, or a side is not positive.
-    """
-    try:
-        width, height = map(index, size)
-    except (TypeError, ValueError):
-        raise ValueError(f"size is {size!r}; expected (width, height) in whole pixels") from None
-    if min(width, height) < 1:
-        raise ValueError(f"size is {width}x{height}; both sides must be at least 1 pixel")
-    return width, height
 
 
 def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:

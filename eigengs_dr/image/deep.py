@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,13 +21,16 @@ from .pictures import exif_orientation, picture_header, png_chunks
 from .pixels import ImageError
 from .strips import Pixels, by_strips
 
+if TYPE_CHECKING:
+    import OpenImageIO as oiio
+
 # ---------------------------------------------------------------------------------------------
 #  OpenImageIO
 # ---------------------------------------------------------------------------------------------
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path) -> Iterator[oiio.ImageInput]:
     """Open a file; its colours and alpha stay as they are stored."""
     import OpenImageIO as oiio
 
@@ -103,7 +106,7 @@ REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """Chromaticities of red, green, blue and white, as in an EXR file."""
 
 
-def _exr_notes(spec: Any) -> tuple[str, ...]:
+def _exr_notes(spec: oiio.ImageSpec) -> tuple[str, ...]:
     notes: tuple[str, ...] = ()
     primaries = spec.getattribute("chromaticities")
     if primaries is not None and np.abs(np.subtract(primaries, REC709)).max() > 0.01:
@@ -113,11 +116,11 @@ def _exr_notes(spec: Any) -> tuple[str, ...]:
     return notes
 
 
-def _display(spec: Any) -> tuple[int, int, int, int]:
+def _display(spec: oiio.ImageSpec) -> tuple[int, int, int, int]:
     return spec.full_x, spec.full_y, spec.full_width, spec.full_height
 
 
-def _data(spec: Any) -> tuple[int, int, int, int]:
+def _data(spec: oiio.ImageSpec) -> tuple[int, int, int, int]:
     return spec.x, spec.y, spec.width, spec.height
 
 
@@ -191,7 +194,7 @@ class _Map:
         self.channels = 3 if self.kind in (b"P3", b"P6", b"PF") else 1
         self.floats, self.text = self.kind in (b"PF", b"Pf"), self.kind in (b"P2", b"P3")
         if self.floats:
-            self.dtype: np.dtype[Any] = np.dtype("<f4" if float(header[4]) < 0 else ">f4")
+            self.dtype: np.dtype = np.dtype("<f4" if float(header[4]) < 0 else ">f4")
             return
         self.white = int(header[4])
         if not 1 <= self.white <= 65535:

@@ -16,11 +16,12 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.feedback import warn
-from .color import BASIS_SPACES, check_size, to_planes
+from ..backend.messages import warn
+from ..backend.types import PathLike, Record, Values
+from .color import BASIS_SPACES, to_planes
 from .formats import LEFT_SUFFIXES, READ_SUFFIXES
 from .io import check_image, load_image
-from .pixels import ImageError
+from .pixels import ImageError, check_size
 from .remote import is_url, list_urls
 from .resize import center_crop
 from .strips import available_cores
@@ -35,10 +36,12 @@ then tells. One image may wait whatever its size."""
 MAX_NAMED = 3
 """Largest number of files that a warning names."""
 
-Source = str | os.PathLike[str] | NDArray[Any] | Iterable[str | os.PathLike[str] | NDArray[Any]]
+FileOrImage = PathLike | Values
+
+TrainingImages = FileOrImage | Iterable[FileOrImage]
 """A folder or its URL, an array of images, or any iterable of files, of URLs and of such arrays."""
 
-ReadProgress = Callable[[int, int | None, dict[str, Any]], None]
+ReadProgress = Callable[[int, int | None, Record], None]
 """``progress(done, total, row)``; the total is None if it is unknown."""
 
 
@@ -132,7 +135,7 @@ def list_images(images: str | os.PathLike[str]) -> Sequence[str | Path]:
 
 
 def read_blocks(
-    source: Source,
+    source: TrainingImages,
     size: tuple[int, int],
     space: str,
     length: int,
@@ -260,7 +263,7 @@ def read_ahead(
 
     Yields
     ------
-    Any
+    object
         In the order of the items. At most `MAX_WAITING` and about `MAX_WAITING_BYTES` wait.
     """
     waiting: deque[Future[Read]] = deque()
@@ -285,10 +288,10 @@ def read_ahead(
         pool.shutdown(cancel_futures=True)
 
 
-def _singles(source: Iterable[Any]) -> Iterator[Any]:
+def _singles(source: Iterable[FileOrImage]) -> Iterator[FileOrImage]:
     """Yield files and single images."""
     for item in source:
-        if _is_file(item):
+        if isinstance(item, str | os.PathLike):
             yield item if is_url(item) else Path(item)
         else:
             yield from _images(item)
@@ -313,11 +316,11 @@ def _prepare(numbered: tuple[int, Any], size: tuple[int, int], space: str) -> Pr
     return PreparedImage(to_planes(image, space), fitted)
 
 
-def _is_file(item: Any) -> bool:
+def _is_file(item: object) -> bool:
     return isinstance(item, str | os.PathLike)
 
 
-def _images(item: Any) -> Sequence[Any]:
+def _images(item: object) -> Sequence[Values]:
     """Return the images of an array as a sequence."""
     if not isinstance(item, np.ndarray) or item.ndim not in (3, 4):
         kind = f"shape {item.shape}" if isinstance(item, np.ndarray) else type(item).__name__

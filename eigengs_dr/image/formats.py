@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from ..backend.types import Record
 from .strips import Pixels
 
 BITS: dict[str, tuple[int, ...]] = {
@@ -73,7 +73,7 @@ def write_file(path: Path, pixels: Pixels, bits: int) -> None:
     if bits == 8 or (suffix == ".png" and grey):
         from PIL import Image
 
-        options: dict[str, Any] = {"quality": 95} if suffix in LOSSY else {}
+        options: Record = {"quality": 95} if suffix in LOSSY else {}
         Image.fromarray(flat).save(path, **options)
     elif suffix in TIFF_SUFFIXES:
         import tifffile

@@ -153,7 +153,7 @@ SAME_COLOR = 4
 """Largest difference of levels of 255 between profiles that count as equal."""
 
 
-@lru_cache(64)
+@lru_cache(64)  # images of one camera share a profile
 def profile_note(profile: bytes, encoding: str) -> tuple[str, ...]:
     """Return a warning if an ICC profile gives other colours than sRGB, or than light.
 

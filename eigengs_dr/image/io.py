@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arguments import takes_numbers
-from ..backend.feedback import warn
+from ..backend.messages import warn
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats import (
@@ -109,7 +109,7 @@ def _read_local(path: Path, name: str, keep_grey: bool, encoding: str | None) ->
     return EncodedImage(pixels, said)
 
 
-def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
+def read_image(image: object, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
     """Read an image that is a file or a URL; say of anything else what its pixels are.
 
     For parameters and errors see `read_file` and `eigengs_dr.image.pixels.encoding_of`. Pixels of
@@ -122,7 +122,7 @@ def read_image(image: Any, keep_grey: bool = False, encoding: str | None = None)
     return EncodedImage(pixels_of(image), encoding_of(image, encoding) or "srgb")
 
 
-def pixels_of(image: Any) -> Any:
+def pixels_of(image: object) -> Any:
     """Return what a `PIL.Image.Image` shows, grey or RGB over white; anything else as it is."""
     if not is_picture(image):
         return image
@@ -138,7 +138,7 @@ def pixels_of(image: Any) -> Any:
 
 
 def read_floats(
-    image: Any, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
+    image: object, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
 ) -> EncodedImage:
     """Read an image and convert it to float32 as `load_image` does: light stays light.
 
@@ -149,7 +149,7 @@ def read_floats(
 
 
 def check_image(
-    image: Any, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
+    image: object, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
 ) -> NDArray[np.float32]:
     """Convert an image to sRGB in float32, and refuse what is not an image.
 
@@ -192,7 +192,7 @@ def check_image(
     return by_strips(to_coded, pixels) if light else pixels
 
 
-def check_data(image: Any, copy: bool = True) -> NDArray[np.float32]:
+def check_data(image: object, copy: bool = True) -> NDArray[np.float32]:
     """Convert an image of data to float32: one channel or three, of any finite values.
 
     For parameters, result and errors see `check_image`; integers are scaled to [0, 1], and nothing

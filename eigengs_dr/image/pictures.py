@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 
@@ -137,7 +137,7 @@ def picture_pixels(image: Image) -> Pixels:
     return pixels if pixels.ndim == 3 else pixels[..., None]
 
 
-def is_picture(image: Any) -> bool:
+def is_picture(image: object) -> TypeGuard[Image]:
     """Whether an image is a `PIL.Image.Image`; does not import Pillow."""
     return "PIL.Image" in sys.modules and isinstance(image, sys.modules["PIL.Image"].Image)
 

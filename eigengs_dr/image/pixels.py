@@ -7,13 +7,15 @@ and a ``mitsuba.Bitmap`` tells itself; of other arrays the caller says it by ``e
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
+from operator import index
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.feedback import warn
+from ..backend.messages import warn
 from .strips import Pixels, by_strips
 
 ENCODINGS = ("srgb", "linear")
@@ -57,7 +59,7 @@ def check_encoding(encoding: str | None) -> None:
         raise ValueError(f"encoding {encoding!r} is unknown; use one of {known}")
 
 
-def encoding_of(image: Any, encoding: str | None = None) -> str | None:
+def encoding_of(image: object, encoding: str | None = None) -> str | None:
     """Return what the pixels of an image are.
 
     Parameters
@@ -96,7 +98,7 @@ def encoding_of(image: Any, encoding: str | None = None) -> str | None:
     return None
 
 
-def peak_of(dtype: np.dtype[Any]) -> int:
+def peak_of(dtype: np.dtype) -> int:
     """Return the value of white: the largest integer, or 1 for floats and bool.
 
     Raises
@@ -175,3 +177,24 @@ def _check_range(pixels: NDArray[np.float32], name: str, encoding: str) -> None:
         raise ImageError(
             f"{name}: pixels run from {low:g} to {high:g}, not 0 to 1; {hint} first{light}"
         )
+
+
+def check_size(size: Iterable[int]) -> tuple[int, int]:
+    """Return a size, (width, height) in pixels, as two integers.
+
+    Parameters
+    ----------
+    size : (int, int)
+
+    Raises
+    ------
+    ValueError
+        If `size` is not a pair of integers, or a side is not positive.
+    """
+    try:
+        width, height = map(index, size)
+    except (TypeError, ValueError):
+        raise ValueError(f"size is {size!r}; expected (width, height) in whole pixels") from None
+    if min(width, height) < 1:
+        raise ValueError(f"size is {width}x{height}; both sides must be at least 1 pixel")
+    return width, height

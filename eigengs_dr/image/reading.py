@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from ..backend.feedback import warn
+from ..backend.messages import warn
 from . import deep, pictures, tiff
 from .formats import ADVICE, has_openimageio
 from .header import Header, image_errors, oriented, over_background, transparency_note

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Any
+from types import ModuleType
 
 from ..storage.memory import SETTING, download_limit
 from .formats import READ_SUFFIXES
@@ -117,7 +117,7 @@ PART = 1 << 20
 """Bytes that are copied at once."""
 
 
-def _fsspec() -> Any:
+def _fsspec() -> ModuleType:
     try:
         import fsspec
     except ImportError:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..backend.types import Values
 
 STRIP_PIXELS = 1 << 19
 """Pixels of a strip. A plane of it, in single precision, takes 2 MB: larger strips leave the cache,
@@ -21,7 +22,7 @@ and with smaller ones threads wait for each other and borders of filters are com
 MAX_THREADS = 8
 """Largest number of threads: Python lets only one of them start an operation at a time."""
 
-Pixels = NDArray[Any]
+Pixels = Values
 """Pixels (H, W, C) of any dtype that an image may have."""
 
 Item = TypeVar("Item")

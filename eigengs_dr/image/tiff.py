@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import lzma
 import zlib
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -21,6 +22,9 @@ from .header import ORIENTATION, TURNED, Header, frames_note, over_background, p
 from .pictures import open_picture, picture_pixels
 from .pixels import ImageError, peak_of, reason_of, scale
 from .strips import Pixels, by_strips
+
+if TYPE_CHECKING:
+    from tifffile import TiffFile, TiffPage
 
 COLORS = {0: "inverted", 1: "grey", 2: "rgb", 3: "palette", 5: "cmyk", 6: "ycbcr"}
 """Photometric interpretations that are read."""
@@ -38,7 +42,7 @@ MAX_SEGMENT = 1 << 26
 """Values of the largest strip or tile that is decoded for a window. A file of one compressed strip
 is better decoded once."""
 
-UNBOUNDED: dict[int, Any] = {
+UNBOUNDED: dict[int, Callable] = {
     8: zlib.decompressobj,
     32946: zlib.decompressobj,
     34925: lzma.LZMADecompressor,
@@ -109,7 +113,7 @@ def read_tiff(path: Path) -> Pixels:
     with tifffile.TiffFile(path) as file:
         page, number, _ = _first_page(file)
         layout = _layout(page)
-        reason = f"{page.photometric.name} colours"
+        reason = f"{getattr(page.photometric, 'name', page.photometric)} colours"
         if layout.color != "ycbcr":
             try:
                 _check_segments(file, page)
@@ -152,23 +156,24 @@ def _read_openimageio(path: Path, number: int, layout: Layout) -> Pixels:
     return to_colors(_whole_range(samples, layout), layout, None)
 
 
-def _first_page(file: Any) -> tuple[Any, int, int]:
+def _first_page(file: TiffFile) -> tuple[TiffPage, int, int]:
     """Return the first page that is no small copy or mask of another, its number, and their count.
 
     The number counts all pages, the count those that are images.
     """
-    pages = [(k, page) for k, page in enumerate(file.pages) if not _tag(page, 254, 0) & 5]
+    numbered = enumerate(cast("Iterable[TiffPage]", file.pages))
+    pages = [(k, page) for k, page in numbered if not _tag(page, 254, 0) & 5]
     if not pages:
         raise ImageError("holds a thumbnail alone, its image is in a sub-IFD; export it as TIFF")
     number, page = pages[0]
     return page, number, len(pages)
 
 
-def _tag(page: Any, code: int, default: Any) -> Any:
+def _tag(page: TiffPage, code: int, default: object) -> Any:
     return page.tags[code].value if code in page.tags else default
 
 
-def _layout(page: Any) -> Layout:
+def _layout(page: TiffPage) -> Layout:
     """Return how a page stores its pixels; refuse by name what has no meaning here."""
     color = COLORS.get(int(page.photometric))
     name = getattr(page.photometric, "name", page.photometric)
@@ -199,7 +204,7 @@ def _layout(page: Any) -> Layout:
     return Layout(color, bits, floats, samples, place, associated)
 
 
-def to_colors(samples: Pixels, layout: Layout, palette: Any) -> Pixels:
+def to_colors(samples: Pixels, layout: Layout, palette: Pixels | None) -> Pixels:
     """Convert samples (H, W, S) of a page to grey or RGB, with alpha as the last channel, if any.
 
     Integers are those of `_whole_range`.
@@ -246,7 +251,7 @@ def _cmyk_to_rgb(rows: Pixels, peak: int) -> Pixels:
     return (1 - rows[..., :3]) * (1 - rows[..., 3:])
 
 
-def _check_segments(file: Any, page: Any) -> None:
+def _check_segments(file: TiffFile, page: TiffPage) -> None:
     """Refuse segments that unfold to more than their size: a few kilobytes may make gigabytes."""
     if page.compression not in UNBOUNDED:
         return
@@ -329,7 +334,7 @@ def read_window(path: str, rows: slice, columns: slice) -> Pixels:
         raise ImageError(f"{path}: damaged or unreadable ({reason}); export it again") from error
 
 
-def _from_segments(file: Any, page: Any, rows: slice, columns: slice) -> Pixels:
+def _from_segments(file: TiffFile, page: TiffPage, rows: slice, columns: slice) -> Pixels:
     """Decode the strips or tiles that a window touches. One without data is black."""
     height, width = page.chunks[:2]
     across = -(-page.imagewidth // width)
@@ -351,7 +356,7 @@ def _shared(part: slice, start: int, length: int) -> tuple[slice, slice]:
     return slice(first - part.start, last - part.start), slice(first - start, last - start)
 
 
-def _decode(file: Any, page: Any, number: int) -> Pixels | None:
+def _decode(file: TiffFile, page: TiffPage, number: int) -> Pixels | None:
     """Return a strip or a tile (R, C, channels)."""
     file.filehandle.seek(page.dataoffsets[number])
     data = file.filehandle.read(page.databytecounts[number])

@@ -39,17 +39,16 @@ class Cholesky:
     def decode(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Gaussians:
         """Return the set; see `eigengs_dr.fitting.variables.Coordinates`."""
         width, height = size or (fixed.width, fixed.height)
-        parts = {}
+        mean, factor = fixed.mean, fixed.factor
         if "mean" in variables:
             x, y = (0.5 * (tanh(v) + 1) for v in variables["mean"])
-            parts["mean"] = type(fixed.mean)(x * width, y * height)
+            mean = type(mean)(x * width, y * height)
         if "cholesky" in variables:
             l1, l2, l3 = variables["cholesky"]
-            factor = factor_from_cholesky(l1 + CHOLESKY_BOUND, l2, l3 + CHOLESKY_BOUND)
-            parts["factor"] = type(fixed.factor)(factor)
-        if "color" in variables:
-            parts["color"] = variables["color"]
-        return replace(fixed, **parts)
+            rows = factor_from_cholesky(l1 + CHOLESKY_BOUND, l2, l3 + CHOLESKY_BOUND)
+            factor = type(factor)(rows)
+        color = variables.get("color", fixed.color)
+        return replace(fixed, mean=mean, factor=factor, color=color)
 
     def project(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Variables:
         """Bound the diagonal; see `eigengs_dr.fitting.variables.Coordinates`."""

@@ -43,10 +43,6 @@ class EigenGSMethod(Method):
         gaussians = model.encode(pixels, "projected", "dense")
         return objective, replace(gaussians, cutoff=float(self.cutoff))
 
-    def mean_image(self, model: Model, width: int, height: int) -> NDArray[np.float32]:
-        """Return the RGB that comes on top of renderings of a set, (height, width, 3)."""
-        return mean_picture(model.dense_mean(width, height), model.gaussians.space)
-
 
 def mean_picture(mean: NDArray[np.float32], space: str) -> NDArray[np.float32]:
     """Return a mean image (H, W, C) as RGB to add: a rendering already holds the RGB of zeros."""

@@ -153,7 +153,7 @@ def train_jointly(
     dict of str to ndarray
         The state after every `ROUND` steps and after the last step; nothing if `state` has all
         steps. Between two states, `KeyboardInterrupt` may become another error, see
-        `eigengs_dr.backend.feedback.defer_interrupts`. "step" is the number of finished steps;
+        `eigengs_dr.backend.interrupts.defer_interrupts`. "step" is the number of finished steps;
         "rows", shape (5, 5 + P, N) for P components, the variables, then m, v, n and the last
         gradient of `eigengs_dr.paper.adan.Adan`. The first 5 rows of each are the
         mean and the factor in `Cholesky` coordinates, each other row the scaled weights of one

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
-from ..backend.arrays import Float, UInt, types_of
+from ..backend.arrays import types_of
+from ..backend.types import Float, FloatLike, Mask, UInt
 from .binning.lists import Pieces, TileLists
 from .evaluate import weights, weights_vjp
 from .kernels import shares_of
@@ -20,7 +19,7 @@ def adjoint(
     lists: TileLists,
     radius: float,
     color_only: bool = False,
-    factors: Float = None,
+    factors: Float | None = None,
 ) -> list:
     """Return the gradient of ``<delta, forward(packed)>`` with respect to all parameters.
 
@@ -55,7 +54,7 @@ def adjoint(
     return sum_pieces(parts, lists.pieces, number)
 
 
-def _images_in(factors: Float, lists: TileLists) -> int:
+def _images_in(factors: Float | None, lists: TileLists) -> int:
     """Return the number of images in the factors of `adjoint`."""
     return 0 if factors is None else dr.width(factors) // (lists.grid.tiles * lists.grid.pixels)
 
@@ -67,8 +66,8 @@ def adjoint_pieces(
     lists: TileLists,
     radius: float,
     color_only: bool = False,
-    factors: Float = None,
-) -> Any:
+    factors: Float | None = None,
+) -> Float:
     """Return the packed sums of every piece, for `sum_pieces`; parameters as for `adjoint`.
 
     A lane owns the same rows of all tiles of its piece, see `Granularity.rows`. Cost per visit of
@@ -99,7 +98,7 @@ def adjoint_pieces(
         x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
         color = sums[-channels - images :][:channels]
 
-        def cotangent(k: int, w: Float) -> Any:
+        def cotangent(k: int, w: Float) -> FloatLike:
             g = type(w)(0)
             for c in range(channels):
                 color[c] = dr.fma(w, d[k * channels + c], color[c])
@@ -108,7 +107,7 @@ def adjoint_pieces(
 
         if color_only:
             own, f = sums[channels:], []
-            if images:
+            if factors is not None:
                 f = gather_run(types, factors, tile * shares + part, length * images, active)
             for k, w in enumerate(weights(shape, x, y, block, radius, steep)):
                 cotangent(k, w)
@@ -138,7 +137,7 @@ def adjoint_pieces(
     return parts
 
 
-def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt = None) -> list:
+def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt | None = None) -> list:
     """Add the results of the pieces of every Gaussian, in the order of the pieces.
 
     Parameters
@@ -157,7 +156,7 @@ def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt = None) ->
     """
     types = types_of(parts)
     count = dr.width(pieces.first)
-    known: Any = True
+    known: Mask = True
     if splat is None:
         splat = dr.arange(types.UInt, count)
     else:

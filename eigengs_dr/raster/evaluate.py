@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 
-from ..backend.arrays import Float, rcp, rsqrt, types_of
+from ..backend.arrays import rcp, rsqrt, types_of
+from ..backend.types import Bool, Float, FloatLike
 
 LN2 = math.log(2)
 
@@ -20,7 +20,7 @@ STEEP = 122.0
 """Largest exponent of the products of `weights` before a Gaussian is steep, see `is_steep`."""
 
 
-def exp2_neg(q: Float) -> Any:
+def exp2_neg(q: Float) -> Float:
     """Return ``2^-q`` for ``-126 <= q <= 126``: relative error < 3e-7, on cuda < 5e-7.
 
     On llvm, single precision costs half of `drjit.exp2`: split ``q = n - f`` into an integer n and
@@ -47,7 +47,7 @@ def exp2_neg(q: Float) -> Any:
     return dr.reinterpret_array(types.Float, dr.reinterpret_array(types.UInt, power) + exponent)
 
 
-def falloff(q: Float, limit: float) -> Any:
+def falloff(q: Float, limit: float) -> Float:
     """Return ``2^-q`` for ``q <= limit``, else 0; the derivative is ``-ln(2)`` times the value."""
     exact = dr.detach(q)
     value = dr.select(exact <= limit, exp2_neg(exact), 0)
@@ -90,7 +90,7 @@ def weights(
 
 def _rows(
     shape: list, x: Float, y: Float, tile: tuple[int, int], radius: float, steep: bool
-) -> list[tuple[list, Any, Any]]:
+) -> list[tuple[list, Float, Float]]:
     """Return for each row of a block its weights, and (u, v) = F (x - mu) at its column `_column`.
 
     One step to the right changes u by a, and one step down changes (u, v) by (b, c).
@@ -115,7 +115,7 @@ def _column(tile: tuple[int, int]) -> int:
     return min(1, tile[0] - 1)
 
 
-def _chained(a: Float, b: Float, points: list, radius: float) -> list[tuple[list, Any, Any]]:
+def _chained(a: Float, b: Float, points: list, radius: float) -> list[tuple[list, Float, Float]]:
     """Return the rows of `_rows` of 4 pixels by products, from the weights w_1 of the second pixel.
 
     With (u, v) there, ``w_2 = w_1 M`` and ``w_3 = w_2 M K`` and ``w_0 = w_1 K / M``, where
@@ -155,7 +155,7 @@ def _powers(value: Float, up: Float, down: Float, start: int, count: int) -> lis
     return values
 
 
-def is_steep(shape: list, radius: float) -> Any:
+def is_steep(shape: list, radius: float) -> Bool:
     """Return for each Gaussian whether products could leave the range of floats in `weights`.
 
     Beside a pixel inside the ellipse, ``|u| <= radius + 2 a`` at the second pixel of the row, and
@@ -188,7 +188,7 @@ def weights_vjp(
     y: Float,
     tile: tuple[int, int],
     radius: float,
-    cotangent: Callable[[int, Any], Any],
+    cotangent: Callable[[int, Float], FloatLike],
     steep: bool = True,
 ) -> list:
     """Return the gradient of ``sum_k g_k w_k`` for ``g_k = cotangent(k, w_k)``.
@@ -239,7 +239,7 @@ def weights_vjp(
     ]
 
 
-def _moment(values: list, factors: list[float]) -> Any:
+def _moment(values: list, factors: list[float]) -> Float:
     """Return the sum of values times literal factors; factors of 0 and 1 cost no product."""
     total = type(values[0])(0)
     for value, factor in zip(values, factors, strict=True):
@@ -250,7 +250,7 @@ def _moment(values: list, factors: list[float]) -> Any:
     return total
 
 
-def widen(shape: list, footprint: list) -> tuple[list, Any]:
+def widen(shape: list, footprint: list) -> tuple[list, Float]:
     """Convolve a Gaussian with a Gaussian footprint whose integral is 1.
 
     The result has the covariance ``Sigma' = Sigma + Sigma_f``, and the amplitude

@@ -9,11 +9,12 @@ channel after channel. A lane then reads or writes one contiguous run with packe
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 
-from ..backend.arrays import ArrayTypes, Float, UInt, types_of
+from ..backend.arrays import ArrayTypes, types_of
+from ..backend.types import Float, UInt
 from .binning.lists import TileLists
 from .binning.tiles import Grid, GridArrays, granularity_of
 from .evaluate import weights
@@ -37,12 +38,12 @@ class _Blocks(NamedTuple):
         Width and height of a block.
     """
 
-    run: Any
-    tile: Any
-    x: Any
-    y: Any
-    begin: Any
-    end: Any
+    run: UInt
+    tile: UInt
+    x: Float
+    y: Float
+    begin: UInt
+    end: UInt
     size: tuple[int, int]
 
     @property
@@ -76,7 +77,7 @@ def _sum_blocks(
     lists: TileLists,
     blocks: _Blocks,
     radius: float,
-    tangent: Float = None,
+    tangent: Float | None = None,
 ) -> list:
     """Sum the Gaussians of every block; return a list of Float, pixels times channels.
 
@@ -105,6 +106,7 @@ def _sum_blocks(
             return i + 1, [dr.fma(w, c, s) for (w, c), s in zip(terms, sums, strict=True)]
 
         def add_tangent(i: UInt, sums: list) -> tuple:
+            assert tangent is not None
             p = gather(i, packed)
             with dr.resume_grad():
                 dr.enable_grad(p)
@@ -130,8 +132,8 @@ def _sum_blocks(
 
 
 def forward(
-    packed: Float, start: list, lists: TileLists, radius: float, tangent: Float = None
-) -> Any:
+    packed: Float, start: list, lists: TileLists, radius: float, tangent: Float | None = None
+) -> Float:
     """Sum the Gaussians of every tile: the image, or its derivative along `tangent`.
 
     ``I_pc = start_c + sum_n w_n(p) c_nc``.
@@ -168,8 +170,8 @@ def residual(
     lists: TileLists,
     radius: float,
     target: Float,
-    curvature: Float = None,
-) -> tuple[Any, list]:
+    curvature: Float | None = None,
+) -> tuple[Float, list]:
     """Sum the Gaussians of every tile, and compare them with an image, in one pass over memory.
 
     With the error ``e = I - T`` of a pixel and its curvature h, the results are ``h e``, which is
@@ -238,7 +240,7 @@ def sum_lanes(values: list, lists: TileLists) -> list:
     return [sum_by_image(row, lists.grid) for row in rows]
 
 
-def sum_by_image(values: Float, grid: Grid) -> Any:
+def sum_by_image(values: Float, grid: Grid) -> Float:
     """Add values of all images, image after image; return a Float of shape (images,)."""
     if grid.images == 1:
         return dr.sum(values)

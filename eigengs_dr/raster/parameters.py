@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
-from ..backend.arrays import ArrayTypes, Bool, Float, UInt, types_of
+from ..backend.arrays import ArrayTypes, types_of
+from ..backend.types import Bool, Float, Mask, UInt
 from ..gaussian.gaussians import Gaussians
 
 EXP2_SCALE = math.sqrt(0.5 / math.log(2))
@@ -74,7 +74,7 @@ def kernel_covariance(covariance: list) -> list:
     return [entry * (1 / EXP2_SCALE**2) for entry in covariance]
 
 
-def pack_parameters(values: list) -> Any:
+def pack_parameters(values: list) -> Float:
     """Store the parameters of N Gaussians one Gaussian after another.
 
     On the CPU, one gather of 4 neighbours is 8 times as fast as 4 gathers. It needs aligned memory,
@@ -99,7 +99,9 @@ def pack_parameters(values: list) -> Any:
     return packed
 
 
-def gather_run(types: ArrayTypes, source: Any, index: UInt, length: int, active: Bool) -> list:
+def gather_run(
+    types: ArrayTypes, source: Float | UInt, index: UInt, length: int, active: Mask
+) -> list:
     """Gather ``source[index * length : (index + 1) * length]``, in packets if the length is even.
 
     Return a list of `length` Float.
@@ -108,12 +110,12 @@ def gather_run(types: ArrayTypes, source: Any, index: UInt, length: int, active:
     return list(dr.gather(types.FloatX, source, index, active, shape=shape))
 
 
-def unpack_parameters(packed: Float, index: UInt, number: int, active: Bool = True) -> list:
+def unpack_parameters(packed: Float, index: UInt, number: int, active: Mask = True) -> list:
     """Gather the first `number` parameters of the Gaussians `index`; undo `pack_parameters`."""
     return gather_run(types_of(packed), packed, index, -(-number // 4) * 4, active)[:number]
 
 
-def gather_index(types: ArrayTypes, splat: UInt, i: UInt, active: Bool) -> Any:
+def gather_index(types: ArrayTypes, splat: UInt, i: UInt, active: Bool) -> UInt:
     """Return ``splat[i]``, on the CPU by the gather of a pair: 8 times as fast as a single gather.
 
     `splat` must have an even length.

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import UInt, types_of
+from ..backend.arrays import types_of
+from ..backend.types import Float, UInt
 from .binning.lists import TileLists
 from .evaluate import weights
 from .parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
 
 
-def render_plain(values: list, background: list, lists: TileLists, cutoff: float = 3.0) -> Any:
+def render_plain(values: list, background: list, lists: TileLists, cutoff: float = 3.0) -> Float:
     """Render with one lane per pixel and Dr.Jit's own derivatives.
 
     Cost per pixel: the whole list of its tile, with one gather per parameter, and in reverse mode
@@ -63,11 +62,11 @@ def render_plain(values: list, background: list, lists: TileLists, cutoff: float
     return dr.ravel(types.FloatX([s + b for s, b in zip(sums, background, strict=True)]), order="F")
 
 
-def _slots(lists: TileLists, UInt: Any, tile: UInt) -> Any:
+def _slots(lists: TileLists, kind: type[UInt], tile: UInt) -> UInt:
     """Return the positions of tiles in `TileLists.order`."""
-    slot = dr.empty(UInt, lists.grid.tiles)
-    dr.scatter(slot, dr.arange(UInt, lists.grid.tiles), lists.order)
-    return dr.gather(UInt, slot, tile)
+    slot = dr.empty(kind, lists.grid.tiles)
+    dr.scatter(slot, dr.arange(kind, lists.grid.tiles), lists.order)
+    return dr.gather(kind, slot, tile)
 
 
 def render_exact(

@@ -11,11 +11,10 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
-from ..backend.arguments import takes_numbers
-from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, settle, types_of
-from ..backend.recording import exclusive
+from ..backend.arrays import ArrayTypes, make_divisor, settle, types_of
+from ..backend.doors import door
+from ..backend.types import Float, FloatLike, Tensor, UInt, Values
 from ..gaussian.channels import show_sums, slices
 from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
@@ -35,15 +34,14 @@ from .parameters import (
 )
 
 
-@exclusive()
-@takes_numbers
+@door
 def render(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,
     lists: TileLists | None = None,
-) -> Any:
+) -> Tensor:
     """Render a set of Gaussians at any size.
 
     The result is differentiable with respect to mean, factor, color and background, in forward and
@@ -110,8 +108,7 @@ def render(
     return from_sum(gaussians.space, tensor)
 
 
-@exclusive()
-@takes_numbers
+@door
 def tile_lists(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -161,8 +158,7 @@ def tile_lists(
     return bin_gaussians(scaled, float(margin))
 
 
-@exclusive()
-@takes_numbers
+@door
 def picture_of(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -263,7 +259,7 @@ def decode_parameters(gaussians: Gaussians) -> KernelParameters:
 
 def bin_gaussians(
     gaussians: Gaussians,
-    pad: Float = 0.0,
+    pad: FloatLike = 0.0,
     growth: float = 1.0,
     adjoint: bool = True,
     images: int = 1,
@@ -299,7 +295,7 @@ def bin_gaussians(
     return build_lists(shape, kernel_radius(cutoff), grid, pad, growth, adjoint)
 
 
-def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float) -> Any:
+def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float) -> Float:
     """Sum Gaussians to an image in tile layout; the differentiable operation behind `render`.
 
     Parameters
@@ -323,7 +319,7 @@ def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float) -> 
 class _Rasterize(dr.CustomOp):
     """``I = background + sum_n c_n w_n`` with the derivatives of `eigengs_dr.raster.kernels`."""
 
-    def eval(self, values: list, background: list, lists: TileLists, radius: float) -> Any:
+    def eval(self, values: list, background: list, lists: TileLists, radius: float) -> Float:
         self.lists, self.radius, self.channels = lists, radius, len(background)
         self.packed = pack_parameters(values)
         return forward(self.packed, background, lists, radius)
@@ -340,7 +336,7 @@ class _Rasterize(dr.CustomOp):
         self.set_grad_in("background", channel_sums(delta, self.channels, self.lists.grid))
 
 
-def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
+def to_tiles(types: ArrayTypes, image: Values, grid: Grid) -> Float:
     """Upload an image (height, width, channels) in tile layout; pixels outside it are 0.
 
     The images (M, height, width, channels) of a batch follow each other. A lane gathers one value;
@@ -374,7 +370,7 @@ def to_tiles(types: ArrayTypes, image: NDArray[Any], grid: Grid) -> Any:
     return result
 
 
-def pixels_inside(types: ArrayTypes, grid: Grid) -> Any:
+def pixels_inside(types: ArrayTypes, grid: Grid) -> Float:
     """Return 1 for the pixels of images, and 0 for those of tiles outside, in tile layout."""
     sizes = grid.in_arrays(types)
     index = dr.arange(types.UInt, grid.tiles * grid.pixels)
@@ -384,7 +380,7 @@ def pixels_inside(types: ArrayTypes, grid: Grid) -> Any:
     return dr.select((x < sizes.width) & (y < sizes.height), types.Float(1), 0)
 
 
-def batch_to_tiles(types: ArrayTypes, images: NDArray[Any]) -> Any:
+def batch_to_tiles(types: ArrayTypes, images: Values) -> Float:
     """Upload images (M, height, width, channels) in tile layout, image after image.
 
     An image (height, width, channels) is a batch of one.
@@ -393,7 +389,7 @@ def batch_to_tiles(types: ArrayTypes, images: NDArray[Any]) -> Any:
     return to_tiles(types, images, Grid(width, height, images=number))
 
 
-def to_tensor(image: Float, grid: Grid, channels: int) -> Any:
+def to_tensor(image: Float, grid: Grid, channels: int) -> Tensor:
     """Convert an image from tile layout to a tensor (height, width, channels); differentiable."""
     types = types_of(image)
     rows = dr.custom(_Rows, image, grid, channels)
@@ -403,7 +399,7 @@ def to_tensor(image: Float, grid: Grid, channels: int) -> Any:
     return types.Tensor(rows, (grid.height, grid.width, channels))
 
 
-def _crop(types: ArrayTypes, rows: Any, grid: Grid, channels: int) -> Any:
+def _crop(types: ArrayTypes, rows: Float, grid: Grid, channels: int) -> Float:
     """Cut the image out of rows of whole tiles; differentiable.
 
     Numbers are in arrays, as in `_Rows`: slices of tensors compile a program for every size.
@@ -420,7 +416,7 @@ def _crop(types: ArrayTypes, rows: Any, grid: Grid, channels: int) -> Any:
 class _Rows(dr.CustomOp):
     """Permutation from tile layout to rows of pixels; the transpose permutes back."""
 
-    def eval(self, image: Float, grid: Grid, channels: int) -> Any:
+    def eval(self, image: Float, grid: Grid, channels: int) -> Float:
         types = types_of(image)
         runs = dr.arange(types.UInt, grid.nx * grid.ny * grid.tile[1])
         columns = make_divisor(types, grid.nx)  # in arrays, for programs that serve every size
@@ -437,7 +433,7 @@ class _Rows(dr.CustomOp):
     def backward(self) -> None:
         self.set_grad_in("image", self._permute(self.grad_out(), self.by_row, self.by_tile))
 
-    def _permute(self, values: Float, source: UInt, target: UInt) -> Any:
+    def _permute(self, values: Float, source: UInt, target: UInt) -> Float:
         types = types_of(values)
         result = dr.empty(types.Float, self.run * dr.width(source))
         dr.scatter(result, types.FloatX(gather_run(types, values, source, self.run, True)), target)

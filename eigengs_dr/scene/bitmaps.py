@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.types import PathLike, Record
 from ..image.color import to_coded
 from ..plugins import register_plugins  # first: its error says what to install
 from ..plugins.versions import Properties, texture_kind
@@ -57,12 +58,12 @@ class Use(NamedTuple):
 class Parsed(NamedTuple):
     """A scene that is parsed but not instantiated: all nodes, and the folder of its files."""
 
-    config: Any
-    state: Any
+    config: mi.parser.ParserConfig
+    state: mi.parser.ParserState
     folder: Path
 
 
-def parse(scene: Any, parameters: Mapping[str, str] | None = None) -> Parsed:
+def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None) -> Parsed:
     """Parse a scene, and make the names of its files absolute.
 
     Parameters
@@ -140,7 +141,7 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
     return uses, left
 
 
-def is_bitmap(node: Any) -> bool:
+def is_bitmap(node: mi.parser.SceneNode) -> bool:
     """Return whether a node of a parsed scene is a bitmap texture."""
     return node.type == texture_kind() and node.props.plugin_name() == "bitmap"
 

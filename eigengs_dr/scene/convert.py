@@ -11,9 +11,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arguments import takes_numbers
-from ..backend.feedback import shows_progress, warn
-from ..backend.recording import exclusive
+from ..backend.doors import door
+from ..backend.messages import warn
+from ..backend.progress import shows_progress
+from ..backend.types import PathLike, Record
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_coded
 from ..image.io import ImageError, save_image
@@ -95,10 +96,9 @@ class ConvertedScene(NamedTuple):
 
 
 @shows_progress
-@exclusive()
-@takes_numbers
+@door
 def convert_scene(
-    scene: str | os.PathLike[str] | dict[str, Any],
+    scene: PathLike | Record,
     output: str | os.PathLike[str],
     target_psnr: float = 40.0,
     iterations: int = 100,
@@ -191,7 +191,7 @@ def _silent(label: str, done: int, total: int) -> None:
 def _convert_into(
     work: Path,
     target: Path,
-    scene: str | os.PathLike[str] | dict[str, Any],
+    scene: PathLike | Record,
     parameters: Mapping[str, str] | None,
     target_psnr: float,
     iterations: int,
@@ -242,7 +242,7 @@ def _convert_into(
 
 
 def _convert(
-    scene: Any,
+    scene: PathLike | Record,
     parsed: Parsed,
     group: list[Use],
     pixels: NDArray[np.float32],
@@ -272,7 +272,7 @@ def _convert(
     return found
 
 
-def _texture(parsed: Parsed, use: Use) -> Any:
+def _texture(parsed: Parsed, use: Use) -> mi.Texture:
     """Return the texture of a scene that was made from what was parsed."""
     return parsed.state.nodes[use.parent].props[use.slot]
 
@@ -343,7 +343,10 @@ for the end of a pass."""
 
 
 def render_in_passes(
-    scene: Any, camera: int, spp: int | None, show: Callable[[int, int], None] = lambda *_: None
+    scene: mi.Scene,
+    camera: int,
+    spp: int | None,
+    show: Callable[[int, int], None] = lambda *_: None,
 ) -> tuple[NDArray[np.float32], int]:
     """Render a scene by one of its cameras; each pass has its own seed.
 
@@ -382,7 +385,7 @@ LOUDER = 8.0
 
 
 def compare_renderings(
-    before: Any, after: Any, folder: Path, spp: int | None, progress: Progress
+    before: mi.Scene, after: mi.Scene, folder: Path, spp: int | None, progress: Progress
 ) -> list[float]:
     """Render two scenes by each camera, with the same random numbers, and write the pictures.
 
@@ -414,7 +417,7 @@ def compare_renderings(
     return found
 
 
-def _picture(scene: Any, camera: int, spp: int | None) -> NDArray[np.float32]:
+def _picture(scene: mi.Scene, camera: int, spp: int | None) -> NDArray[np.float32]:
     """Render a scene in sRGB, shape (H, W, 3) or (H, W, 1)."""
     light, _ = render_in_passes(scene, camera, spp)
     channels = 3 if light.shape[2] >= 3 else 1

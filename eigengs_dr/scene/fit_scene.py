@@ -18,9 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
-from ..backend.arguments import takes_numbers
 from ..backend.arrays import types_in
-from ..backend.recording import exclusive
+from ..backend.doors import door
 from ..backend.selection import backend_of, select
 from ..fitting.fewest import fewest
 from ..fitting.measure import Row
@@ -84,8 +83,7 @@ class SceneFit(NamedTuple):
     tried: list[tuple[int, float]]
 
 
-@exclusive()
-@takes_numbers
+@door
 def fit_for_scene(
     scene: Any,
     texture: str | Texture | Sequence[str | Texture],

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, csr_array
 
-from ..backend.arrays import Float, upload
+from ..backend.arrays import upload
+from ..backend.types import Float, Floats
 from ..plugins.cone import PIXEL
 from ..plugins.properties import WRAPS, to_uv
 from ..plugins.versions import Interaction, Texture, texture_class
@@ -46,16 +47,14 @@ MAX_LAYERS = 16
 LAMP_BLOCKS = 16
 """Number of blocks along a side of a lamp. Their means count like what a pixel sees."""
 
-Floats = NDArray[np.floating]
-
 
 class View(NamedTuple):
     """A camera, the shapes with the texture, and the map from their uv to texels."""
 
-    scene: Any
-    sensor: Any
+    scene: mi.Scene
+    sensor: mi.Sensor
     shapes: list
-    to_texels: Any
+    to_texels: mi.ScalarTransform3f
     wrap: str
     size: tuple[int, int]
 
@@ -189,7 +188,7 @@ class Visibility(NamedTuple):
 
 
 def visibility(
-    scene: Any,
+    scene: mi.Scene,
     texture: str | Texture | Sequence[str | Texture],
     width: int,
     height: int,
@@ -256,7 +255,7 @@ def _name(texture: object) -> str:
     return repr(texture) if isinstance(texture, str) else "the texture"
 
 
-def _find(scene: Any, texture: str | Texture) -> tuple[Texture, list]:
+def _find(scene: mi.Scene, texture: str | Texture) -> tuple[Texture, list]:
     """Find the texture of a name, and the shapes that use it.
 
     Raises

@@ -1,15 +1,14 @@
-"""Files and folders that appear in one step, and who reads which file."""
+"""Files and folders that appear in one step."""
 
 from __future__ import annotations
 
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from ..backend.ending import undone_at_end
 from .locks import PREFIX, hold
@@ -176,30 +175,3 @@ def _names(path: str | os.PathLike[str]) -> Iterator[None]:
         if error.errno is None or (name and not name.startswith(PREFIX)):
             raise
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
-
-
-class Reader(NamedTuple):
-    """The reader of one format.
-
-    Attributes
-    ----------
-    read_set : callable
-        ``read_set(path, sections)`` returns the set as `Gaussians.load` takes it; `sections` is a
-        number, or None for all.
-    read_maps : callable
-        ``read_maps(path)`` returns the maps of the set, without its Gaussians.
-    """
-
-    read_set: Callable[..., Any]
-    read_maps: Callable[..., Any]
-
-
-READERS: dict[bytes, Reader] = {}
-"""Readers by the first bytes of a file. `eigengs_dr` registers that of packed sets."""
-
-
-def reader_of(path: str | os.PathLike[str]) -> Reader | None:
-    """Return the reader of a file, None for ``.npz``; `OSError` if it cannot be opened."""
-    with open(path, "rb") as file:
-        start = file.read(max(map(len, READERS), default=0))
-    return next((reader for magic, reader in READERS.items() if start.startswith(magic)), None)

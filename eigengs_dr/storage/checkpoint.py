@@ -8,12 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.ending import undone_at_end
+from ..backend.types import Arrays
 from . import npz
 from .atomic import atomic_folder, remove_folder, remove_stale
 from .locks import lock_output
@@ -126,7 +125,7 @@ class Checkpoint:
         """Whether the folder holds arrays."""
         return any(self.folder.glob("[!.]*.npz"))
 
-    def save(self, name: str, arrays: dict[str, NDArray[Any]]) -> None:
+    def save(self, name: str, arrays: Arrays) -> None:
         """Write arrays under a name, and replace older arrays of this name in one step.
 
         Raises
@@ -140,7 +139,7 @@ class Checkpoint:
         """Return whether arrays were saved under a name."""
         return (self.folder / f"{name}.npz").exists()
 
-    def load(self, name: str) -> dict[str, NDArray[Any]] | None:
+    def load(self, name: str) -> Arrays | None:
         """Return the arrays that were saved under a name, or None.
 
         Raises
@@ -156,7 +155,7 @@ class Checkpoint:
             path.unlink(missing_ok=True)
 
 
-def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+def write_arrays(path: Path, arrays: Arrays) -> None:
     """Write arrays of any names and types to a file, in one step.
 
     Raises
@@ -169,7 +168,7 @@ def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     npz.write(path, FORMAT, VERSION, {"layout": layout, **arrays}, compressed=False)
 
 
-def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path) -> Arrays:
     """Read arrays that `write_arrays` wrote.
 
     Raises

@@ -7,20 +7,18 @@ import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from ..backend.types import Arrays, Record, Values
 from .atomic import atomic_write
 from .memory import check_content
 
 MAX_ENTRIES = 1 << 26
 """Largest number of elements of one array; a file that claims more is refused."""
-
-
-Arrays = dict[str, NDArray[Any]]
 
 
 class BadValue(ValueError):
@@ -70,7 +68,7 @@ def write(
         If the file cannot be written; an existing file does not change.
     """
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        members: dict[str, Any] = {"format": np.array(name), "version": np.array(version), **arrays}
+        members: Record = {"format": np.array(name), "version": np.array(version), **arrays}
         (np.savez_compressed if compressed else np.savez)(file, **members)
 
 
@@ -175,7 +173,7 @@ def _check_format(archive: zipfile.ZipFile, name: str, version: int) -> None:
         )
 
 
-def _read_array(archive: zipfile.ZipFile, key: str, field: Field) -> NDArray[Any]:
+def _read_array(archive: zipfile.ZipFile, key: str, field: Field) -> Values:
     """Check the header of one array, then read the array."""
     _checked_shape(archive, key, field)
     with archive.open(f"{key}.npy") as file:

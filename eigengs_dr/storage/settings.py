@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
-Settings = dict[str, Any]
+from ..backend.types import Record
+
+Settings = Record
 
 
 def to_json(settings: Settings) -> Settings:

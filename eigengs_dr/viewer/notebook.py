@@ -17,7 +17,7 @@ from ..raster.render import picture_of
 from .pictures import first_components, photo_uri, within
 from .view import MAX_GAUSSIANS
 
-MAX_SIDE = 480
+MAX_SHOWN_SIDE = 480
 """Longest side of the picture of a set, in pixels. Smaller sets are shown at their size."""
 
 THUMBNAIL = 120
@@ -35,13 +35,13 @@ def _show_set(gaussians: Gaussians) -> str:
     if len(gaussians) > MAX_GAUSSIANS:  # drawing them takes seconds
         return _block(repr(gaussians))
     size = gaussians.width, gaussians.height
-    shown = picture_of(gaussians, *within(min(MAX_SIDE, max(size)), *size))
+    shown = picture_of(gaussians, *within(min(MAX_SHOWN_SIDE, max(size)), *size))
     return _block(repr(gaussians), *_images(shown))
 
 
 @to_html.register
 def _show_fit(fit: Fit) -> str:
-    step = -(-max(fit.gaussians.width, fit.gaussians.height) // MAX_SIDE)
+    step = -(-max(fit.gaussians.width, fit.gaussians.height) // MAX_SHOWN_SIDE)
     if isinstance(fit.image, Mapping):
         small = {name: image[::step, ::step] for name, image in fit.image.items()}
         return _block(repr(fit), *_images(small))
@@ -55,7 +55,7 @@ def _show_components(source: EigenGS | Eigenbasis) -> str:
 
 
 def _images(
-    pictures: NDArray[np.float32] | Mapping[str, NDArray[np.float32]], most: int = MAX_SIDE
+    pictures: NDArray[np.float32] | Mapping[str, NDArray[np.float32]], most: int = MAX_SHOWN_SIDE
 ) -> list[str]:
     """Return a picture, or pictures with their names, as HTML.
 

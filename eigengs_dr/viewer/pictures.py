@@ -15,7 +15,8 @@ from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import decode, rendered_as
 from ..image.io import check_data, check_image, to_8bit
-from ..image.resize import join_pictures, resample, text_line
+from ..image.resize import resample
+from ..image.sheet import join_pictures, text_line
 from ..raster.render import render
 
 OUTLINES = 800
@@ -244,7 +245,7 @@ def _captioned(text: str, *pictures: Picture) -> Picture:
     return join_pictures([text_line(text, pictures[0].shape[1]), *pictures], 0)
 
 
-MAX_SIDE = 2048
+MAX_PHOTO_SIDE = 2048
 """Longest side of a photo in a page, in pixels; larger photos are scaled down."""
 
 QUALITY = 92
@@ -272,7 +273,7 @@ def photo_uri(pixels: NDArray[np.float32]) -> str:
     from PIL import Image
 
     height, width = pixels.shape[:2]
-    small = resample(pixels, *within(min(MAX_SIDE, max(width, height)), width, height))
+    small = resample(pixels, *within(min(MAX_PHOTO_SIDE, max(width, height)), width, height))
     codes = to_8bit(small).astype(np.uint8)
     picture = Image.fromarray(codes[..., 0] if codes.shape[2] == 1 else codes)
     jpeg, png = BytesIO(), BytesIO()

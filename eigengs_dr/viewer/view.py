@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.recording import exclusive
+from ..backend.types import Record
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
@@ -67,7 +66,7 @@ class Page:
         return f'<iframe srcdoc="{escape(self.html)}" style="{style}"></iframe>'
 
 
-@cache
+@cache  # compiled once
 def _template() -> jinja2.Template:
     """Return the template of a page; an unknown value is an error, and text is escaped."""
     environment = jinja2.Environment(
@@ -79,7 +78,6 @@ def _template() -> jinja2.Template:
     return environment.get_template("page.html.j2")
 
 
-@exclusive()
 def view(
     source: Gaussians | Fit | EigenGS,
     image: ArrayLike | None = None,
@@ -173,7 +171,7 @@ def check_count(count: int) -> None:
         )
 
 
-def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> dict[str, Any]:
+def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> Record:
     """Return the arrays of a set for a page.
 
     Parameters
@@ -251,7 +249,7 @@ NAMES = {
 """What the channels of a model are called, by its space."""
 
 
-def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> dict[str, Any]:
+def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> Record:
     """Return the components of a model for a page.
 
     Parameters

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.families import small_model
 from _helpers.process import python_path, run_python
 from _helpers.waves import half_read, picture, start
 from eigengs_dr.backend import recording
+from eigengs_dr.backend.executor import LocalExecutor
 from eigengs_dr.backend.recording import (
     LARGEST_RECORDED,
     collector_off,
@@ -211,15 +213,34 @@ def test_gradients_beside_fits_have_the_bits_of_gradients_alone(backend):
         assert len({fit.result(WAIT).image.tobytes() for fit in fits}) == 1
 
 
-@pytest.mark.parametrize("use", ["fit", "arrays"])
+DOORS = {
+    "fit": lambda g, image: eg.fit(image, gaussians=40, iterations=0, backend="llvm"),
+    "fit_many": lambda g, image: eg.fit_many([image], gaussians=40, iterations=0, progress=False),
+    "render": lambda g, image: eg.render(g),
+    "picture_of": lambda g, image: eg.picture_of(g),
+    "tile_lists": lambda g, image: eg.tile_lists(g),
+    "concatenate": lambda g, image: eg.concatenate([g, g]),
+    "to_tensors": lambda g, image: eg.to_tensors(g),
+    "view": lambda g, image: eg.view(g),
+    "from_arrays": lambda g, image: eg.Gaussians.from_arrays(
+        [[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data", backend="llvm"
+    ),
+    "to_arrays": lambda g, image: g.to_arrays(),
+    "an index": lambda g, image: g[:2],
+    "scaled": lambda g, image: g.scaled(5, 5),
+    "bounded": lambda g, image: g.bounded(),
+    "a task": lambda g, image: list(LocalExecutor().map(lambda task, shared: task, [1])),
+    "encode": lambda g, image: small_model("llvm").encode(image),
+}
+"""Calls that take the lock, see `eigengs_dr.backend.doors`."""
+
+
+@pytest.mark.parametrize("use", DOORS)
 def test_calls_wait_for_the_block_of_another_thread(use):
-    image = picture()
-    calls = {
-        "fit": lambda: eg.fit(image, gaussians=40, iterations=0, backend="llvm"),
-        "arrays": start("llvm")[0].to_arrays,
-    }
+    image, gaussians = picture(), start("llvm")[0]
+    small_model("llvm")
     done = threading.Event()
-    thread = threading.Thread(target=lambda: (calls[use](), done.set()))
+    thread = threading.Thread(target=lambda: (DOORS[use](gaussians, image), done.set()))
     with exclusive():
         thread.start()
         assert not done.wait(0.2)

@@ -32,9 +32,10 @@ from _helpers.families import small_model
 from _helpers.low_rank import SIZE, assert_same, family
 from _helpers.process import run_python
 from _helpers.sets import check_equal
-from eigengs_dr.backend.executor import ClusterError, Done, executor_for
+from eigengs_dr.backend.executor import ClusterError, Done
 from eigengs_dr.backend.selection import describe
 from eigengs_dr.cluster import executor as module
+from eigengs_dr.cluster.client import executor_for
 from eigengs_dr.cluster.executor import connect
 from eigengs_dr.cluster.local import local_cluster
 from eigengs_dr.cluster.worker import Shared, package_versions, run_task, share

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from _helpers.errors import refused
 from _helpers.low_rank import planes
-from eigengs_dr.image.color import check_size, rgb_to_ycbcr, to_planes
+from eigengs_dr.image.color import rgb_to_ycbcr, to_planes
 from eigengs_dr.image.folder import (
     MAX_WAITING,
     MAX_WAITING_BYTES,
@@ -19,6 +19,7 @@ from eigengs_dr.image.folder import (
     read_blocks,
 )
 from eigengs_dr.image.io import ImageError, check_image, save_image
+from eigengs_dr.image.pixels import check_size
 from eigengs_dr.image.resize import center_crop
 
 WIDTH, HEIGHT = SIZE = (6, 5)

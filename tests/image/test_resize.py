@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eigengs_dr.image.resize import center_crop, join_pictures, resample, text_line
+from eigengs_dr.image.resize import center_crop, resample
+from eigengs_dr.image.sheet import join_pictures, text_line
 
 sizes = st.tuples(st.integers(1, 40), st.integers(1, 40))
 

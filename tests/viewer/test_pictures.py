@@ -5,7 +5,8 @@ import pytest
 
 from _helpers.families import small_basis, small_model
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.image.resize import GAP, resample
+from eigengs_dr.image.resize import resample
+from eigengs_dr.image.sheet import GAP
 from eigengs_dr.raster.render import render
 from eigengs_dr.viewer.pictures import (
     CELL,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.recording import exclusive
+from ...backend.doors import door
 from ...fitting.solvers.normal_equations import BATCH, NormalEquations, squared_norms
 from ...gaussian.gaussians import Gaussians, concatenate, with_colors
 from ...image.metrics import psnr_from_mse
@@ -26,7 +26,7 @@ from .bands import (
 from .shape_training import train_shapes
 
 
-@exclusive()
+@door
 def fit_model(
     basis: Eigenbasis,
     options: TrainOptions,

@@ -12,10 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...backend.arguments import takes_numbers
-from ...backend.feedback import shows_progress, to_html, warn
-from ...image.color import check_size, to_planes, ycbcr_to_rgb
-from ...image.folder import Source
+from ...backend.messages import warn
+from ...backend.notebook import to_html
+from ...backend.progress import shows_progress
+from ...image.color import to_planes, ycbcr_to_rgb
+from ...image.folder import TrainingImages
 from ...image.io import check_image
+from ...image.pixels import check_size
 from ...image.resize import resample
 from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
 from .incremental import orient, rank_for
@@ -66,13 +69,13 @@ class Eigenbasis:
     @takes_numbers
     def from_images(
         cls,
-        images: Source,
+        images: TrainingImages,
         size: tuple[int, int] = (256, 256),
         components: int | Sequence[int] = 300,
         energy: float | None = None,
         space: str = "ycbcr",
         progress: Any = None,
-        client: Any = None,
+        client: object = None,
         checkpoint: str | os.PathLike[str] | None = None,
     ) -> Eigenbasis:
         """Find the eigenbasis of a family of images in one pass.

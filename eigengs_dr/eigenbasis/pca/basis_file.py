@@ -6,11 +6,12 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...backend.types import Record
 from ...image.color import BASIS_SPACES
 from ...storage import npz
 
@@ -45,7 +46,7 @@ def write_basis(path: str | os.PathLike[str], basis: Eigenbasis) -> None:
     npz.write(path, FORMAT, VERSION, arrays, compressed=False)
 
 
-def read_basis(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_basis(path: str | os.PathLike[str]) -> Record:
     """Read the fields of an `eigengs_dr.Eigenbasis`; see its `load`."""
     head = npz.read(path, FORMAT, VERSION, LAYOUT)
     height, width = head["mean"].shape[1:]

@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from ...backend.types import Doubles, Singles
+
 BLOCK_BYTES = 768 << 20
 """Bytes of a block of images."""
 
 MAX_BLOCK = 1024
 """Most images in a block: its Gram matrix has as many rows."""
 
-MARGIN = 0.25
+EXTRA_SHARE = 0.25
 """Additional components from block to block, as a share of the components to keep."""
-
-Rows = NDArray[np.float32]
-Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +43,9 @@ class EigenState:
     """
 
     count: int
-    mean: Values
-    rows: Rows
-    scatter: Values
+    mean: Doubles
+    rows: Singles
+    scatter: Doubles
     squares: float
 
     def arrays(self) -> dict[str, NDArray]:
@@ -75,10 +74,10 @@ def block_length(size: tuple[int, int]) -> int:
 
 def rank_for(components: int) -> int:
     """Return how many rows a state needs for `components` accurate components at the end."""
-    return components + int(np.ceil(MARGIN * components))
+    return components + int(np.ceil(EXTRA_SHARE * components))
 
 
-def merge(state: EigenState, block: Rows, rank: int) -> EigenState:
+def merge(state: EigenState, block: Singles, rank: int) -> EigenState:
     """Add a block of images to a state, by one step of incremental PCA.
 
     With n images of mean m1 before and b new images of mean m2, the scatter matrix of all is ::
@@ -127,7 +126,9 @@ def merge_states(first: EigenState, second: EigenState, rank: int) -> EigenState
     return EigenState(n + m, mean, rows, scatter, squares)
 
 
-def _add_rows(state: EigenState, block: Rows, rank: int, count: int) -> tuple[Rows, Values, float]:
+def _add_rows(
+    state: EigenState, block: Singles, rank: int, count: int
+) -> tuple[Singles, Doubles, float]:
     """Add the rows of a block to the scatter matrix of a state; return the trace they add too."""
     old = len(state.rows)
     roots = np.sqrt(state.scatter)
@@ -162,7 +163,7 @@ FEW = 0.25
 of 0.05."""
 
 
-def product(a: Rows, b: Rows) -> Values:
+def product(a: Singles, b: Singles) -> Doubles:
     """Return ``a b^T`` of long rows; pure single precision would lose small variances."""
     result = np.zeros((len(a), len(b)))
     for first in range(0, a.shape[1], COLUMNS):
@@ -170,7 +171,7 @@ def product(a: Rows, b: Rows) -> Values:
     return result
 
 
-def largest_eigenpairs(gram: Values, most: int, floor: float) -> tuple[Values, Values]:
+def largest_eigenpairs(gram: Doubles, most: int, floor: float) -> tuple[Doubles, Doubles]:
     """Return the largest eigenvalues of a Gram matrix, and the weights of its rows.
 
     Parameters
@@ -203,7 +204,7 @@ def largest_eigenpairs(gram: Values, most: int, floor: float) -> tuple[Values, V
     return values[:kept], vectors[:, :kept] / np.sqrt(values[:kept])
 
 
-def orthonormalize(rows: Rows, scatter: Values) -> tuple[Rows, Values]:
+def orthonormalize(rows: Singles, scatter: Doubles) -> tuple[Singles, Doubles]:
     """Drop spurious rows and make the others orthonormal again after rounding.
 
     Parameters
@@ -230,7 +231,7 @@ def orthonormalize(rows: Rows, scatter: Values) -> tuple[Rows, Values]:
     return rows, scatter
 
 
-def orient(rows: Rows) -> Rows:
+def orient(rows: Singles) -> Singles:
     """Give each row the sign that makes its entry of largest size positive, as scikit-learn does.
 
     The eigenvectors of a matrix have no sign of their own: without this rule, rounding would choose

@@ -17,11 +17,12 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...backend.executor import completed, executor_for
-from ...backend.feedback import warn
-from ...image.folder import ReadProgress, Source, list_images, read_blocks
+from ...backend.executor import completed
+from ...backend.messages import warn
+from ...backend.types import Values
+from ...cluster.client import executor_for
+from ...image.folder import ReadProgress, TrainingImages, list_images, read_blocks
 from ...image.pixels import ImageError
 from ...image.remote import is_url
 from ...storage.checkpoint import read_arrays, write_arrays
@@ -35,7 +36,7 @@ BLOCKS_OF_SHARD = 4
 """If there are several shards, a block has this fraction of the images of `block_length`: 256 of
 256x256. A process then needs less than 1 GB."""
 
-Images = Sequence[Any] | NDArray[Any]
+Images = Sequence | Values
 """Files or single images, or one array of images."""
 
 
@@ -62,12 +63,12 @@ class Stream(NamedTuple):
 
 
 def find_states(
-    source: Source,
+    source: TrainingImages,
     size: tuple[int, int],
     space: str,
     ranks: Sequence[int],
     progress: ReadProgress | None = None,
-    client: Any = None,
+    client: object = None,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> list[EigenState]:
     """Find the state of each channel after all images of a source.
@@ -90,7 +91,7 @@ def find_states(
         return _merge_shards(images, stream, client, Path(folder))
 
 
-def is_countable(source: Any) -> bool:
+def is_countable(source: object) -> bool:
     """Whether a source is a sequence of files or of single images, which can be cut in shards."""
     if isinstance(source, np.ndarray):
         return source.ndim == 4 or (source.ndim == 3 and source.shape[2] not in (1, 3))
@@ -100,7 +101,7 @@ def is_countable(source: Any) -> bool:
     )
 
 
-def _merge_shards(images: Images, stream: Stream, client: Any, folder: Path) -> list[EigenState]:
+def _merge_shards(images: Images, stream: Stream, client: object, folder: Path) -> list[EigenState]:
     """Merge the states of shards in their order.
 
     In the folder, ``pca-C.npz`` is the state of channel C after the first shards, and their number.
@@ -162,7 +163,7 @@ def make_shard(task: tuple[int, Images], stream: Stream) -> tuple[list[EigenStat
     return states, notes + [str(note.message) for note in caught]
 
 
-def _find_states_of_part(images: Any, stream: Stream) -> list[EigenState]:
+def _find_states_of_part(images: Images, stream: Stream) -> list[EigenState]:
     """Find the state of each channel, block by block."""
     size, space, ranks, length, progress = stream
     states = [empty_state(size) for _ in ranks]

@@ -21,12 +21,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.feedback import warn
+from ...backend.messages import warn
+from ...backend.types import Doubles
 
 MIN_MSE = 1e-12
 """Smallest mean squared error, 120 dB; smaller errors are rounding of single precision."""
-
-Values = NDArray[np.float64]
 
 
 class TruncationCurve(NamedTuple):
@@ -42,7 +41,7 @@ class TruncationCurve(NamedTuple):
     """
 
     counts: NDArray[np.int64]
-    psnr: Values
+    psnr: Doubles
 
     def rank_for_psnr(self, target_psnr: float) -> tuple[int, ...]:
         """Find the fewest components of each channel that reach a PSNR.
@@ -72,7 +71,7 @@ class TruncationCurve(NamedTuple):
             _warn_out_of_reach(target_psnr, self.counts[-1], self.psnr[-1])
         return tuple(self.counts[reaches.argmax() if reaches.any() else -1].tolist())
 
-    def explained_variance_ratio(self) -> Values:
+    def explained_variance_ratio(self) -> Doubles:
         """Return the share of the initial error that the first 0, 1, ..., n components remove.
 
         Returns
@@ -85,7 +84,7 @@ class TruncationCurve(NamedTuple):
 
 
 def curve_from_residuals(
-    eigenvalues: Sequence[Values], left: Sequence[Values], entries: int
+    eigenvalues: Sequence[Doubles], left: Sequence[Doubles], entries: int
 ) -> TruncationCurve:
     """Build the curve of all channels from the residuals of each.
 
@@ -114,7 +113,7 @@ def curve_from_residuals(
 
 
 def curve_from_eigenvalues(
-    eigenvalues: Sequence[Values], variance: Values, entries: int
+    eigenvalues: Sequence[Doubles], variance: Doubles, entries: int
 ) -> TruncationCurve:
     """Build the curve of the training images from the eigenvalues alone.
 
@@ -137,7 +136,7 @@ def curve_from_eigenvalues(
 
 
 def min_ranks_per_channel(
-    left: Sequence[Values], entries: int, target_psnr: float
+    left: Sequence[Doubles], entries: int, target_psnr: float
 ) -> tuple[int, ...]:
     """Find the rank of each channel with the smallest sum that reaches a PSNR for one image.
 
@@ -170,7 +169,7 @@ def min_ranks_per_channel(
     return int(needed[j, k]), int(j), int(k)
 
 
-def residual_energy(total: float, gains: Values) -> Values:
+def residual_energy(total: float, gains: Doubles) -> Doubles:
     """Return ``total - sum_(i <= n) gains_i`` for n = 0, 1, ..., k, shape (k + 1,)."""
     return total - np.concatenate([[0.0], np.cumsum(gains, dtype=np.float64)])
 
@@ -181,7 +180,7 @@ def check_target(target_psnr: float) -> None:
         raise ValueError(f"target_psnr is {target_psnr}; expected a number of dB above 0")
 
 
-def _decibels(error: NDArray[np.float64] | float) -> Values:
+def _decibels(error: NDArray[np.float64] | float) -> Doubles:
     return -10 * np.log10(np.maximum(error, MIN_MSE))
 
 

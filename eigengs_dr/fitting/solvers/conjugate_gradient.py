@@ -86,8 +86,8 @@ def solve(
     """
     needed = (gaussians.width, gaussians.height, gaussians.channels)
     if (*objective.size, objective.channels) != needed:
-        shape = (*objective.size, objective.channels)
-        raise ValueError(f"solve: the image has width, height, channels {shape}, the set {needed}")
+        given = (*objective.size, objective.channels)
+        raise ValueError(f"solve: the image has width, height, channels {given}, the set {needed}")
     if steps < 0:
         raise ValueError(f"solve: steps is {steps}; it must be at least 0")
     with dr.suspend_grad():

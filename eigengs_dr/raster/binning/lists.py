@@ -13,16 +13,16 @@ for every core.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
-from ...backend.arrays import ArrayTypes, Bool, Float, UInt, make_divisor, types_of, upload
+from ...backend.arrays import ArrayTypes, make_divisor, types_of, upload
 from ...backend.detail import sorting_index
 from ...backend.recording import record
+from ...backend.types import Bool, FloatLike, UInt
 from ..evaluate import is_steep
 from .tiles import TILE, Grid, GridArrays, for_each_row, for_each_tile, granularity_of
 
@@ -56,13 +56,13 @@ class Pieces:
         numbers are part of the arguments, so that other sizes are traced anew.
     """
 
-    tile: Any
-    splat: Any
-    begin: Any
-    end: Any
-    slot: Any
-    first: Any
-    number: Any
+    tile: UInt
+    splat: UInt
+    begin: UInt
+    end: UInt
+    slot: UInt
+    first: UInt
+    number: UInt
     capacity: tuple[int, int]
 
 
@@ -97,17 +97,17 @@ class TileLists:
 
     grid: Grid
     sizes: GridArrays
-    splat: Any
-    begin: Any
-    end: Any
-    order: Any
-    image: Any
+    splat: UInt
+    begin: UInt
+    end: UInt
+    order: UInt
+    image: UInt | None
     pieces: Pieces | None
     capacity: int
-    steep: Any
+    steep: bool | Bool
     radius: float
 
-    def runs(self, begin: UInt, end: UInt) -> list[tuple[bool, Any, Any]]:
+    def runs(self, begin: UInt, end: UInt) -> list[tuple[bool, UInt, UInt]]:
         """Return loops over ``[begin, end)``: whether each takes exponentials, its begin and end.
 
         Where the device decides, there are two, of which it leaves one empty.
@@ -128,7 +128,7 @@ def build_lists(
     shape: list,
     radius: float,
     grid: Grid,
-    pad: Float = 0.0,
+    pad: FloatLike = 0.0,
     growth: float = 1.0,
     adjoint: bool = True,
     ordered: bool = True,
@@ -222,7 +222,7 @@ def steep_now(lists: TileLists, shape: list, radius: float) -> TileLists:
     return replace(lists, steep=found != 0)
 
 
-def _images(types: ArrayTypes, count: int, grid: Grid) -> Any:
+def _images(types: ArrayTypes, count: int, grid: Grid) -> UInt | None:
     """Return the image of each of `count` Gaussians; None if there is only one image."""
     if grid.images == 1:
         return None
@@ -243,8 +243,8 @@ def _padded(count: int) -> int:
 
 @record
 def _count_tiles(
-    shape: list, radius: float, wide: Float, grid: GridArrays, pad: Float
-) -> tuple[UInt, Any]:
+    shape: list, radius: float, wide: FloatLike, grid: GridArrays, pad: FloatLike
+) -> tuple[UInt, UInt]:
     """Return the number of tiles that each Gaussian touches, and totals for one copy to the host.
 
     The total holds the number of all entries, and 2^40 for each Gaussian that is steep.
@@ -252,7 +252,7 @@ def _count_tiles(
     types = types_of(shape[0])
     UInt64 = dr.uint64_array_t(types.UInt)
 
-    def add(row: UInt, first: UInt, last: UInt, total: UInt) -> Any:
+    def add(row: UInt, first: UInt, last: UInt, total: UInt) -> UInt:
         return total + types.UInt(dr.maximum(last - first, 0))
 
     touched = for_each_row(shape, wide, grid, add, types.UInt(0), pad=pad, label="count tiles")
@@ -264,10 +264,10 @@ def _count_tiles(
 @record
 def _list_tiles(
     shape: list,
-    radius: Float,
+    radius: FloatLike,
     grid: GridArrays,
-    pad: Float,
-    image: UInt,
+    pad: FloatLike,
+    image: UInt | None,
     touched: UInt,
     visits: int,
     capacity: tuple[int, int],
@@ -291,21 +291,21 @@ def _list_tiles(
 def _emit_tiles(
     types: ArrayTypes,
     shape: list,
-    radius: Any,
+    radius: FloatLike,
     grid: GridArrays,
-    pad: Float,
-    image: Float,
-    slots: tuple,
+    pad: FloatLike,
+    image: UInt | None,
+    slots: tuple[UInt, UInt],
     capacity: int,
-) -> Any:
+) -> UInt:
     """Write the tiles of each Gaussian to its slots ``[start, last)``."""
     start, last = slots
     # Zeros, because rounding could let the two walks differ by a tile in different programs.
     tiles = dr.zeros(types.UInt, capacity)
     dr.make_opaque(tiles)
-    first = types.UInt(0) if grid.image is None else image * grid.image.divisor
+    first = types.UInt(0) if grid.image is None or image is None else image * grid.image.divisor
 
-    def emit(tile: UInt, column: UInt, row: UInt, active: Bool, slot: UInt) -> Any:
+    def emit(tile: UInt, column: UInt, row: UInt, active: Bool, slot: UInt) -> UInt:
         tile = types.UInt(tile) + first
         dr.scatter(tiles, tile, slot, active & (slot < last))
         return slot + dr.select(active, types.UInt(1), 0)
@@ -314,11 +314,12 @@ def _emit_tiles(
     return tiles
 
 
-def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[Any, Any, Any]:
+def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[UInt, UInt, UInt]:
     """Return the order of the tiles, and the ranges of their lists in this order."""
     tile = dr.arange(types.UInt, grid.tiles)
     if ordered:
-        length = np.diff(starts.numpy().view(np.int32))
+        ends = starts.numpy().view(np.int32)
+        length = ends[1:] - ends[:-1]
         x, y = (np.arange(n, dtype=np.int32) // TILE_WINDOW for n in (grid.nx, grid.ny))
         window = (x + y[:, None] * (x[-1] + 1)).ravel()
         images = np.arange(grid.images, dtype=np.int32)[:, None]
@@ -385,7 +386,7 @@ keys up to 9 bits on cuda, where its counts fit into shared memory."""
 
 def transpose_by_counting(
     types: ArrayTypes, number: int, tile: UInt, last: UInt, entries: int, capacity: int
-) -> tuple[Any, Any]:
+) -> tuple[UInt, UInt]:
     """Transpose by SciPy's counting sort: one pass over the entries, on the host.
 
     Parameters
@@ -418,7 +419,9 @@ def transpose_by_counting(
     return splat, upload(types.UInt, by_tile.indptr.view(np.uint32))
 
 
-def transpose_pattern(columns: NDArray[np.int32], starts: NDArray[np.int32], number: int) -> Any:
+def transpose_pattern(
+    columns: NDArray[np.int32], starts: NDArray[np.int32], number: int
+) -> csc_array:
     """Return the transpose of a sparse pattern of rows, with its indices in ascending order."""
     # The values mean nothing: memory that is never written takes no room.
     unused = np.empty(len(columns), np.int8)
@@ -427,7 +430,7 @@ def transpose_pattern(columns: NDArray[np.int32], starts: NDArray[np.int32], num
 
 def transpose_by_sorting(
     types: ArrayTypes, number: int, tile: UInt, last: UInt, entries: int, capacity: int
-) -> tuple[Any, Any]:
+) -> tuple[UInt, UInt]:
     """Transpose by a stable radix sort of the bits that tiles need, on the device.
 
     The entries are in the order of Gaussians, and a stable sort by tile keeps it. No copy goes to
@@ -443,7 +446,7 @@ def transpose_by_sorting(
     return splat, _search(real, key, dr.arange(UInt, number + 1))
 
 
-def _sort_stably(key: Any, value: Any, bits: int) -> tuple[Any, Any]:
+def _sort_stably(key: UInt, value: UInt, bits: int) -> tuple[UInt, UInt]:
     """Sort keys of some bits, and values by their keys, from the lowest digit to the highest.
 
     `drjit.sort` always sorts all 32 or 64 bits.
@@ -460,7 +463,7 @@ def _sort_stably(key: Any, value: Any, bits: int) -> tuple[Any, Any]:
     return key, value
 
 
-def _search(size: Any, values: UInt, bound: UInt) -> Any:
+def _search(size: UInt, values: UInt, bound: UInt) -> UInt:
     """Return how many of the first `size` values, which ascend, are below each bound.
 
     The steps depend on the number of bits of the width only, so that few programs serve all sizes;

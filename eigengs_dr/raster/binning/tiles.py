@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, Divisor, Float, UInt, make_divisor, rcp, rsqrt, types_of
+from ...backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
+from ...backend.types import Bool, Float, FloatLike, UInt
 
 
 class Granularity(NamedTuple):
@@ -136,23 +137,23 @@ class GridArrays:
     tile : (int, int)
     """
 
-    width: Any
-    height: Any
-    ny: Any
+    width: Float
+    height: Float
+    ny: UInt
     row: Divisor
     image: Divisor | None
     tile: tuple[int, int]
 
     @property
-    def nx(self) -> Any:
+    def nx(self) -> UInt:
         """Number of columns of tiles, as Int32."""
         return dr.int32_array_t(self.row.divisor)(self.row.divisor)
 
-    def image_of(self, tile: UInt) -> Any:
+    def image_of(self, tile: UInt) -> UInt | None:
         """Return the image of a tile, by its index among all tiles; None for a single image."""
         return None if self.image is None else self.image.divmod(tile)[0]
 
-    def first_pixel(self, tile: UInt) -> tuple[Any, Any]:
+    def first_pixel(self, tile: UInt) -> tuple[UInt, UInt]:
         """Return the column and the row of the first pixel of a tile in its image, as integers."""
         if self.image is not None:
             tile = self.image.divmod(tile)[1]
@@ -161,8 +162,8 @@ class GridArrays:
 
 
 def tile_columns(
-    shape: list, radius: Any, grid: GridArrays, row: UInt, pad: Float = 0.0
-) -> tuple[Any, Any]:
+    shape: list, radius: FloatLike, grid: GridArrays, row: UInt, pad: FloatLike = 0.0
+) -> tuple[UInt, UInt]:
     """Return the columns `[first, last)` that the ellipse of a Gaussian touches in a row of tiles.
 
     The ellipse is ``(a dx + b dy)^2 + (c dy)^2 <= radius^2``. At height dy its right edge is
@@ -197,7 +198,7 @@ def tile_columns(
     b1, c1 = b * larger, c * larger
     peak = -radius * b1 * rsqrt(dr.fma(b1, b1, c1 * c1)) * rcp(c)
 
-    def half_width(dy: Float) -> Any:
+    def half_width(dy: Float) -> Float:
         return dr.safe_sqrt(radius * radius - dr.square(c * dy))
 
     inverse = rcp(a)
@@ -213,7 +214,9 @@ def tile_columns(
     return dr.select(hit, Int(first), 0), dr.select(hit, Int(last), 0)
 
 
-def tile_rows(shape: list, radius: Any, grid: GridArrays, pad: Float = 0.0) -> tuple[Any, Any]:
+def tile_rows(
+    shape: list, radius: FloatLike, grid: GridArrays, pad: FloatLike = 0.0
+) -> tuple[UInt, UInt]:
     """Return the rows of tiles `[first, last)` that the ellipse may touch; see `tile_columns`."""
     Int = types_of(shape[0]).Int
     my, c = shape[1], shape[4]
@@ -226,16 +229,20 @@ def tile_rows(shape: list, radius: Any, grid: GridArrays, pad: Float = 0.0) -> t
     return dr.select(finite, Int(first), 0), dr.select(finite, Int(last), 0)
 
 
+State = TypeVar("State")
+"""What a loop carries: arrays, or lists of them."""
+
+
 def for_each_row(
     shape: list,
-    radius: float,
+    radius: FloatLike,
     grid: GridArrays,
-    visit: Callable[..., Any],
-    state: Any,
+    visit: Callable[[UInt, UInt, UInt, State], State],
+    state: State,
     *,
-    pad: Float = 0.0,
+    pad: FloatLike = 0.0,
     label: str,
-) -> Any:
+) -> State:
     """Call `visit` for every Gaussian and every row of tiles that its ellipse may touch.
 
     Parameters
@@ -252,7 +259,7 @@ def for_each_row(
     """
     row, stop = tile_rows(shape, radius, grid, pad)
 
-    def body(row: UInt, state: Any) -> tuple:
+    def body(row: UInt, state: State) -> tuple[UInt, State]:
         first, last = tile_columns(shape, radius, grid, row, pad)
         return row + 1, visit(row, first, last, state)
 
@@ -263,14 +270,14 @@ def for_each_row(
 
 def for_each_tile(
     shape: list,
-    radius: float,
+    radius: FloatLike,
     grid: GridArrays,
-    visit: Callable[..., Any],
-    state: Any,
+    visit: Callable[[UInt, UInt, UInt, Bool, State], State],
+    state: State,
     *,
-    pad: Float = 0.0,
+    pad: FloatLike = 0.0,
     label: str,
-) -> Any:
+) -> State:
     """Call `visit` for every Gaussian and every tile that its ellipse touches, row by row.
 
     Lanes of a packet wait in every row for the longest row. One loop over rows and columns would
@@ -295,8 +302,8 @@ def for_each_tile(
         The final `state`.
     """
 
-    def visit_row(row: UInt, first: Float, last: UInt, state: Any) -> Any:
-        def body(column: UInt, state: Any) -> tuple:
+    def visit_row(row: UInt, first: UInt, last: UInt, state: State) -> State:
+        def body(column: UInt, state: State) -> tuple[UInt, State]:
             tile = row * grid.nx + column
             return column + 1, visit(tile, column, row, column < last, state)
 

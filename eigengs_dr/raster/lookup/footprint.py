@@ -6,7 +6,8 @@ import math
 
 import drjit as dr
 
-from ...backend.arrays import Bool, Float, UInt, rcp, rsqrt
+from ...backend.arrays import rcp, rsqrt
+from ...backend.types import Bool, Float, UInt
 from ..evaluate import falloff, weights, widen
 from ..parameters import EXP2_SCALE, kernel_covariance
 from .points import Packed, Terms, in_list_order

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from ...backend.arrays import Bool, Float, UInt, types_of
+from ...backend.arrays import types_of
+from ...backend.types import Bool, Float, Mask, UInt
 from ..binning.lists import build_lists
 from ..binning.tiles import Grid
 from ..evaluate import LN2, weights
@@ -56,7 +57,7 @@ class Packed:
         """The cutoff in the units of the kernels."""
         return kernel_radius(self.cutoff)
 
-    def gather(self, index: UInt, active: Bool = True) -> tuple[list, list]:
+    def gather(self, index: UInt, active: Mask = True) -> tuple[list, list]:
         """Return the shape and the channels of the Gaussians `index`."""
         number = NUM_SHAPE_PARAMS + self.channels
         rows = unpack_parameters(self.values, index, number, active)
@@ -254,7 +255,7 @@ def sum_range(
     """Sum the Gaussians ``index[begin:end]`` with another range at each point."""
     types = types_of(packed.values)
     ordered = packed.arranged is not None
-    source = replace(packed, values=packed.arranged) if ordered else packed
+    source = packed if packed.arranged is None else replace(packed, values=packed.arranged)
 
     def add(i: UInt, end: UInt, x: Float, y: Float, sums: list) -> tuple:
         here = i < end

@@ -19,7 +19,8 @@ from typing import Any
 
 import drjit as dr
 
-from ...backend.arrays import Bool, Float, UInt, rcp, rsqrt, types_of
+from ...backend.arrays import rcp, rsqrt, types_of
+from ...backend.types import Bool, Float, UInt
 from ..evaluate import weights, widen
 from ..parameters import gather_index, kernel_covariance, unpack_parameters
 from .footprint import filtered_terms, inside_share

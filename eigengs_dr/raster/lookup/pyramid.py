@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, Bool, Float, UInt, rcp, rsqrt, types_of
+from ...backend.arrays import ArrayTypes, rcp, rsqrt, types_of
+from ...backend.types import Bool, DrJitArray, Float, UInt
 from ..binning.lists import TileLists, build_lists
 from ..binning.tiles import Grid
 from ..evaluate import falloff, widen
@@ -207,7 +208,7 @@ def sum_pyramid(
 
 def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Float) -> list:
     """Return first, nx, ny, dx, dy of the coarsest level for footprints with this variance."""
-    kinds = (types.UInt, types.Float, types.Float, types.Float, types.Float)
+    kinds: list[type[DrJitArray]] = [types.UInt, *4 * [types.Float]]
     picked: list = []
     for level in levels:
         row = (level.first, level.nx, level.ny, level.dx, level.dy)

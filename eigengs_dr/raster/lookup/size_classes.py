@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import numpy as np
 
-from ...backend.arrays import Float, UInt, types_of, upload
+from ...backend.arrays import types_of, upload
+from ...backend.types import Float, UInt
 from ...gaussian.covariance import max_deviation
 from ..evaluate import widen
 from ..parameters import EXP2_SCALE, kernel_radius

@@ -1,0 +1,45 @@
+"""Doors: what callers reach the package by, and the one place where these take the lock of Dr.Jit.
+
+A public function that uses Dr.Jit is a door, and so is each public method of a class of doors.
+What is reached through doors alone needs no lock. Work that has no door takes `exclusive` itself:
+a group of images, a block, a task of a cluster.
+"""
+
+from __future__ import annotations
+
+from functools import wraps
+from inspect import isfunction
+from typing import TypeVar, cast
+
+from .arguments import Function, takes_numbers
+from .recording import exclusive
+
+Kind = TypeVar("Kind", bound=type)
+
+
+def door(function: Function) -> Function:
+    """Decorate a public function that uses Dr.Jit.
+
+    No other thread uses Dr.Jit during a call: without that, threads end the process or hang, see
+    `eigengs_dr.backend.recording`. Numbers may be those of NumPy, see `takes_numbers`.
+    """
+    plain = takes_numbers(function)
+
+    @wraps(function)
+    def call(*values: object, **options: object) -> object:
+        with exclusive():
+            return plain(*values, **options)
+
+    return cast(Function, call)
+
+
+def class_of_doors(kind: Kind) -> Kind:
+    """Decorate a class, so that its public methods and ``[...]`` are doors; properties are none."""
+    for name, member in list(vars(kind).items()):
+        if name.startswith("_") and name != "__getitem__":
+            continue
+        if isinstance(member, classmethod):
+            setattr(kind, name, classmethod(door(member.__func__)))
+        elif isfunction(member):
+            setattr(kind, name, door(member))
+    return kind

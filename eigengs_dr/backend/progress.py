@@ -1,0 +1,88 @@
+"""Bars that show how far a call is, in a terminal or a notebook."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from inspect import signature
+from typing import Any, TypeVar
+
+DELAY = 2.0
+"""Seconds before a bar appears."""
+
+Progress = Callable[..., None] | bool | None
+"""What callers give, see `shows_progress`."""
+
+Function = TypeVar("Function", bound=Callable[..., object])
+
+
+def shows_progress(function: Function) -> Function:
+    """Decorate a function with an argument ``progress``, so that it shows a bar by itself.
+
+    None and True make a bar that appears after `DELAY` seconds, in a notebook or if standard error
+    is a terminal. False shows nothing. A function ``progress(done, total, row)`` is called.
+    """
+    arguments = signature(function)
+
+    @wraps(function)
+    def call(*values: object, **options: object) -> object:
+        bound = arguments.bind(*values, **options)
+        with progress_bar(bound.arguments.get("progress"), function.__name__) as show:
+            bound.arguments["progress"] = show
+            return function(*bound.args, **bound.kwargs)
+
+    return call  # type: ignore[return-value]
+
+
+@contextmanager
+def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable[..., None] | None]:
+    """Show a bar during a block, and return what reports progress.
+
+    Parameters
+    ----------
+    progress : bool or callable, optional
+        See `shows_progress`.
+    name : str, optional
+        What stands before the bar.
+
+    Yields
+    ------
+    callable or None
+        ``show(done, total, row)``, or with a label before these; a new label restarts the bar. The
+        bar shows ``psnr_rgb`` of the row, which may be left out. None if nobody sees a bar.
+    """
+    if callable(progress):
+        yield progress
+        return
+    if progress is False or not _is_watched():
+        yield None
+        return
+    from tqdm.auto import tqdm
+
+    with tqdm(desc=name, delay=DELAY, leave=False) as bar:
+
+        def show(*values: Any) -> None:
+            if isinstance(values[0], str):
+                label, *values = values  # type: ignore[assignment]
+                if label != bar.desc:
+                    bar.set_description_str(label, refresh=False)
+                    if bar.n:  # else it would be shown at once
+                        bar.reset()
+            done, bar.total, *rest = values
+            row = rest[0] if rest else None
+            psnr = row.get("psnr_rgb") if isinstance(row, dict) else getattr(row, "psnr_rgb", None)
+            if psnr is not None:
+                bar.set_postfix_str(f"psnr_rgb {psnr:.2f} dB", refresh=False)
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def _is_watched() -> bool:
+    """Return whether somebody sees a bar: in a notebook, or in a terminal."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if shell is not None and hasattr(shell, "kernel"):
+        return True
+    return sys.stderr is not None and sys.stderr.isatty()

@@ -1,0 +1,32 @@
+"""Packed sets, ``.egs``, for what reads sets of any format.
+
+The codec, which is above this folder, reads them: `eigengs_dr` puts functions of
+`eigengs_dr.codec.egs` here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+TYPE_CHECKING = False  # the package imports this module before all else
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from .channels import TextureMap
+    from .file import SetData
+
+MAGIC = b"\x89EGS"
+"""First bytes of a file. The first byte is no ASCII character, so no text file starts with it."""
+
+read_set: Callable[[Path, int | None], SetData]
+"""``read_set(path, sections)`` reads a set; `sections` is a number, or None for all."""
+
+read_maps: Callable[[Path], tuple[TextureMap, ...]]
+"""``read_maps(path)`` reads the maps of a set, without its Gaussians."""
+
+
+def is_packed(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is a packed set; `OSError` if it cannot be opened."""
+    with open(path, "rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
