@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 import eigengs_dr as eg
 from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate
 from eigengs_dr.fitting.descent import State, begin, descend
-from eigengs_dr.fitting.objective import Pixels, data_of
+from eigengs_dr.fitting.objective import Pixels, data_of, picture
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.pixels import read_pixels
 from eigengs_dr.fitting.place import Adaptive
 from eigengs_dr.fitting.start import load_start, set_in, start_from, types_for
 from eigengs_dr.image.metrics import MAX_PSNR
-from eigengs_dr.paper.eigengs import EIGENGS, EigenGSMethod
+from eigengs_dr.paper.eigengs import EIGENGS
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 Image = NDArray[np.float32]  # RGB, shape (H, W, 3), 1 is white
@@ -59,16 +59,17 @@ def start(image: Image, options: FitOptions) -> Run:
     pixels, space = read_pixels(image, space)
     height, width = pixels.shape[:2]
     data = data_of(pixels, space)
-    objective = Pixels.of(data, space, types_for(source, options.backend))
+    types = types_for(source, options.backend)
+    shown = picture(types, space, [pixels], [data])
+    objective = replace(Pixels.of(data, space, types), pictures=(shown,))
     if source is None:
         count = options.count_for(width * height)
         placed = method.place_and_solve(objective, count, options.seed)
         return Run(objective, begin(placed, chosen=method.place != Adaptive()))
     objective, begun = start_from(source, objective, method, pixels, moves=True)
-    run = Run(objective, begin(begun, chosen=True))
-    if isinstance(method, EigenGSMethod) and not isinstance(source, eg.Gaussians):
-        return run._replace(mean_image=method.mean_image(source, width, height))
-    return run
+    base = objective.pictures[0].base
+    mean_image = 0.0 if base is None else objective.picture(base).numpy()
+    return Run(objective, begin(begun, chosen=True), mean_image)
 
 
 def follow(
