@@ -162,7 +162,12 @@ class Method:
         return placed if self.place.has_colors else solve(placed, objective, self.solve_steps)
 
     def start_from(self, objective: Pixels, gaussians: Gaussians) -> Gaussians:
-        """Return a set with better colours for the image: the solve goes on from its own."""
+        """Return a set with better colours for the image: the solve goes on from its own.
+
+        A method whose placement has colours solves for none here either.
+        """
+        if self.place.has_colors:
+            return gaussians
         return solve(gaussians, objective, self.solve_steps, warm_start=True)
 
     needs_model = False
