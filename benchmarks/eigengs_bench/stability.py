@@ -93,7 +93,7 @@ def _start(case: Case, image: Image, backend: str | None) -> eg.Gaussians:
     assert case.place is not None
     generator = np.random.default_rng(0)
     mean, factor = case.place(image, case.gaussians, generator)
-    size, color = (image.shape[1], image.shape[0]), np.zeros((case.gaussians, 3))
+    size, color = (image.shape[1], image.shape[0]), generator.uniform(0, 1, (case.gaussians, 3))
     return eg.Gaussians.from_arrays(mean, factor, color, size=size, backend=backend)
 
 

@@ -143,6 +143,7 @@ def test_cases_start_as_users_do(backend):
     assert found["end_ycbcr"] > found["start_ycbcr"] + 5
     stays = stability.measure_cell(heap, "gaussianimage", backend)
     assert stays["finite"] and stays["end_ycbcr"] < found["end_ycbcr"]
+    assert stays["start_ycbcr"] < found["start_ycbcr"]  # it solves for no colours
 
 
 def test_units_of_data_change_nothing(backend):
