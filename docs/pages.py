@@ -20,7 +20,7 @@ def write_pages() -> None:
     many = eg.fit(coffee, 20_000)
     eg.view(many, coffee, title="A photo").save(folder / "photo.html")
     counts = eg.level_counts(5000, 4)
-    nested = eg.fit(cat, 5000, levels=4)
+    nested = eg.fit(cat, counts)
     eg.view(nested, cat, levels=counts, title="Levels of detail").save(folder / "levels.html")
     model = EigenGS.load("natural")
     eg.view(model, coffee, title="An eigenbasis").save(folder / "model.html")

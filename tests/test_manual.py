@@ -13,8 +13,6 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import small_model
 from eigengs_dr.cli.main import main
-from eigengs_dr.fitting.options import PRESETS, Preset
-from eigengs_dr.fitting.schedule import Schedule
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs"
@@ -180,8 +178,13 @@ def space(tmp_path, monkeypatch):
         "array": np.tile(image, (3, 3, 1)),
     }
     space |= {"a": image, "r": image[..., :1], "n": n, "model": model, "result": result}
-    space |= {"gaussians": result.gaussians, "files": ["a", "b"], "fit_one": fit_one}
-    return space | {"PRESETS": dict(PRESETS), "Preset": Preset, "Schedule": Schedule}
+    space |= {
+        "h": image[..., 1:2],
+        "gaussians": result.gaussians,
+        "files": ["a", "b"],
+        "fit_one": fit_one,
+    }
+    return space
 
 
 def small(code):
@@ -203,6 +206,17 @@ def test_python_of_a_page_runs(page, space):
     run_blocks(page, space, small)
     for texture in TEXTURE.findall(page.read_text()):
         mi.load_string(f'<texture version="3.0.0" {texture}')
+
+
+def test_parts_of_ones_own_fit(space):
+    """Each part of a method on the page takes steps that gain, or places as well."""
+    made = run_blocks(FOLDER / "extending.md", space, small)
+    for name in ("placed", "signs", "colored", "calm"):
+        found = made[name]
+        assert len(found.gaussians) == 200 and np.isfinite(found.image).all()
+        assert found.psnr_ycbcr > found.trace[0]["psnr_ycbcr"] + 1, name
+    assert made["colored"].psnr_ycbcr > eg.fit(made["image"], 200, 0).psnr_ycbcr + 1
+    assert [row.status for row in made["rows"]] == ["done", "done"]
 
 
 TEXTS = {str(page.relative_to(ROOT)): page.read_text() for page in PAGES}

@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,11 +17,14 @@ NEED_MITSUBA = ("convert_scene", "fit_for_scene", "register_plugins")
 def functions():
     """Yield the public functions and methods, by their names."""
     for name in eg.__all__:
+        if name == "Method":  # fits call its methods; what it is made of is tested below
+            continue
         if name in NEED_MITSUBA:
             pytest.importorskip("mitsuba", reason="scenes need mitsuba")
         thing = getattr(eg, name)
         if not inspect.isclass(thing):
-            yield name, thing
+            if callable(thing):
+                yield name, thing
             continue
         for method in vars(thing):
             if not method.startswith("_") and callable(getattr(thing, method)):
@@ -47,12 +51,22 @@ def test_what_is_no_number_is_refused_in_one_line():
     assert checked > 30
 
 
+@pytest.mark.parametrize("name", ["cutoff", "solve_steps", "warm_up", "decay"])
+def test_what_is_no_number_of_a_method_is_refused_in_one_line(name):
+    for wrong in ("5", True, [1]):
+        with pytest.raises(ValueError, match=f"^{name} is .*; it must be a"):
+            replace(eg.DEFAULT, **{name: wrong})
+
+
 def test_a_fit_takes_numbers_of_numpy(tmp_path):
     image = family(1, side=16)[0]
     n = np.int64
-    plain = eg.fit(image, 20, iterations=3, solve_steps=2, seed=1, cutoff=2.5, levels=2)
-    numbers = {"iterations": np.int32(3), "solve_steps": n(2), "seed": np.uint8(1), "levels": n(2)}
-    result = eg.fit(image, n(20), cutoff=np.float32(2.5), **numbers)
+    method = replace(eg.DEFAULT, solve_steps=2, cutoff=2.5)
+    plain = eg.fit(image, [5, 20], iterations=3, seed=1, method=method)
+    assert eg.level_counts(n(20), n(2)) == [5, 20]
+    numbers = {"iterations": np.int32(3), "seed": np.uint8(1)}
+    method = replace(eg.DEFAULT, solve_steps=n(2), cutoff=np.float32(2.5))
+    result = eg.fit(image, np.array([5, 20]), method=method, **numbers)
     for name, array in plain.gaussians.to_arrays().items():
         np.testing.assert_array_equal(array, result.gaussians.to_arrays()[name])
     json.dumps([result.iterations, result.gaussians.cutoff])

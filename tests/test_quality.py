@@ -1,15 +1,20 @@
 """A guard on quality: the PSNR of small fits, on llvm, may not fall."""
 
+from dataclasses import replace
+
 import pytest
 
 import eigengs_dr as eg
 from _helpers.families import family, fidelity, rendered, small_model
 from _helpers.photos import coffee
+from eigengs_dr.fitting.place import Grid
+from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 SLACK = 0.2
 """Decibels by which a PSNR may lie below the recorded value."""
 
 COUNT = {"gaussians": 300, "iterations": 60}
+GRID = replace(eg.DEFAULT, place=Grid())
 NATURAL = {"start": eg.EigenGS.load("natural", "llvm")}
 
 FITS = {
@@ -18,8 +23,8 @@ FITS = {
     "rgb": ("face", {**COUNT, "space": "rgb"}, 35.40, 41.51),
     "linear": ("face", {**COUNT, "space": "linear"}, 34.65, 40.80),
     "start": ("face", {**COUNT, "iterations": 0}, 29.05, 35.26),
-    "grid": ("face", {**COUNT, "iterations": 0, "init": "grid"}, 25.87, 32.08),
-    "gaussianimage": ("face", {**COUNT, "iterations": 300, "preset": "gaussianimage"}, 9.39, 14.56),
+    "grid": ("face", {**COUNT, "iterations": 0, "method": GRID}, 25.87, 32.08),
+    "gaussianimage": ("face", {**COUNT, "iterations": 300, "method": GAUSSIANIMAGE}, 9.39, 14.56),
     "basis": ("astronaut", {**NATURAL, "iterations": 0}, 32.74, 38.85),
     "basis, 20 steps": ("astronaut", {**NATURAL, "iterations": 20}, 37.08, 43.14),
 }
@@ -49,7 +54,7 @@ def test_fit(name):
 def test_search():
     """The target is reached, by as few Gaussians; another CPU rounds otherwise, so a few more."""
     image = photo("face")
-    found = eg.fit(image, target_psnr=32, target_space="ycbcr", iterations=60, backend="llvm")
+    found = eg.fit(image, target_psnr=eg.Goal(32, "ycbcr"), iterations=60, backend="llvm")
     assert found.stopped == "met"
     assert eg.psnr(image, found.image, space="ycbcr") >= 32
     assert len(found.gaussians) <= 1.1 * 42
@@ -57,7 +62,7 @@ def test_search():
 
 def test_levels():
     image = photo("face")
-    gaussians = eg.fit(image, 300, levels=2, iterations=60, backend="llvm").gaussians
+    gaussians = eg.fit(image, [75, 300], iterations=60, backend="llvm").gaussians
     check(image, eg.picture_of(gaussians[:75]), 28.86, 35.06)
     check(image, eg.picture_of(gaussians), 35.16, 41.39)
 

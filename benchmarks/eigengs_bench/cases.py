@@ -26,7 +26,8 @@ class Case(NamedTuple):
     """One thing that may go wrong.
 
     ``image()`` makes the image. `place`, a `Placement`, returns means and factors to start from;
-    None for the start of the preset. `rates` multiplies the rates of the preset.
+    None for the start of the method. `rates` multiplies the rates of the method. `space` is that of
+    the fit, by default its own.
     """
 
     name: str
@@ -35,6 +36,8 @@ class Case(NamedTuple):
     iterations: int = ITERATIONS
     place: Callable[..., Shapes] | None = None
     rates: float = 1.0
+    space: str | None = None
+    seeds: Sequence[int] = (0,)
 
 
 def photo(width: int = SIDE, height: int = SIDE) -> Image:
@@ -91,6 +94,11 @@ def _noise() -> Image:
 def _foreign() -> Image:
     inverted = np.indices((SIDE, SIDE))[0] // STRIPE % 2 == 1
     return np.where(inverted[..., None], 1 - photo(), photo())
+
+
+def _data(scale: float, offset: float) -> Image:
+    """Return the photo as data of another unit; a fit does not depend on it."""
+    return photo() * np.float32(scale) + np.float32(offset)
 
 
 def _grey(plane: NDArray[np.number]) -> Image:
@@ -151,6 +159,16 @@ _ALL = (
     *(Case(place.__name__, photo, place=place) for place in (needles, subpixel, heap, outside)),
     Case("fast", photo, rates=10.0),
     Case("long", photo, iterations=10_000),
+    Case("seeds", photo, seeds=range(5)),
+    *(
+        Case(name, partial(_data, *unit), space="data")
+        for name, unit in {
+            "data": (1, 0),
+            "data x 1e-6": (1e-6, 0),
+            "data x 1e6": (1e6, 0),
+            "data + 1000": (1, 1000),
+        }.items()
+    ),
 )
 
 CASES = {case.name: case for case in _ALL}

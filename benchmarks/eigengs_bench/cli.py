@@ -144,10 +144,10 @@ def pictures() -> None:
     """Draw the curves, histograms and pictures of the paper, with our fits.
 
     \b
-    iterations  fits at iterations 0, 10, 100 and the last, by every preset
+    iterations  fits at iterations 0, 10, 100 and the last, by every method
     colors      fits in YCbCr and in RGB, and their errors
     curves      PSNR every 50 iterations
-    tiles       a slow gradient by every preset, and its errors
+    tiles       a slow gradient by every method, and its errors
     radii       how large Gaussians are, with the frequency-aware split and without
     split       what Gaussians for low and for high frequencies render alone
     cross       images projected on bases of other images
@@ -194,12 +194,12 @@ def number_of_gaussians() -> None:
 
 @question("stability")
 @click.option("--case", "cases", multiple=True, help="By default all; may be repeated.")
-@several("--preset", "presets", PRESETS, "By default all", PRESETS)
+@several("--preset", "presets", PRESETS, "Methods, by default all", PRESETS)
 @number("--iterations", "Most steps of a fit.", 10_000, 0)
 def stability() -> None:
-    """Try every preset on hard cases: odd images, odd starts, rates too high.
+    """Try every method on hard cases: odd images, odd starts, rates too high, seeds, units.
 
-    All cases take two minutes.
+    All cases take three minutes.
     """
 
 

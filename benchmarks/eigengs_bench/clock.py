@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -11,13 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 import eigengs_dr as eg
-from eigengs_dr.fitting.descent import FitProblem, descend
+from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate
+from eigengs_dr.fitting.descent import State, begin, descend
+from eigengs_dr.fitting.objective import Pixels, data_of, picture
 from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO, Schedule
-from eigengs_dr.fitting.start import initialize, mean_picture
+from eigengs_dr.fitting.pixels import read_pixels
+from eigengs_dr.fitting.place import Adaptive
+from eigengs_dr.fitting.start import load_start, set_in, start_from, types_for
 from eigengs_dr.image.metrics import MAX_PSNR
+from eigengs_dr.paper.eigengs import EIGENGS
+from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 Image = NDArray[np.float32]  # RGB, shape (H, W, 3), 1 is white
+
+METHODS = {"default": eg.DEFAULT, "gaussianimage": GAUSSIANIMAGE, "eigengs": EIGENGS}
+"""The methods that are compared, by name."""
+
+WARM_STEPS = 10
+"""Steps of a fit that compiles the programs of others."""
+
+SOON = {Redistribute: Redistribute(after=1), Relocate: Relocate(every=3), Perturb: Perturb(every=3)}
+"""Controls that act within `WARM_STEPS`."""
 
 
 class Moment(NamedTuple):
@@ -29,47 +42,74 @@ class Moment(NamedTuple):
     picture: Image
 
 
+class Run(NamedTuple):
+    """A descent before its first step, and the RGB that comes on top of its pictures, or 0."""
+
+    objective: Pixels
+    state: State
+    mean_image: Image | float = 0.0
+
+
+def start(image: Image, options: FitOptions) -> Run:
+    """Start as `eigengs_dr.fit` does, for the state after each step, which that does not show."""
+    method, source = options.method, None
+    if options.start is not None:
+        source = load_start(options.start, options.backend)
+    space = options.space or (set_in(source).space if source is not None else "ycbcr")
+    pixels, space = read_pixels(image, space)
+    height, width = pixels.shape[:2]
+    data = data_of(pixels, space)
+    types = types_for(source, options.backend)
+    shown = picture(types, space, [pixels], [data])
+    objective = replace(Pixels.of(data, space, types), pictures=(shown,))
+    if source is None:
+        count = options.count_for(width * height)
+        placed = method.place_and_solve(objective, count, options.seed)
+        return Run(objective, begin(placed, chosen=method.place != Adaptive()))
+    objective, begun = start_from(source, objective, method, pixels, moves=True)
+    base = objective.pictures[0].base
+    mean_image = 0.0 if base is None else objective.picture(base).numpy()
+    return Run(objective, begin(begun, chosen=True), mean_image)
+
+
 def follow(
-    begin: Callable[[], FitProblem],
-    schedule: Schedule,
-    iterations: int,
-    marks: Collection[int],
-    mean_image: Image | None = None,
+    image: Image, iterations: int, marks: Collection[int], options: FitOptions
 ) -> Iterator[Moment]:
     """Run a descent to its last step and yield its state after the steps in `marks`.
 
     It takes all steps, and shows the set as it is, where `eigengs_dr.fit` stops and keeps the best.
-    Sets with more Gaussians than the first one, which a descent has on its way, are left out.
-    Pictures include `mean_image`. The time of `begin` counts; the clock stops between moments.
+    Sets with more Gaussians than asked for, which a descent has on its way, are left out. The time
+    of the start counts; the clock stops between moments.
     """
     spent, resumed = 0.0, time.perf_counter()
-    start = begin()
-    for iteration, current in enumerate(descend(start, schedule, iterations)):
-        if iteration not in marks or len(current) != len(start.gaussians):
+    objective, state, mean_image = start(image, options)
+    steps = descend(objective, options.method, state, iterations, options.seed)
+    for iteration in range(iterations + 1):
+        if iteration:
+            state = next(steps)
+        if iteration not in marks or state.total != state.count:
             continue
-        dr.eval(current)
+        dr.eval(state.gaussians)
         dr.sync_thread()  # steps run asynchronously
         spent += time.perf_counter() - resumed
-        picture = eg.picture_of(current)
-        yield Moment(iteration, spent, current, picture + (0 if mean_image is None else mean_image))
+        yield Moment(iteration, spent, state.gaussians, eg.picture_of(state.gaussians) + mean_image)
         resumed = time.perf_counter()
+    steps.close()
 
 
 def descent(
     image: Image, iterations: int, marks: Collection[int], **options: Any
 ) -> Iterator[Moment]:
     """Follow the descent of a fit; `options` are those of `FitOptions`."""
-    chosen = FitOptions(**options)
-    mean_image = mean_picture(chosen, image.shape[1], image.shape[0])
-    begin = partial(initialize, image, chosen)
-    return follow(begin, chosen.method.schedule, iterations, marks, mean_image)
+    return follow(image, iterations, marks, FitOptions(**options))
 
 
 def warm_up(image: Image, iterations: int, **options: Any) -> None:
-    """Compile the programs of a fit, also programs that place Gaussians anew."""
-    chosen, steps = FitOptions(**options), min(MIN_PHASE_RATIO, iterations)
-    schedule = replace(chosen.method.schedule, redistribute_after=1)
-    list(follow(partial(initialize, image, chosen), schedule, steps, (0, steps)))
+    """Compile the programs of a fit, also those of its controls."""
+    method, steps = options.pop("method", eg.DEFAULT), min(WARM_STEPS, iterations)
+    controls = tuple(SOON.get(type(control), control) for control in method.controls)
+    soon = FitOptions(method=replace(method, controls=controls), **options)
+    list(follow(image, steps, (0, steps), soon))
 
 
 def decibels(picture: Image, image: Image, space: str) -> float:

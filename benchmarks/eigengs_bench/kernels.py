@@ -15,19 +15,17 @@ from eigengs_bench.report import Section, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import TiledImage
-from eigengs_dr.fitting.descent import run as descend_to_end
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.refine import refine
-from eigengs_dr.fitting.schedule import Relocation
-from eigengs_dr.fitting.start import start_for
-from eigengs_dr.fitting.target import make_target
+from eigengs_dr.fitting.control import Perturb, Relocate
+from eigengs_dr.fitting.descent import begin, descend, last
+from eigengs_dr.fitting.loop import refine
+from eigengs_dr.fitting.measure import psnrs
+from eigengs_dr.fitting.objective import Pixels, data_of, picture
 from eigengs_dr.image.resize import center_crop
 from eigengs_dr.raster.binning.lists import TileLists, build_lists
 from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_radius
 from eigengs_dr.raster.reference import render_plain
-from eigengs_dr.raster.render import batch_to_tiles, bin_gaussians, decode_parameters, rasterize
+from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize
 
 # The scene: Gaussians of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
@@ -35,6 +33,7 @@ SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
 PLAIN_TILE = (8, 8)
 WARM_UP, ROUNDS = 3, 15  # rounds that compile and settle, and rounds that are measured
 FIT_STEPS, FIT_ROUNDS = 500, 5  # steps of the refinement behind `fit_over_steps`, and how often
+LONG = 1000  # steps of the descent of which one round is timed alone
 PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program that measures the peak
 
 
@@ -176,24 +175,33 @@ def pixels_inside(scene: eg.Gaussians) -> int:
 
 def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time a refinement, its steps alone, and a round of relocation."""
-    photo = center_crop(eg.sample("astronaut"), SIDE, SIDE)
-    options = FitOptions(gaussians=COUNT, iterations=FIT_STEPS, backend=types.backend)
-    problem = start_for(make_target(photo, options.space), options)
-    control, schedule = problem.control, options.method.schedule
-    assert control
-    move = Relocation(schedule.relocate_share, schedule.noise)
+    photo, method = center_crop(eg.sample("astronaut"), SIDE, SIDE), eg.DEFAULT
+    data = data_of(photo, "ycbcr")
+    shown = picture(types, "ycbcr", [photo], [data])
+    objective = replace(Pixels.of(data, "ycbcr", types), pictures=(shown,))
+    start = method.place_and_solve(objective, COUNT)
+    bare = replace(method, controls=())
+    moves = [c for c in method.controls if isinstance(c, (Relocate, Perturb))]
+    first = moves[0].steps(LONG)[0]
+
+    def score(gaussians: eg.Gaussians) -> list[Row]:
+        [[[reached], _]] = psnrs(gaussians, objective.pictures).tolist()
+        return [{"psnr_ycbcr": reached}]
 
     def whole() -> eg.Gaussians:
-        return refine(problem, photo, schedule, FIT_STEPS).gaussians
+        return refine(objective, method, begin(start), FIT_STEPS, score)[0].gaussians
 
     def steps() -> eg.Gaussians:
-        return descend_to_end(problem._replace(control=None), schedule, FIT_STEPS)
+        return last(descend(objective, bare, begin(start), FIT_STEPS), start)
 
     def relocated() -> eg.Gaussians:
-        return control.relocate(moved, move, image)
+        state = replace(begin(moved), lists=(lists,))
+        for control in moves:
+            state = control(state, objective, first, LONG, 0)
+        return state.gaussians
 
     moved = steps()
-    image = TiledImage(batch_to_tiles(types, problem.target), lists=bin_gaussians(moved))
+    lists = bin_gaussians(moved)
     timed = {"fit": whole, "steps": steps, "round": relocated}
     ms = interleaved(timed, 1, FIT_ROUNDS, progress)
     return {

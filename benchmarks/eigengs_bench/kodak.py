@@ -6,6 +6,7 @@ seconds count where the job is "timed": nothing else ran on the machine.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from itertools import cycle, product
@@ -56,7 +57,8 @@ def _jobs(
 ) -> Iterator[Job]:
     """Name the fits: all of the first number of steps before the next, photo by photo."""
     photos = images_of(task, SET)
-    options: Row = {"space": COLOR, "solve_steps": solve_steps, "backend": task.backend}
+    method = replace(eg.DEFAULT, solve_steps=solve_steps)
+    options: Row = {"space": COLOR, "method": method, "backend": task.backend}
     warm_up(photos[0][1], max(steps), **options)
     shared: Row = {"set": SET, "space": COLOR, "timed": timed}
     if solve_steps != SOLVE_STEPS:

@@ -9,10 +9,9 @@ from functools import partial
 
 import eigengs_dr as eg
 from eigengs_bench import report as fr
-from eigengs_bench.clock import Image, decibels
+from eigengs_bench.clock import WARM_STEPS, Image, decibels
 from eigengs_bench.images import images_of
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.fitting.schedule import MIN_PHASE_RATIO
 
 
 def run(task: Task, names: Sequence[str], targets: Sequence[float]) -> list[Row]:
@@ -29,8 +28,9 @@ def _jobs(task: Task, names: Sequence[str], targets: Sequence[float]) -> Iterato
 
 
 def _search(task: Task, image: Image, target: float) -> Row:
-    search = partial(eg.fit, image, target_psnr=target, target_space="ycbcr", backend=task.backend)
-    search(iterations=min(MIN_PHASE_RATIO, task.iterations))  # untimed, to compile
+    goal = eg.Goal(target, space="ycbcr")
+    search = partial(eg.fit, image, target_psnr=goal, backend=task.backend)
+    search(iterations=min(WARM_STEPS, task.iterations))  # untimed, to compile
     found = search(iterations=task.iterations)
     count = len(found.gaussians)
     usual = eg.fit(image, count, task.iterations, backend=task.backend)

@@ -6,6 +6,7 @@ steps.
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,12 +16,11 @@ from matplotlib.figure import Figure
 
 import eigengs_dr as eg
 from eigengs_bench import report as fr
-from eigengs_bench.clock import Image, descent, score, warm_up
+from eigengs_bench.clock import METHODS, Image, descent, score, warm_up
 from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import SETS
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.fitting.options import PRESETS
-from eigengs_dr.gaussian.file import CUTOFF
+from eigengs_dr.fitting.place import Grid, Random
 
 # Steps of runs of a method whose rates fall: each number is a run of its own.
 HORIZONS = (0, 10, 100, 300, 1000)
@@ -37,11 +37,8 @@ class Variant(NamedTuple):
     knob: str
     value: str | float
     gaussians: int | None = None
-    preset: str = "default"
-    init: str = "auto"
+    method: eg.Method = eg.DEFAULT
     start: eg.EigenGS | None = None
-    solve_steps: int = 10
-    cutoff: float = CUTOFF
 
 
 def run(task: Task, names: Sequence[str]) -> list[Row]:
@@ -58,13 +55,16 @@ def variants(task: Task, name: str) -> list[Variant]:
     basis = model_for(task, name, name, 300) if own else eg.EigenGS.load("natural", task.backend)
     return [
         Variant("preset", "default", count),
-        Variant("preset", "gaussianimage", count, "gaussianimage"),
-        Variant("preset", "eigengs", None, "eigengs", start=basis),
-        Variant("init", "grid", count, init="grid"),
-        Variant("init", "random", count, init="random"),
+        Variant("preset", "gaussianimage", count, METHODS["gaussianimage"]),
+        Variant("preset", "eigengs", None, METHODS["eigengs"], basis),
+        Variant("init", "grid", count, replace(eg.DEFAULT, place=Grid())),
+        Variant("init", "random", count, replace(eg.DEFAULT, place=Random())),
         Variant("init", "eigen", None, start=basis),
-        *(Variant("solve steps", k, count, solve_steps=k) for k in (0, 2, 5, 30)),
-        *(Variant("cutoff", k, count, cutoff=k) for k in (2.5, 3.5, 4.0, 5.0)),
+        *(
+            Variant("solve steps", k, count, replace(eg.DEFAULT, solve_steps=k))
+            for k in (0, 2, 5, 30)
+        ),
+        *(Variant("cutoff", k, count, replace(eg.DEFAULT, cutoff=k)) for k in (2.5, 3.5, 4.0, 5.0)),
         *(Variant("gaussians", round(k * count), round(k * count)) for k in (0.25, 0.5, 2, 4)),
     ]
 
@@ -78,11 +78,11 @@ def _jobs(task: Task, name: str) -> Iterator[Job]:
 
 def trace(task: Task, fit: Variant, image: Image) -> Row:
     """Run a variant once untimed, then once for every number of steps it is judged at."""
-    schedule, iterations = PRESETS[fit.preset].schedule, task.iterations
+    iterations = task.iterations
     options = {k: v for k, v in fit._asdict().items() if k not in ("knob", "value")}
     options["backend"] = task.backend
     warm_up(image, iterations, **options)
-    falls = schedule.decay < 1
+    falls = fit.method.decay < 1
     marks = sorted({n for n in (HORIZONS if falls else MARKS) if n < iterations} | {iterations})
     runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
     moments = [m for steps, shown in runs for m in descent(image, steps, shown, **options)]

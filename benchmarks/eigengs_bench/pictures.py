@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from eigengs_bench import report as fr
 from eigengs_bench.cases import CASES
-from eigengs_bench.clock import Image, Moment, descent
+from eigengs_bench.clock import METHODS, Image, Moment, descent
 from eigengs_bench.images import images_of, is_present, model_for
 from eigengs_bench.names import CATS, NATURAL, PICTURES
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_bench.stability import moments
+from eigengs_bench.stability import fit_case
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.io import sample
@@ -29,8 +29,8 @@ from eigengs_dr.viewer.pictures import overlay
 
 COMPONENTS = 300  # a channel of the models that are trained, as in the paper's comparisons
 PHOTO = "coffee"  # photo of scikit-image that the basis "natural" was not trained on
-# The presets that are compared, and what stands above their pictures.
-METHODS = {
+# What stands above the pictures of a method.
+HEADINGS = {
     "gaussianimage": "gaussianimage: random start",
     "eigengs": "eigengs: start from the basis",
     "default": "default: placed by the image, colours solved",
@@ -69,9 +69,10 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 def preset_descent(
     task: Task, image: Image, model: EigenGS, preset: str, marks: Sequence[int], **options: Any
 ) -> Iterator[Moment]:
-    """Fit by a preset with the number of Gaussians of a model; "eigengs" starts from it."""
-    start, count = model if preset == "eigengs" else None, len(model.gaussians)
-    shared = {"gaussians": count, "backend": task.backend, "preset": preset, "start": start}
+    """Fit by a method with the number of Gaussians of a model; "eigengs" starts from it."""
+    method, count = METHODS[preset], len(model.gaussians)
+    start = model if method.needs_model else None
+    shared = {"gaussians": count, "backend": task.backend, "method": method, "start": start}
     return descent(image, task.iterations, marks, **shared, **options)
 
 
@@ -86,7 +87,7 @@ def to_size(image: Image, model: EigenGS) -> Image:
 
 
 def _curves(task: Task) -> list[Row]:
-    """Measure PSNR over iterations of every preset: the paper's figure of curves."""
+    """Measure PSNR over iterations of every method: the paper's figure of curves."""
     present = [name for name in CURVES if is_present(task, name)]
     return task.measure("pictures", [job for name in present for job in _curve_jobs(task, name)])
 
@@ -102,18 +103,18 @@ def _curve_jobs(task: Task, name: str) -> Iterator[Job]:
         return {"psnr_ycbcr": [psnr(m.picture, image, "ycbcr") for m in moments], "marks": marks}
 
     for file, image in images_of(task, name):
-        for preset in METHODS:
+        for preset in HEADINGS:
             label = {"set": name, "image": file, "preset": preset, "iterations": task.iterations}
             yield label, partial(work, to_size(image, model), preset)
 
 
 def _curves_chart(rows: Sequence[Row]) -> Figure:
-    """Draw lines in the colours of the presets, one panel a set: means over its images."""
+    """Draw lines in the colours of the methods, one panel a set: means over its images."""
     names = list(dict.fromkeys(row["job"]["set"] for row in rows))
     figure = fr.new_figure(2.8 * len(names) + 0.6, 3.2)
     axes = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
     for axis, name in zip(axes, names, strict=True):
-        for preset in METHODS:
+        for preset in HEADINGS:
             job = {"set": name, "preset": preset}
             some = [row for row in rows if job.items() <= row["job"].items()]
             # A fit that has failed is None in a file, and NaN here.
@@ -189,7 +190,7 @@ def _drawn(
 
 
 def _iterations(task: Task) -> list[Row]:
-    """Show the first iterations of every preset: the paper's figures of convergence."""
+    """Show the first iterations of every method: the paper's figures of convergence."""
     marks = [n for n in (0, 10, 100) if n < task.iterations] + [task.iterations]
     file, words, photo = f"iterations-{PHOTO}.jpg", 'a photo and the basis "natural"', sample(PHOTO)
     model = EigenGS.load("natural", task.backend)
@@ -201,12 +202,12 @@ def _iterations(task: Task) -> list[Row]:
 
     def make() -> list[tuple[str, Sequence[Cell]]]:
         rows: list[tuple[str, Sequence[Cell]]] = []
-        for preset, heading in METHODS.items():
+        for preset, heading in HEADINGS.items():
             cells = [_cell_of(m, image) for m in preset_descent(task, image, model, preset, marks)]
             rows.append((heading, [*cells, ("photo", image)]))
         return rows
 
-    caption = f"Iterations of every preset: {words}, {_size(model)}; PSNR in YCbCr"
+    caption = f"Iterations of every method: {words}, {_size(model)}; PSNR in YCbCr"
     return _drawn(task, file, caption, make)
 
 
@@ -228,20 +229,20 @@ def _colors(task: Task) -> list[Row]:
             rows.append((f"fitted in {heading}; PSNR in YCbCr / in RGB, in dB", cells))
         return rows
 
-    caption = f"A photo fitted in YCbCr and in RGB by the preset default: {_size(model)}"
+    caption = f"A photo fitted in YCbCr and in RGB by the method default: {_size(model)}"
     return _drawn(task, "colors.jpg", caption, make)
 
 
 def _tiles(task: Task) -> list[Row]:
-    """Show the middle of a slow gradient by every preset, where Gaussians show as round tiles."""
+    """Show the middle of a slow gradient by every method, where Gaussians show as round tiles."""
 
     def make() -> list[tuple[str, Sequence[Cell]]]:
         case = CASES["smooth"]._replace(iterations=task.iterations)
         image = case.image()
         middle = (slice(len(image) // 3, 2 * len(image) // 3),) * 2
         shown, errors = [], []
-        for preset in METHODS:
-            picture = moments(case, image, preset, task.backend)[-1].picture
+        for preset in HEADINGS:
+            picture = fit_case(case, image, preset, task.backend).image
             shown.append((f"{preset}: {psnr(picture, image, 'ycbcr'):.1f} dB", picture[middle]))
             errors.append(("", (0.5 + STRETCHED * (picture - image))[middle]))
         return [("", shown), (f"their errors times {STRETCHED}", errors)]

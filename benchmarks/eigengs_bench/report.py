@@ -18,7 +18,7 @@ from eigengs_dr.storage.atomic import atomic_write
 
 MISSING = "-"  # cell of a figure that is not there
 
-# Lines of the presets, which differ in lightness too, for readers who confuse red and green.
+# Lines of the methods, which differ in lightness too, for readers who confuse red and green.
 COLORS = {"default": "#0b6e99", "gaussianimage": "#b5442f", "eigengs": "#5a8f3c"}
 INK = "#222222"
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import cycle, islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,13 +20,12 @@ import numpy as np
 import eigengs_dr as eg
 from eigengs_bench.clock import Image
 from eigengs_bench.rows import Job, Row, Task, alone, peak_gib
-from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.arrays import ArrayTypes, types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import FitProblem, descend
-from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.fitting.descent import begin, descend
+from eigengs_dr.fitting.objective import Pixels, data_of
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
-from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.fitting.solve import solve
 from eigengs_dr.image.resize import center_crop
 
 if TYPE_CHECKING:  # the processes that are measured load neither pandas nor matplotlib
@@ -87,18 +87,17 @@ def _jobs(task: Task, parts: Sequence[str], max_side: int) -> Iterator[Job]:
 
 
 def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
-    """Place Gaussians, solve for their colours, and take steps of the preset "default"."""
-    types = types_in(select(backend))
-    target = rgb_to_ycbcr(mosaic(case.width, case.height))
-    _place(target[:CELL, :CELL], 1, types.backend)  # imports
-    placed, place_seconds = _place(target, case.gaussians, types.backend)
-    solve(placed, target, 1)  # compiles
+    """Place Gaussians, solve for their colours, and take steps without relocation."""
+    types, image = types_in(select(backend)), mosaic(case.width, case.height)
+    _place(image[:CELL, :CELL], 1, types)  # imports
+    objective, placed, place_seconds = _place(image, case.gaussians, types)
+    solve(placed, objective, 1)  # compiles
     started = time.perf_counter()
-    start = solve(placed, target)
+    start = solve(placed, objective)
     dr.sync_thread()
     solve_seconds = time.perf_counter() - started
     del placed
-    step_ms, mean_ms = time_steps(FitProblem(start, target), steps)
+    step_ms, mean_ms = time_steps(objective, start, steps)
     return {
         "place_seconds": place_seconds,
         "solve_seconds": solve_seconds,
@@ -109,32 +108,36 @@ def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
     }
 
 
-def _place(target: Image, count: int, backend: str) -> tuple[eg.Gaussians, float]:
+def _place(image: Image, count: int, types: ArrayTypes) -> tuple[Pixels, eg.Gaussians, float]:
+    """Upload an image and place Gaussians; return the seconds of both too."""
+    data = data_of(image, "ycbcr")
     started = time.perf_counter()
-    placed = place_adaptive(target, count, "ycbcr", backend)
+    objective = Pixels.of(data, "ycbcr", types)
+    placed = place_adaptive(objective, count)
     dr.sync_thread()
-    return placed, time.perf_counter() - started
+    return objective, placed, time.perf_counter() - started
 
 
-def time_steps(problem: FitProblem, steps: int) -> tuple[float, float]:
+def time_steps(objective: Pixels, start: eg.Gaussians, steps: int) -> tuple[float, float]:
     """Return milliseconds of a step: the median of single ones, and the mean of `steps` in a row.
 
     Steps run asynchronously: a mean waits for its last step only, a median for each.
     """
     single = max(5, steps // 3)
-    sets = descend(problem, PRESETS["default"].schedule, WARM_UP + steps + single)
+    method, total = replace(eg.DEFAULT, controls=()), WARM_UP + steps + single
+    states = descend(objective, method, begin(start), total)
 
     def spend(count: int) -> float:
         started = time.perf_counter()
-        for _ in islice(sets, count):
+        for _ in islice(states, count):
             pass
         dr.sync_thread()
         return 1e3 * (time.perf_counter() - started) / count
 
-    spend(1 + WARM_UP)  # the first set is the start
+    spend(WARM_UP)
     mean_ms = spend(steps)
     median_ms = float(np.median([spend(1) for _ in range(single)]))
-    sets.close()
+    states.close()
     return median_ms, mean_ms
 
 

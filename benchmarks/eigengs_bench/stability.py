@@ -1,9 +1,12 @@
-"""Hard cases times presets: which stay finite, and end no worse than they were."""
+"""Hard cases times methods: which fits stay finite, and end no worse than they were.
+
+Every cell is a call of `eigengs_dr.fit`, as a user makes it.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,112 +14,142 @@ import pandas as pd
 import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.cases import Case, chosen_cases
-from eigengs_bench.clock import Image, Moment, decibels, follow
+from eigengs_bench.clock import METHODS, Image
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.fitting.descent import FitProblem
-from eigengs_dr.fitting.options import PRESETS, FitOptions
-from eigengs_dr.fitting.refine import trace_steps
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
-from eigengs_dr.fitting.start import initialize, mean_picture
-from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import MAX_PSNR
 
-BASIS = "natural"  # where presets that need a basis start
+BASIS = "natural"  # where methods that need a basis start
 
 
 def run(task: Task, cases: Sequence[str], presets: Sequence[str]) -> list[Row]:
-    """Measure every cell of the matrix, case by case."""
+    """Measure every cell of the matrix, case by case, by methods of some names."""
     return task.measure("stability", _jobs(task, chosen_cases(cases, task.iterations), presets))
 
 
 def _jobs(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> Iterator[Job]:
     for case, name in product(cases, presets):
         job = {"case": case.name, "preset": name, "iterations": case.iterations}
-        yield job, partial(measure_cell, case, name, task.backend)
+        for seed in case.seeds:
+            shown = {"seed": seed} if len(case.seeds) > 1 else {}
+            yield {**job, **shown}, partial(measure_cell, case, name, task.backend, seed)
 
 
-def measure_cell(case: Case, preset: str, backend: str | None) -> Row:
-    """Run a case by a preset and score it: one cell.
+def measure_cell(case: Case, name: str, backend: str | None, seed: int = 0) -> Row:
+    """Fit a case by the method of a name and score it: one cell.
 
-    "needs", alone, says what a preset lacks. Else "finite" is true if all parameters and pixels are
-    finite at all marks of `trace_steps`; start and end are PSNRs of the first and of the last
-    moment.
+    "needs", alone, says what a method lacks. Else "finite" is true if all PSNRs of the trace are
+    numbers, and all parameters and pixels of the result are finite; start and end are PSNRs of the
+    first and of the last row of the trace.
     """
     image = case.image()
-    most = image.shape[0] * image.shape[1]
-    encodes = PRESETS[preset].mean == "dense" and case.place is None
-    if encodes and len(eg.EigenGS.load(BASIS, backend).gaussians) > most:
-        return {"needs": f"a basis with at most {most} Gaussians"}
-    followed = moments(case, image, preset, backend)
-    finite = [np.isfinite(moment.picture).all() for moment in followed]
-    for moment in followed:
-        finite += [np.isfinite(values).all() for values in moment.gaussians.to_arrays().values()]
+    if needs := _needs(case, image, name, backend):
+        return {"needs": needs}
+    found = fit_case(case, image, name, backend, seed)
+    reached = [row["psnr_ycbcr"] for row in found.trace]
+    values = [found.image, *found.gaussians.to_arrays().values()]
     return {
-        "finite": all(finite),
-        "gaussians": len(followed[0].gaussians),
-        "seconds": followed[-1].seconds,
-        "start_ycbcr": decibels(followed[0].picture, image, "ycbcr"),
-        "end_ycbcr": decibels(followed[-1].picture, image, "ycbcr"),
+        "finite": not np.isnan(reached).any() and all(np.isfinite(v).all() for v in values),
+        "gaussians": len(found.gaussians),
+        "seconds": found.seconds,
+        "start_ycbcr": min(reached[0], MAX_PSNR),
+        "end_ycbcr": min(reached[-1], MAX_PSNR),
     }
 
 
-def moments(case: Case, image: Image, preset: str, backend: str | None = None) -> list[Moment]:
-    """Follow the descent of a preset on the image of a case, at the marks of `trace_steps`.
-
-    It starts as the preset does, or in its way from the shapes of the case.
-    """
-    method, marks = PRESETS[preset], trace_steps(case.iterations)
-    rates = {name: case.rates * rate for name, rate in method.schedule.rates.items()}
-    schedule = replace(method.schedule, rates=rates)
-    if case.place is not None:
-        start = partial(_start, case, image, method.solves, backend)
-        return list(follow(start, schedule, case.iterations, marks))
-    encodes = method.mean == "dense"
-    model, count = (eg.EigenGS.load(BASIS, backend), None) if encodes else (None, case.gaussians)
-    options = FitOptions(gaussians=count, start=model, preset=preset, backend=backend)
-    mean_image = mean_picture(options, image.shape[1], image.shape[0])
-    begin = partial(initialize, image, options)
-    return list(follow(begin, schedule, case.iterations, marks, mean_image))
+def _needs(case: Case, image: Image, name: str, backend: str | None) -> str:
+    """Return what a method lacks for a case, or ""."""
+    if not METHODS[name].needs_model:
+        return ""
+    if case.place is not None or case.space is not None:
+        return "a basis of the case"
+    most = image.shape[0] * image.shape[1]
+    fits = len(eg.EigenGS.load(BASIS, backend).gaussians) <= most
+    return "" if fits else f"a basis with at most {most} Gaussians"
 
 
-def _start(case: Case, image: Image, solves: bool, backend: str | None) -> FitProblem:
+def fit_case(
+    case: Case, image: Image, name: str, backend: str | None = None, seed: int = 0
+) -> eg.Fit:
+    """Fit the image of a case by the method of a name, from the start of the case if it has one."""
+    method = METHODS[name]
+    begun: dict[str, Any] = {"gaussians": case.gaussians}
+    if method.needs_model:
+        begun = {"start": eg.EigenGS.load(BASIS, backend)}
+    elif case.place is not None:
+        begun = {"start": _start(case, image, backend)}
+    return eg.fit(
+        image,
+        iterations=case.iterations,
+        **begun,
+        space=case.space,
+        method=method.at_rates(case.rates),
+        seed=seed,
+        backend=backend,
+        progress=False,
+    )
+
+
+def _start(case: Case, image: Image, backend: str | None) -> eg.Gaussians:
     assert case.place is not None
-    target, generator = rgb_to_ycbcr(image), np.random.default_rng(0)
+    generator = np.random.default_rng(0)
     mean, factor = case.place(image, case.gaussians, generator)
-    size, shape = (image.shape[1], image.shape[0]), (case.gaussians, 3)
-    colors = np.zeros(shape) if solves else generator.uniform(0, 1, shape)
-    start = eg.Gaussians.from_arrays(mean, factor, colors, size=size, backend=backend).bounded()
-    return FitProblem(solve(start, target) if solves else start, target)
+    size, color = (image.shape[1], image.shape[0]), generator.uniform(0, 1, (case.gaussians, 3))
+    return eg.Gaussians.from_arrays(mean, factor, color, size=size, backend=backend)
 
 
 # ---------------------------------------------------------------------------------------------
-#  Tables: cases down, presets across, one table a figure
+#  Tables: cases down, methods across, one table a figure
 # ---------------------------------------------------------------------------------------------
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out two matrices of cases and presets: PSNRs, and seconds."""
+    """Lay out two matrices of cases and methods: PSNRs, and seconds.
+
+    Of several seeds, a cell has the mean, and the range of the ends.
+    """
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
     ends = f"PSNR in dB, YCbCr, at the end, from the start; {steps} steps"
-    costs = _matrix("Seconds", lambda row: fr.number(row.get("seconds")), rows, "costs")
+    costs = _matrix("Seconds", _seconds, rows, "costs")
     return fr.Section([_matrix(ends, _ends, rows, "ends"), costs])
 
 
-def _matrix(caption: str, cell: Callable[[Row], str], rows: Sequence[Row], name: str) -> fr.Table:
-    """Put a figure of every case and preset into a matrix; of equal ones the last is shown."""
-    cells = pd.DataFrame([{**row["job"], "cell": cell(row)} for row in rows])
-    cells = cells.drop_duplicates(["case", "preset"], keep="last")
+def _matrix(
+    caption: str, cell: Callable[[list[Row]], str], rows: Sequence[Row], name: str
+) -> fr.Table:
+    """Put a figure of every case and method into a matrix; of equal rows the last is shown.
+
+    A cell is of all seeds.
+    """
+    groups: dict[tuple[str, str], dict[int, Row]] = {}
+    for row in rows:
+        job = row["job"]
+        groups.setdefault((job["case"], job["preset"]), {})[job.get("seed", 0)] = row
+    cells = pd.DataFrame(
+        [(case, preset, cell(list(group.values()))) for (case, preset), group in groups.items()],
+        columns=["case", "preset", "cell"],
+    )
     matrix = cells.pivot(index="case", columns="preset", values="cell").fillna(fr.MISSING)
     matrix = matrix.loc[cells.case.unique(), cells.preset.unique()].reset_index()
     return fr.Table(caption, matrix, name)
 
 
-def _ends(row: Row) -> str:
-    if "needs" in row:
-        return f"needs {row['needs']}"
-    ends = f"{_decibels(row['end_ycbcr'])} from {_decibels(row['start_ycbcr'])}"
-    return ends if row["finite"] else "not finite"
+def _ends(rows: list[Row]) -> str:
+    """Write the end and the start; of several seeds the mean, with the range of the ends."""
+    if "needs" in rows[0]:
+        return f"needs {rows[0]['needs']}"
+    if not all(row["finite"] for row in rows):
+        return "not finite"
+    ends, starts = ([row[f"{when}_ycbcr"] for row in rows] for when in ("end", "start"))
+    end = _decibels(float(np.mean(ends)))
+    if len(rows) > 1:
+        end += f" ({fr.number(min(ends), 2)} to {fr.number(max(ends), 2)})"
+    return f"{end} from {_decibels(float(np.mean(starts)))}"
 
 
-def _decibels(value: float | None) -> str:
+def _seconds(rows: list[Row]) -> str:
+    known = [row["seconds"] for row in rows if "seconds" in row]
+    return fr.number(float(np.median(known)) if known else None)
+
+
+def _decibels(value: float) -> str:
     return "exact" if value == MAX_PSNR else fr.number(value)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from eigengs_bench import report as fr
-from eigengs_bench.clock import Image, descent, score, warm_up
+from eigengs_bench.clock import METHODS, Image, descent, score, warm_up
 from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import NATURAL, SETS, TABLES
 from eigengs_bench.rows import Job, Row, Task
@@ -26,7 +26,10 @@ LENT = {"faces256": "cats256", "cats256": "faces256"}  # the sets that lend each
 
 
 class Method(NamedTuple):
-    """A preset, and the model it starts from: of the training images of `source`, "" for none."""
+    """A method by its name, and the model it starts from.
+
+    The model is of the training images of `source`, "" for none.
+    """
 
     preset: str
     source: str = ""
@@ -72,7 +75,7 @@ def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:
         if method.source:
             split = {"split": True, "whole": False}.get(method.split, "auto")
             model = model_for(task, name, method.source, method.components, method.space, split)
-        options: Row = {"preset": method.preset, "space": method.space, "start": model}
+        options: Row = {"method": METHODS[method.preset], "space": method.space, "start": model}
         options |= {"gaussians": count, "backend": task.backend}
         warm_up(pictures[0][1], task.iterations, **options)
         return options

@@ -199,7 +199,10 @@ def _settings(
             raise ValueError("levels and target_psnr exclude each other; give one of them")
         if isinstance(levels, int) and count is None:
             count = _default_count(first)
-        count = eg.level_counts(levels[-1] if count is None else count, levels)
+        try:
+            count = eg.level_counts(levels[-1] if count is None else count, levels)
+        except ValueError as error:
+            raise ValueError(f"{first}: {error}") from None
     return FitOptions(
         gaussians=count,
         iterations=choices["iterations"],

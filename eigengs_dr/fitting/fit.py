@@ -67,8 +67,8 @@ class Fit:
         Why the fit ended: "iterations", "exact" or "interrupted"; a search for the number of
         Gaussians ends with "met", "out of reach" or "interrupted".
     mean_image : ndarray of float32, shape (H, W, 3), or None
-        RGB image to add to renderings of the set. The preset "eigengs" keeps the mean image of the
-        model as pixels. The attribute `image` includes the mean image.
+        RGB image to add to renderings of the set. The method of the paper EigenGS keeps the mean
+        image of the model as pixels. The attribute `image` includes the mean image.
     psnr_ycbcr, psnr_rgb : float
         PSNR of the set in dB, from its row of the trace; for maps, the means over the maps.
     source : str

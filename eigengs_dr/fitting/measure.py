@@ -18,6 +18,7 @@ from ..backend.recording import record
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import (
     RGB_TO_YCBCR,
+    UNBOUNDED,
     decode,
     from_log,
     rendered_as,
@@ -37,7 +38,7 @@ from ..raster.parameters import (
 )
 from ..raster.render import bin_gaussians, pixels_inside
 from .objective import Picture
-from .solvers.conjugate_gradient import spread
+from .solve import spread
 
 Row: TypeAlias = dict[str, Any]
 """A row of a trace: its numbers by name, and under "maps" those of every map."""
@@ -67,7 +68,7 @@ def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float
         shape, color = detached_shape(gaussians), whole(gaussians.color, gaussians)
         background = list(gaussians.background)
         given = [
-            (p.space, p.channels.start, p.image, p.scale, p.offset, p.weight, p.base)
+            (p.space, p.channels.start, p.image, p.scale, p.offset, p.exposure, p.weight, p.base)
             for p in pictures
         ]
         sums = _squared_errors(shape, color, background, lists, gaussians.cutoff, given)
@@ -104,8 +105,8 @@ def _squared_errors(
     floats: list[Float] = []
     codes: list[Float] = []
     areas: list[Float] = []
-    for space, first, image, scale, offset, weight, base in pictures:
-        a, b = spread(scale, owner), spread(offset, owner)
+    for space, first, image, scale, offset, exposure, weight, base in pictures:
+        a, b, light = (spread(v, owner) for v in (scale, offset, exposure))
         totals = [types.Float(0)] * 3
         factors = read(inside if weight is None else weight)
         bases = None if base is None else read(base)
@@ -116,7 +117,7 @@ def _squared_errors(
                 error = sum(dr.square((s - v) * a) for s, v in zip(sums, seen, strict=True))
                 shown, seen = ([dr.fma(v, a, b) for v in pixel] for pixel in (sums, seen))
             else:
-                shown = show(space, [dr.fma(s, a, b) for s in sums])
+                shown = show(space, [dr.fma(s, a, b) for s in sums], light)
                 if bases is not None:
                     shown = [s + v for s, v in zip(shown, bases[k], strict=True)]
                 error = squared_difference(shown, seen, float_space(space))
@@ -130,12 +131,14 @@ def _squared_errors(
     return [*floats, *codes, *areas]
 
 
-def show(space: str, sums: list) -> list:
+def show(space: str, sums: list, exposure: Float | float = 1.0) -> list:
     """Convert the channels of a pixel as `eigengs_dr.picture_of` does, light to sRGB."""
     if space == "log":
         sums = [from_log(channel) for channel in sums]
     elif space == "normal":
         sums = unit_codes(sums)
+    if space in UNBOUNDED:
+        sums = [channel * exposure for channel in sums]
     if rendered_as(space) == "linear":
         return [to_coded(dr.maximum(channel, 0)) for channel in sums]
     return decode(space, sums)

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arguments import plain_numbers
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from .control import Perturb, Redistribute, Relocate, Retreat, Surplus
 from .optimizer import Adam, Optimizer
 from .place import Adaptive, Placement
-from .solvers.conjugate_gradient import solve
+from .solve import solve
 from .variables import Coordinates, Relative
 
 if TYPE_CHECKING:
@@ -93,8 +94,9 @@ class Method:
     --------
     >>> from dataclasses import replace
     >>> import eigengs_dr as eg
-    >>> eg.fit(eg.sample("coffee")[:32, :32], 50, 10, method=replace(eg.DEFAULT, cutoff=4.0))
-    Fit(50 Gaussians, 32x32 pixels, 10 iterations, ...)
+    >>> method = replace(eg.DEFAULT, cutoff=4.0)
+    >>> eg.fit(eg.sample("coffee")[:32, :32], 50, 10, method=method).gaussians.cutoff
+    4.0
     """
 
     place: Placement
@@ -110,6 +112,8 @@ class Method:
     cutoff: float = CUTOFF
 
     def __post_init__(self) -> None:
+        for name, value in plain_numbers(vars(self), Method.__annotations__).items():
+            object.__setattr__(self, name, value)
         if not 0 < self.cutoff <= MAX_CUTOFF:
             raise ValueError(
                 f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
@@ -158,7 +162,12 @@ class Method:
         return placed if self.place.has_colors else solve(placed, objective, self.solve_steps)
 
     def start_from(self, objective: Pixels, gaussians: Gaussians) -> Gaussians:
-        """Return a set with better colours for the image: the solve goes on from its own."""
+        """Return a set with better colours for the image: the solve goes on from its own.
+
+        A method whose placement has colours solves for none here either.
+        """
+        if self.place.has_colors:
+            return gaussians
         return solve(gaussians, objective, self.solve_steps, warm_start=True)
 
     needs_model = False

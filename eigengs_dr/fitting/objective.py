@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, Float, types_of, upload
 from ..gaussian.gaussians import Gaussians, whole
-from ..image.color import LIGHT, rgb_to_ycbcr, to_linear, to_log
+from ..image.color import LIGHT, UNBOUNDED, rgb_to_ycbcr, to_coded, to_linear, to_log
 from ..image.pixels import MAX_PIXEL
 from ..image.strips import by_strips
 from ..raster.binning.lists import TileLists
@@ -96,6 +96,8 @@ class Picture(NamedTuple):
         The channels of the set.
     scale, offset : Float, shape (images,)
         ``scale s + offset`` of a fitted value s is in units of the space; of data, with the peak 1.
+    exposure : Float, shape (images,)
+        Factor of light that may exceed 1 before it is compared.
     weight : Float, shape (pixels,), or None
         Factor of the squared errors, in tile layout.
     base : Float or None
@@ -109,6 +111,7 @@ class Picture(NamedTuple):
     channels: slice
     scale: Float
     offset: Float
+    exposure: Float
     weight: Float | None = None
     base: Float | None = None
     has_codes: bool = True
@@ -301,7 +304,8 @@ def data_of(
     if affine != Affine():
         values = (values - np.float32(affine.offset)) / np.float32(affine.scale)
     if space in LIGHT:
-        return Data(values, pixels, _product(by_strips(dark_weight, values), weight), affine)
+        shown = pixels if affine == Affine() else by_strips(to_coded, values)
+        return Data(values, shown, _product(by_strips(dark_weight, values), weight), affine)
     return Data(values, values, weight, affine)
 
 
@@ -345,6 +349,10 @@ class Extent(NamedTuple):
         return self.low >= 0 and MIN_CODE < self.high <= MAX_PIXEL
 
 
+VISIBLE = 100.0
+"""Means of light that may exceed 1 are shown as they are if they are at most so much brighter or
+darker than `GREY`: others are out of the range of a display, and would all look alike."""
+
 MIN_CODE = 0.1
 """Least largest value of data that count as codes between 0 and 1, as those of textures."""
 
@@ -360,7 +368,8 @@ def picture(
 ) -> Picture:
     """Return what an image, or a batch of images, shows, for the PSNRs.
 
-    Data are measured with their range as the peak, or 1 if they are codes, see `is_codes`.
+    Data are measured with their range as the peak, or 1 if they are codes, see `is_codes`. Light
+    that may exceed 1 is exposed if its mean is far from `GREY`, see `VISIBLE`.
 
     Parameters
     ----------
@@ -383,6 +392,11 @@ def picture(
         codes = all(map(is_codes, pixels))
         if not codes:
             affines = [Affine(1.0, a.offset / a.scale) for a in affines]
+    exposures = [1.0] * len(shown)
+    if space in UNBOUNDED:
+        exposures = [exposure_of(p) for p in shown]
+        lit = zip(shown, exposures, strict=True)
+        shown = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
     batch = np.stack(shown) if len(shown) > 1 else shown[0]
     weights = None
     if weight is not None:
@@ -393,9 +407,16 @@ def picture(
         slice(first, first + batch.shape[-1]),
         upload(types.Float, np.array([a.scale / factor for a in affines])),
         upload(types.Float, np.array([a.offset for a in affines])),
+        upload(types.Float, np.array(exposures)),
         weights,
         has_codes=codes,
     )
+
+
+def exposure_of(pixels: Image) -> float:
+    """Return the factor with which light (H, W, C), in sRGB, comes into the range of a display."""
+    mean = float(to_linear(pixels).mean(dtype=np.float64))
+    return 1.0 if mean <= 0 or 1 / VISIBLE <= mean / GREY <= VISIBLE else GREY / mean
 
 
 def is_codes(data: Image) -> bool:

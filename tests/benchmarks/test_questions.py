@@ -26,11 +26,11 @@ from eigengs_bench import (
     stability,
     tables,
 )
+from eigengs_bench.clock import METHODS
 from eigengs_bench.names import SETS, ImageSet
 from eigengs_bench.rows import FILE, read
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.image.io import load_image, save_image
-from eigengs_dr.image.metrics import psnr
 
 
 def answered(out, bench, *arguments):
@@ -62,7 +62,7 @@ def test_tables(data, tmp_path, backend):  # noqa: F811
     image = pictures.images_of(task_in(tmp_path, data=data, images=1), "cats256")[0][1]
     for preset in ("default", "gaussianimage"):
         [found] = [row for row in rows if row["job"].get("preset") == preset]
-        expected = fit(image, 60, 12, preset=preset, backend=backend)
+        expected = fit(image, 60, 12, method=METHODS[preset], backend=backend)
         assert found["moments"][-1]["psnr_rgb"] == pytest.approx(expected.trace[-1]["psnr_rgb"])
 
 
@@ -122,15 +122,40 @@ def case(name="photo", **changes):
     return cases.Case(name, lambda: cases.photo(32, 32), 30, 10)._replace(**changes)
 
 
-def test_a_cell_says_what_the_moments_say(backend):
+def test_a_cell_says_what_the_fit_says(backend):
     found = stability.measure_cell(case(), "default", backend)
-    first, *_, last = stability.moments(case(), cases.photo(32, 32), "default", backend)
-    values = [psnr(m.picture, cases.photo(32, 32), "ycbcr") for m in (first, last)]
-    assert [found["start_ycbcr"], found["end_ycbcr"]] == values and found["finite"]
+    first, *_, last = fit(cases.photo(32, 32), 30, 10, backend=backend).trace
+    ends = [row["psnr_ycbcr"] for row in (first, last)]
+    assert [found["start_ycbcr"], found["end_ycbcr"]] == ends and found["finite"]
     thin = case(image=lambda: cases.photo(70, 71))
     assert stability.measure_cell(thin, "eigengs", backend) == {
         "needs": "a basis with at most 4970 Gaussians"
     }
+    placed = case(place=cases.heap)
+    assert "needs" in stability.measure_cell(placed, "eigengs", backend)
+
+
+def test_cases_start_as_users_do(backend):
+    """From a useless start the default method places Gaussians anew."""
+    heap = case(place=cases.heap, gaussians=60, iterations=100)
+    found = stability.measure_cell(heap, "default", backend)
+    assert found["finite"] and found["gaussians"] == 60
+    assert found["end_ycbcr"] > found["start_ycbcr"] + 5
+    stays = stability.measure_cell(heap, "gaussianimage", backend)
+    assert stays["finite"] and stays["end_ycbcr"] < found["end_ycbcr"]
+    assert stays["start_ycbcr"] < found["start_ycbcr"]  # it solves for no colours
+
+
+def test_units_of_data_change_nothing(backend):
+    made = {name: c for name, c in cases.CASES.items() if name.startswith("data")}
+    ends = []
+    for made_case in made.values():
+        image = made_case.image()[100:132, 100:132]
+        small = made_case._replace(image=lambda image=image: image, gaussians=60, iterations=10)
+        ends.append(stability.measure_cell(small, "default", backend)["end_ycbcr"])
+    assert len(ends) == 4
+    # The photo itself is measured with the peak 1, data of other units with their range.
+    assert max(ends[1:]) - min(ends[1:]) < 0.02 and ends[0] > max(ends[1:])
 
 
 def test_the_matrix_of_ends():
@@ -155,11 +180,25 @@ def test_the_matrix_of_ends():
     assert [cost for _, cost in lines_of(costs)] == ["2.0", "2.0", "2.0", "-"]
 
 
+def test_seeds_are_a_mean_and_a_range():
+    job = {"case": "seeds", "preset": "default", "iterations": 9}
+    made = [
+        row({**job, "seed": seed}, finite=True, start_ycbcr=30.0, end_ycbcr=end, seconds=seed + 1.0)
+        for seed, end in enumerate((40.0, 40.5, 41.0))
+    ]
+    ends, costs = stability.summarize(made).tables
+    assert lines_of(ends) == [("seeds", "40.5 (40.00 to 41.00) from 30.0")]
+    assert lines_of(costs) == [("seeds", "2.0")]
+
+
 def test_stability(monkeypatch, tmp_path):
     monkeypatch.setitem(cases.CASES, "photo", case())
     arguments = ("--case", "photo", "--preset", "default", "--iterations", 5)
     rows, text = answered(tmp_path / "out", "stability", *arguments)
     assert len(rows) == 1 and "photo" in text and "5 steps" in text
+    monkeypatch.setitem(cases.CASES, "photo", case(seeds=(0, 1)))
+    rows, text = answered(tmp_path / "two", "stability", *arguments)
+    assert [row["job"]["seed"] for row in rows] == [0, 1] and " to " in text
 
 
 # --- Kodak, the number for a quality, rate ---

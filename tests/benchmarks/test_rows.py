@@ -14,7 +14,7 @@ from eigengs_bench import clock, images, rows
 from eigengs_bench import report as fr
 from eigengs_bench.names import PRESETS as NAMES
 from eigengs_bench.names import SETS, ImageSet
-from eigengs_dr.fitting.options import PRESETS
+from eigengs_dr.cli.fit import PRESETS as COMMANDS
 from eigengs_dr.image.io import ImageError, save_image
 
 OTHER = {**RUN, "commit": "b" * 40}
@@ -144,8 +144,8 @@ def test_mistakes_are_told_before_the_work(tmp_path):
 # --- Programs in turns, sets of images and their models ---
 
 
-def test_presets_have_the_names_of_the_package():
-    assert tuple(PRESETS) == NAMES
+def test_methods_have_the_names_of_the_command_line():
+    assert tuple(clock.METHODS) == NAMES == COMMANDS
 
 
 def test_programs_take_turns():

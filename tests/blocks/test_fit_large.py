@@ -2,6 +2,7 @@
 
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from _helpers.process import python_path, run_python
 from _helpers.sets import check_equal
 from eigengs_dr.backend.executor import Done
 from eigengs_dr.blocks.draw import BAND_PIXELS, draw_region, save_region
-from eigengs_dr.fitting.memory import estimate_memory
+from eigengs_dr.cli.memory import estimate_memory
 from eigengs_dr.gaussian.file import read
 from eigengs_dr.storage.checkpoint import read_arrays, write_arrays
 
@@ -100,7 +101,7 @@ def test_data_of_any_range():
     assert result.psnr_ycbcr == pytest.approx(same.psnr_ycbcr, abs=0.5)
     error = np.square(eg.picture_of(result.gaussians) - heights).mean()
     assert result.psnr_ycbcr == pytest.approx(
-        -10 * np.log10(error / np.abs(heights).max() ** 2), abs=0.01
+        -10 * np.log10(error / np.ptp(heights) ** 2), abs=0.01
     )
 
 
@@ -131,15 +132,23 @@ def test_progress():
         ({"block": 64.5}, "block is 64.5"),
         ({"gaussians": 10}, "at least 64: use more, or fit a smaller version"),
         ({"gaussians": 128 * 128 + 1}, "takes 1 to 16384"),
-        ({"gaussians": 0}, "gaussians is 0; blocks"),
+        ({"gaussians": 0}, "gaussians is 0; it must be at least 1"),
         ({"iterations": -1}, "iterations is -1"),
         ({"space": "cmyk"}, "space 'cmyk' is unknown"),
-        ({"cutoff": 0}, "cutoff is 0"),
     ],
 )
 def test_bad_options(options, reason):
     with pytest.raises(ValueError, match=reason):
         eg.fit_large(mosaic(128), **FEW | options)
+
+
+def test_a_method_of_the_caller():
+    found = eg.fit_large(mosaic(96), **FEW, method=replace(eg.DEFAULT, cutoff=4.0))
+    assert found.gaussians.cutoff == 4 and found.psnr_rgb > 20
+    with pytest.raises(ValueError, match="cutoff is 0"):
+        eg.fit_large(mosaic(96), **FEW, method=replace(eg.DEFAULT, cutoff=0))
+    with pytest.raises(TypeError, match="method is 'default'; pass a Method"):
+        eg.fit_large(mosaic(96), **FEW, method="default")
 
 
 def test_bad_pixel_ends_the_run_before_the_fit(tmp_path):

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from eigengs_dr.blocks.block import rounds
 from eigengs_dr.blocks.grid import BlockSets, deal, divide
-from eigengs_dr.fitting.options import PRESETS
-from eigengs_dr.fitting.schedule import lr_factor, relocations
+from eigengs_dr.fitting.control import Relocate
+from eigengs_dr.fitting.descent import next_build
+from eigengs_dr.fitting.method import DEFAULT
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.integers(20, 120), st.integers(0, 40))
@@ -52,23 +53,25 @@ def test_gaussians_follow_the_picture():
     assert deal(np.array([1.0, 8.0, 1.0]), np.array([100, 100, 100]), 200).tolist() == [50, 100, 50]
 
 
-SCHEDULE = PRESETS["default"].schedule
-
-
 @pytest.mark.parametrize("iterations", [0, 1, 2, 10, 100, 179, 180, 980, 5000])
 def test_rounds_take_every_step_once(iterations):
-    parts = rounds(SCHEDULE, iterations)
+    parts = rounds(DEFAULT, iterations)
     assert [step for part in parts for step in part] == list(range(iterations))
     assert len(parts) == 1 or all(parts)
     starts = {part.start for part in parts}
-    assert set(relocations(SCHEDULE, iterations)) <= starts  # a round may end with none
+    assert set(DEFAULT.control(Relocate).steps(iterations)) <= starts  # a round may end with none
 
 
 def test_rates_rise_from_the_start_of_a_part():
-    factors = [lr_factor(SCHEDULE, step, 100, start=40) for step in range(100)]
-    whole = [lr_factor(SCHEDULE, step, 100) for step in range(100)]
-    assert factors[:40] == [0] * 40
-    rise = [a / b for a, b in zip(factors[40:50], whole[40:50], strict=True)]
+    """By the sums of the rates between builds, which bound how far Gaussians move."""
+    factors = DEFAULT.rate_factors(100, chosen=True)
+
+    def moved(step, since):
+        end, moves = next_build(DEFAULT, factors, step, step + 1, since)
+        assert end == step + 1
+        return moves["mean"] / (DEFAULT.rates["mean"] * factors[step])
+
+    rise = [moved(step, 40) for step in range(40, 50)]
     np.testing.assert_allclose(rise, [0.2, 0.4, 0.6, 0.8, 1, 1, 1, 1, 1, 1])
 
 

@@ -8,7 +8,7 @@ import tifffile
 from _helpers.command import assert_refused, run, succeeded
 from _helpers.files import png
 from _helpers.mosaics import mosaic
-from eigengs_dr.fitting import memory
+from eigengs_dr.cli import memory
 
 FEW = ["--gaussians", 700, "--iterations", 5]
 

@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +11,14 @@ import pytest
 import eigengs_dr as eg
 from _helpers.sets import check_equal
 from _helpers.waves import picture
-from eigengs_dr.collection.fit_batch import MAX_CUTOFF, fit_batch, fits_in_batches
+from eigengs_dr.collection.fit_many import MAX_CUTOFF, _is_groupable, _may_join
+from eigengs_dr.fitting.fit import fit_images
 from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.place import Adaptive, Grid, Random
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
+from eigengs_dr.image.pixels import EncodedImage
+from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 from eigengs_dr.raster.evaluate import is_steep
 from eigengs_dr.raster.parameters import kernel_radius, kernel_shape
 
@@ -28,12 +33,13 @@ def options(backend, **changed):
 
 
 @pytest.mark.parametrize("color", ["ycbcr", "linear", "data"])
-@pytest.mark.parametrize("init", ["adaptive", "random"])
-def test_results_are_those_of_single_fits(backend, color, init):
+@pytest.mark.parametrize("place", [Adaptive(), Random()])
+def test_results_are_those_of_single_fits(backend, color, place):
     """On llvm bit for bit."""
-    settings = options(backend, space=color, init=init)
-    for image, found in zip(pictures(3), fit_batch(pictures(3), settings), strict=True):
-        alone = eg.fit(image, 60, 30, init=init, space=color, backend=backend)
+    method = replace(eg.DEFAULT, place=place)
+    settings = options(backend, space=color, method=method)
+    for image, found in zip(pictures(3), fit_images(pictures(3), settings), strict=True):
+        alone = eg.fit(image, 60, 30, method=method, space=color, backend=backend)
         for row, other in zip(found.trace, alone.trace, strict=True):
             assert row["iteration"] == other["iteration"]
             assert row["psnr_ycbcr"] == pytest.approx(other["psnr_ycbcr"], abs=0.05)
@@ -91,7 +97,7 @@ def test_an_image_that_is_done_rests(backend):
     """A constant image is exact at once; its trace ends there."""
     images = pictures(2)
     images[0] = 0.25
-    flat, other = fit_batch(images, options(backend, iterations=60))
+    flat, other = fit_images(images, options(backend, iterations=60))
     assert flat.stopped == "exact" and flat.iterations < 60
     assert other.stopped == "iterations" and other.iterations == 60
     np.testing.assert_allclose(flat.image, 0.25, atol=1e-4)
@@ -100,16 +106,20 @@ def test_an_image_that_is_done_rests(backend):
 def test_interrupts_end_the_batch(backend):
     threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
-        fit_batch(pictures(2), options(backend, iterations=100_000))
+        fit_images(pictures(2), options(backend, iterations=100_000))
 
 
 @pytest.mark.parametrize(
     ("changed", "expected"),
-    [({}, True), ({"init": "grid"}, True), ({"preset": "gaussianimage"}, False),
+    [({}, True), ({"method": replace(eg.DEFAULT, place=Grid())}, True),
+     ({"method": GAUSSIANIMAGE}, False), ({"gaussians": [20, 60]}, False),
      ({"target_psnr": 30.0, "gaussians": None}, False), ({"start": "set.npz"}, False),
-     ({"cutoff": 4.0}, False), ({"gaussians": 33000}, False)],
+     ({"method": replace(eg.DEFAULT, cutoff=4.0)}, False), ({"gaussians": 33000}, False)],
 )  # fmt: skip
 def test_which_options_go_together(changed, expected):
-    pixels = np.zeros((256, 256, 3), np.float32)
-    assert fits_in_batches(options(None, **changed), pixels) == expected
-    assert not fits_in_batches(options(None, **changed), np.zeros((257, 8, 3), np.float32))
+    image, wide = (
+        EncodedImage(np.zeros(shape, np.float32), "srgb") for shape in ((256, 256, 3), (257, 8, 3))
+    )
+    settings = options(None, **changed)
+    assert _is_groupable(image, settings) == _may_join([image], image, settings) == expected
+    assert not _is_groupable(wide, settings) and not _may_join([image], wide, settings)

@@ -70,8 +70,8 @@ def test_an_iterator_may_reuse_its_array():
 
 
 def test_levels_of_detail(photos, output):
-    [row, *_] = eg.fit_many(photos, output, levels=2, **QUICK)
-    alone = eg.fit(eg.load_image(row.input), levels=2, **QUICK)
+    [row, *_] = eg.fit_many(photos, output, **{**QUICK, "gaussians": [5, 20]})
+    alone = eg.fit(eg.load_image(row.input), **{**QUICK, "gaussians": [5, 20]})
     check_equal(eg.Gaussians.load(row.output), alone.gaussians.to_arrays())
 
 
@@ -144,7 +144,7 @@ def test_mistakes_are_found_before_the_work(photos, output, tmp_path):
     with pytest.raises(ValueError, match="holds no images"):
         eg.fit_many(tmp_path, output)
     with pytest.raises(ValueError, match="exclude each other"):
-        eg.fit_many(photos, output, levels=2, target_psnr=30)
+        eg.fit_many(photos, output, gaussians=[5, 20], target_psnr=30)
     assert not output.exists()
     output.write_text("a file")
     with pytest.raises(OSError, match="need a folder"):

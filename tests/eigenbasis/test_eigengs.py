@@ -14,7 +14,8 @@ from _helpers.families import (
     small_model,
     splits,
 )
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.objective import Pixels
+from eigengs_dr.fitting.solve import solve
 from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resample
@@ -105,7 +106,7 @@ def test_exact_colours_are_those_of_conjugate_gradients(backend, split, others):
     model = small_model(backend, split)
     encoded = model.encode(others[0])
     target = np.moveaxis(to_planes(others[0], "ycbcr").reshape(3, SIDE, SIDE), 0, 2)
-    iterated = solve(encoded, target, 100)
+    iterated = solve(encoded, Pixels.plain(target, encoded), 100)
     exact, slow = (eg.psnr(eg.render(g), others[0], "ycbcr") for g in (encoded, iterated))
     # With the split, small splats fit what large ones leave: on so smooth an image, that costs.
     assert slow - (3 if split else 0.02) < exact < slow + 0.1

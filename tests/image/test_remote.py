@@ -67,7 +67,7 @@ def test_an_image_may_be_a_file_or_a_url(place, photos, tmp_path):
     np.testing.assert_array_equal(eg.load_image(url), pixels)
     want = eg.fit(pixels, **QUICK).image
     np.testing.assert_array_equal(eg.fit(url, **QUICK).image, want)
-    eg.fit(url, levels=2, **QUICK)
+    eg.fit(url, **{**QUICK, "gaussians": [15, 60]})
     assert eg.fit(url, space="data", **QUICK).gaussians.channels == 3
     found = eg.fit({"albedo": url, "roughness": url}, **QUICK)
     assert list(found.maps) == ["albedo", "roughness"]

@@ -7,7 +7,8 @@ import pytest
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.components.bands import FrequencyBand
-from eigengs_dr.eigenbasis.components.joint_training import (
+from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.paper.joint_training import (
     HALVED,
     RATE,
     decode_shapes,
@@ -15,7 +16,6 @@ from eigengs_dr.eigenbasis.components.joint_training import (
     joint_weights,
     train_jointly,
 )
-from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import bin_gaussians, render
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from _helpers.sets import COUNT, SIZE, Scene, check_equal, few, random_scene, scene_of, scenes
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.fitting.objective import Data, Pixels
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve as solve_objective
+from eigengs_dr.fitting.solve import solve as solve_objective
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.raster.render import render
 
