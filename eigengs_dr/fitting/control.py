@@ -173,10 +173,19 @@ class Relocate:
         Steps between two rounds.
     share : float
         Share of the Gaussians that leave their places in a round, in [0, 1].
+
+    Raises
+    ------
+    ValueError
+        If the share is out of range.
     """
 
     every: int = EVERY
     share: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"Relocate: share is {self.share}; it must be from 0 to 1")
 
     def steps(self, iterations: int) -> list[int]:
         """Return the steps of the rounds, see `rounds`."""
