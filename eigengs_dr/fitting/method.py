@@ -122,6 +122,13 @@ class Method:
             raise ValueError(f"solve_steps is {self.solve_steps!r}; it must be at least 0")
         if not self.rates or not all(rate > 0 for rate in self.rates.values()):
             raise ValueError(f"rates are {dict(self.rates)}; each must be above 0")
+        surplus, relocate = self.control(Surplus), self.control(Relocate)
+        often = relocate.every if isinstance(relocate, Relocate) else 0
+        if isinstance(surplus, Surplus) and surplus.every and not 0 < often <= surplus.every:
+            raise ValueError(
+                "controls: a Surplus leaves by a Relocate that comes as often; add one, or leave "
+                "the Surplus out"
+            )
 
     def __repr__(self) -> str:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
