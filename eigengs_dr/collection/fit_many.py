@@ -121,7 +121,8 @@ def fit_many(
     refuse_unknown(options, [*(field.name for field in fields(FitOptions)), *own])
     settings = FitOptions(**options)
     if settings.start is not None:
-        settings = replace(settings, start=load_start(settings.start, settings.backend))
+        start = load_start(settings.start, settings.backend)
+        settings = replace(settings, start=start, space=settings.space or set_in(start).space)
     if client is None:
         select(settings.backend)  # a backend that is missing is said before the work
     job = Job(
