@@ -62,10 +62,13 @@ def test_rates_times_a_factor():
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"cutoff": 0}, "cutoff is 0; it must be above 0 and at most 12"),
-        ({"cutoff": 13}, "cutoff is 13; it must be above 0 and at most 12"),
+        ({"cutoff": 0}, "cutoff is 0.0; it must be above 0 and at most 12"),
+        ({"cutoff": 13}, "cutoff is 13.0; it must be above 0 and at most 12"),
         ({"cutoff": np.nan}, "cutoff is nan"),
         ({"solve_steps": -1}, "solve_steps is -1; it must be at least 0"),
+        ({"solve_steps": 2.5}, "solve_steps is 2.5; it must be a whole number"),
+        ({"controls": (Surplus(),)}, "controls: a Surplus leaves by a Relocate that comes as ofte"),
+        ({"controls": (Surplus(), Relocate(every=90))}, "add one, or leave the Surplus out"),
         ({"rates": {}}, "rates are {}; each must be above 0"),
         ({"rates": {"mean": 0.1, "color": 0}}, "each must be above 0"),
         ({"rates": {"mean": np.nan}}, "each must be above 0"),
@@ -75,6 +78,12 @@ def test_bad_values_are_refused(changed, words):
     with pytest.raises(ValueError, match=words) as error:
         replace(eg.DEFAULT, **changed)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, np.nan])
+def test_shares_are_checked(share):
+    with pytest.raises(ValueError, match=r"Relocate: share is .*; it must be from 0 to 1"):
+        Relocate(share=share)
 
 
 def test_betas_are_checked():

@@ -9,7 +9,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, family, small_model
 from _helpers.halves import picture
-from eigengs_dr.fitting.control import Perturb, Relocate
+from eigengs_dr.fitting.control import Perturb, Relocate, Surplus
 from eigengs_dr.fitting.place import Grid, Random
 from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.resize import resample
@@ -23,7 +23,7 @@ def test_other_placements_gain_from_relocation(place):
     method = replace(eg.DEFAULT, place=place)
     moved, left = (
         eg.fit(image, 200, 600, method=m).psnr_rgb
-        for m in (method, method.without(Relocate, Perturb))
+        for m in (method, method.without(Surplus, Relocate, Perturb))
     )
     assert moved > left + 0.3
 
@@ -101,6 +101,8 @@ def test_data_above_1_start_in_their_own_unit(backend):
     method = replace(eg.DEFAULT, solve_steps=0)
     again = eg.fit(data, start=first, iterations=0, method=method, backend=backend)
     np.testing.assert_allclose(again.image, first.image, atol=0.01)
+    [row] = eg.fit_many([data], start=first, iterations=0, method=method)
+    np.testing.assert_array_equal(row.result.image, again.image)
 
 
 @pytest.mark.parametrize("space", ["rgb", "linear", "data", "log"])

@@ -98,6 +98,20 @@ def test_the_unit_of_data(channels):
     assert data_of(pixels, "rgb").affine == Affine()
 
 
+@pytest.mark.parametrize("space", ["linear", "log"])
+def test_light_of_any_scale(values, space):
+    """Far from what a display shows, PSNRs do not depend on the scale; sets do."""
+    light = np.repeat((0.01 + values**4)[..., None], 3, axis=2)
+    light[3, 3] = 5  # above 1 at every scale, so that the space is the same
+    found = []
+    for scale in (1e3, 1e5):
+        options = {"space": space, "encoding": "linear", "iterations": 60}
+        found.append(eg.fit(scale * light, 60, **options))
+        rendered = eg.render(found[-1].gaussians).numpy()
+        np.testing.assert_allclose(rendered.mean(), scale * light.mean(), rtol=0.2)
+    assert found[1].psnr_ycbcr == pytest.approx(found[0].psnr_ycbcr, abs=0.2)
+
+
 def test_sets_there_and_back():
     gaussians = eg.fit(np.eye(8), 5, 0, space="data").gaussians
     affine = Affine(30.0, -7.0)
