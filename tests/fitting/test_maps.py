@@ -7,6 +7,7 @@ import eigengs_dr as eg
 from _helpers.materials import images
 from eigengs_dr.image.pixels import ImageError
 from eigengs_dr.paper.eigengs import EIGENGS
+from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 
 def figures(result, **changed):
@@ -122,6 +123,12 @@ def test_the_goal_of_a_fit_is_that_of_maps_without_their_own(space):
 def test_a_map_in_another_space():
     result = eg.fit({"glow": eg.Map(images()["albedo"], space="rgb")}, 60, iterations=5)
     assert [m.space for m in result.gaussians.maps] == ["rgb"]
+
+
+def test_maps_by_another_method():
+    result = eg.fit(images(), 60, iterations=30, method=GAUSSIANIMAGE)
+    assert list(result.image) == list(images())
+    assert result.psnr_ycbcr > result.trace[0]["psnr_ycbcr"]
 
 
 def test_weights_of_pixels_hold_for_all_maps():

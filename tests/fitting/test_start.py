@@ -9,14 +9,25 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, family, small_model
 from _helpers.halves import picture
-from eigengs_dr.fitting.control import Perturb, Relocate, Surplus
+from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Surplus
 from eigengs_dr.fitting.place import Grid, Random
 from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.resize import resample
 from eigengs_dr.paper.eigengs import EIGENGS
 
+places = pytest.mark.parametrize("place", [Grid(), Random()], ids=repr)
 
-@pytest.mark.parametrize("place", [Grid(), Random()], ids=repr)
+
+@places
+def test_other_placements_stay_where_they_were_put(place):
+    """They are not placed anew, and have no surplus."""
+    method = replace(eg.DEFAULT, place=place)
+    plain = method.without(Surplus, Redistribute)
+    one, other = (eg.fit(picture(), 60, 110, method=m) for m in (method, plain))
+    np.testing.assert_array_equal(one.image, other.image)
+
+
+@places
 def test_other_placements_gain_from_relocation(place):
     """They are not placed anew, but they relocate in a long descent."""
     image = eg.sample("coffee")[100:164, 200:264]
