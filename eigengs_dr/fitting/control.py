@@ -159,7 +159,8 @@ class Redistribute:
         before, after = (dr.sum(squared_error(g, objective))[0] for g in (current, anew))
         if before <= after:
             return state
-        return state.replaced(solve(anew, objective, self.solve_steps, warm_start=True))
+        anew = solve(anew, objective, self.solve_steps, warm_start=True)
+        return replace(state.replaced(anew), speed=())
 
 
 @dataclass(frozen=True)
