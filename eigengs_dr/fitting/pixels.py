@@ -111,7 +111,8 @@ def _filled(image: EncodedImage, weight: Image) -> NDArray[Any]:
         raise ValueError(
             f"weight is for {width}x{height} pixels, but the image has shape {pixels.shape}"
         )
-    if weight.ndim == 3 and weight.shape[2] not in (1, pixels.shape[-1]):
+    channels = pixels.shape[2] if pixels.ndim == 3 else 1
+    if weight.ndim == 3 and weight.shape[2] not in (1, channels):
         raise ValueError(
             f"weight has {weight.shape[2]} channels, but the image has shape {pixels.shape}"
         )
