@@ -25,7 +25,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.descent import begin, descend
 from eigengs_dr.fitting.objective import Pixels, data_of
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solve import solve
 from eigengs_dr.image.resize import center_crop
 
 if TYPE_CHECKING:  # the processes that are measured load neither pandas nor matplotlib

@@ -36,7 +36,7 @@ from ..fitting.pixels import BRIGHT, WHITE, check_normals
 from ..fitting.placement.adaptive import density_from_hessian, place_by_density
 from ..fitting.placement.density import Owners, density_ratio, squared_error
 from ..fitting.placement.filters import Canvas
-from ..fitting.solvers.conjugate_gradient import solve
+from ..fitting.solve import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
 from ..raster.render import to_tensor

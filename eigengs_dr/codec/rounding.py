@@ -23,7 +23,7 @@ from ..backend.arrays import types_of
 from ..fitting.descent import begin, descend, last
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Pixels
-from ..fitting.solvers.conjugate_gradient import solve
+from ..fitting.solve import solve
 from ..gaussian.gaussians import Gaussians, like
 from ..raster.render import render
 from .cells import hilbert_encode

@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cholesky, solve_triangular
 
 from ..backend.doors import class_of_doors
-from ..fitting.solvers.normal_equations import NormalEquations, squared_norms
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET, to_planes
 from ..image.resize import resample
+from .normal_equations import NormalEquations, squared_norms
 from .pca.truncation import min_ranks_per_channel, residual_energy
 
 Planes = NDArray[np.float32]

@@ -18,7 +18,7 @@ from ..raster.kernels import sum_by_image
 from .exchange import among, blend, exchange, exchange_levels
 from .placement.adaptive import place_adaptive, redistribute
 from .placement.density import squared_error
-from .solvers.conjugate_gradient import solve
+from .solve import solve
 
 if TYPE_CHECKING:
     from .descent import State

@@ -21,7 +21,7 @@ from .objective import Part, Pixels, Quadratic
 from .placement.filters import Canvas
 from .placement.peaks import SIZE, Peaks, residual_peaks
 from .placement.pieces import order_along_hilbert
-from .solvers.conjugate_gradient import (
+from .solve import (
     Unknowns,
     apply,
     by_channel,

@@ -38,7 +38,7 @@ from ..raster.parameters import (
 )
 from ..raster.render import bin_gaussians, pixels_inside
 from .objective import Picture
-from .solvers.conjugate_gradient import spread
+from .solve import spread
 
 Row: TypeAlias = dict[str, Any]
 """A row of a trace: its numbers by name, and under "maps" those of every map."""

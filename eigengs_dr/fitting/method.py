@@ -15,7 +15,7 @@ from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from .control import Perturb, Redistribute, Relocate, Retreat, Surplus
 from .optimizer import Adam, Optimizer
 from .place import Adaptive, Placement
-from .solvers.conjugate_gradient import solve
+from .solve import solve
 from .variables import Coordinates, Relative
 
 if TYPE_CHECKING:

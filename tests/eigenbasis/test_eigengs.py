@@ -15,7 +15,7 @@ from _helpers.families import (
     splits,
 )
 from eigengs_dr.fitting.objective import Pixels
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solve import solve
 from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resample

@@ -22,7 +22,7 @@ from ...fitting.method import Method
 from ...fitting.objective import Pixels
 from ...fitting.optimizer import Adam
 from ...fitting.place import Grid
-from ...fitting.solvers.conjugate_gradient import solve
+from ...fitting.solve import solve
 from ...fitting.variables import Relative
 from ...gaussian.gaussians import Gaussians
 from ...raster.render import bin_gaussians

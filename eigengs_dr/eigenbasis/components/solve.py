@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.doors import door
-from ...fitting.solvers.normal_equations import BATCH, NormalEquations, squared_norms
 from ...gaussian.gaussians import Gaussians, concatenate, with_colors
 from ...image.metrics import psnr_from_mse
 from ...paper.joint_training import joint_shapes, joint_weights, train_jointly
+from ..normal_equations import BATCH, NormalEquations, squared_norms
 from ..options import TrainOptions
 from ..pca.basis import Eigenbasis
 from .bands import (

@@ -14,7 +14,7 @@ from ...raster.kernels import forward, sum_by_image, sum_lanes
 from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ...raster.render import bin_gaussians
 from ..objective import Pixels, Quadratic
-from ..solvers.conjugate_gradient import Unknowns, apply, by_channel, correlate, spread
+from ..solve import Unknowns, apply, by_channel, correlate, spread
 from .filters import Canvas
 
 ERROR_EXPONENT = 4 / 3

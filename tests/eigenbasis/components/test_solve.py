@@ -6,8 +6,8 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, small_basis, small_model, splits
 from eigengs_dr.eigenbasis.components.solve import fit_model
+from eigengs_dr.eigenbasis.normal_equations import NormalEquations
 from eigengs_dr.eigenbasis.options import TrainOptions
-from eigengs_dr.fitting.solvers.normal_equations import NormalEquations
 
 
 @splits

@@ -14,21 +14,21 @@ from dataclasses import replace
 
 import drjit as dr
 
-from ...backend.arrays import Float, UInt, rcp, release_memory, types_of
-from ...backend.recording import record
-from ...gaussian.gaussians import Gaussians, whole
-from ...raster.adjoint import adjoint
-from ...raster.binning.lists import TileLists
-from ...raster.binning.tiles import Grid
-from ...raster.kernels import channel_sums, sum_by_image, sum_lanes
-from ...raster.parameters import (
+from ..backend.arrays import Float, UInt, rcp, release_memory, types_of
+from ..backend.recording import record
+from ..gaussian.gaussians import Gaussians, whole
+from ..raster.adjoint import adjoint
+from ..raster.binning.lists import TileLists
+from ..raster.binning.tiles import Grid
+from ..raster.kernels import channel_sums, sum_by_image, sum_lanes
+from ..raster.parameters import (
     detached_shape,
     gather_run,
     kernel_radius,
     pack_parameters,
 )
-from ...raster.render import bin_gaussians
-from ..objective import Pixels, Quadratic
+from ..raster.render import bin_gaussians
+from .objective import Pixels, Quadratic
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
 """Tolerance by the bits of a float: a channel stops if ``r^T z``, relative to its first value, is

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
-from eigengs_dr.fitting.solvers.normal_equations import RIDGE, NormalEquations, weight_matrix
+from eigengs_dr.eigenbasis.normal_equations import RIDGE, NormalEquations, weight_matrix
 
 
 def dense_matrix(scene, cutoff=np.inf):

@@ -3,7 +3,7 @@
 Column n of A holds the weights of Gaussian n at all pixels. The best colours c and background b of
 an image D minimise ``|A c + b 1 - D|^2``. ``A^T A`` depends on the shapes only: it is factorised
 once, and each image costs one product and one back-substitution. For one image,
-`eigengs_dr.fitting.solvers.conjugate_gradient` is cheaper.
+`eigengs_dr.fitting.solve` is cheaper.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from ...backend.arrays import types_of, upload
-from ...backend.recording import freeze_program
-from ...gaussian.gaussians import Gaussians
-from ...image.strips import available_cores
-from ...raster.adjoint import adjoint
-from ...raster.evaluate import weights
-from ...raster.parameters import (
+from ..backend.arrays import types_of, upload
+from ..backend.recording import freeze_program
+from ..gaussian.gaussians import Gaussians
+from ..image.strips import available_cores
+from ..raster.adjoint import adjoint
+from ..raster.evaluate import weights
+from ..raster.parameters import (
     NUM_SHAPE_PARAMS,
     kernel_radius,
     kernel_shape,
     pack_parameters,
     unpack_parameters,
 )
-from ...raster.render import bin_gaussians, to_tiles
+from ..raster.render import bin_gaussians, to_tiles
 
 GROUP = 3
 """Planes that one adjoint correlates: as many as an image has channels, so that all calls share one

@@ -10,7 +10,7 @@ from drjit import JitFlag
 from hypothesis import given
 
 from _helpers.sets import COUNT, SIZE, Scene, check_equal, few, random_scene, scene_of, scenes
-from eigengs_dr.fitting.solvers.conjugate_gradient import solve
+from eigengs_dr.fitting.solve import solve
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.raster.render import render
 
