@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 import eigengs_dr as eg
 from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate
-from eigengs_dr.fitting.descent import State, begin, descend
+from eigengs_dr.fitting.descent import State, begin
+from eigengs_dr.fitting.loop import descend
 from eigengs_dr.fitting.objective import Pixels, data_of, picture
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.pixels import read_pixels

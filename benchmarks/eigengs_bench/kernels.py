@@ -16,8 +16,8 @@ from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.control import Perturb, Relocate
-from eigengs_dr.fitting.descent import begin, descend, last
-from eigengs_dr.fitting.loop import refine
+from eigengs_dr.fitting.descent import begin
+from eigengs_dr.fitting.loop import descend, last, refine
 from eigengs_dr.fitting.measure import psnrs
 from eigengs_dr.fitting.objective import Pixels, data_of, picture
 from eigengs_dr.image.resize import center_crop

@@ -22,7 +22,8 @@ from eigengs_bench.clock import Image
 from eigengs_bench.rows import Job, Row, Task, alone, peak_gib
 from eigengs_dr.backend.arrays import ArrayTypes, types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import begin, descend
+from eigengs_dr.fitting.descent import begin
+from eigengs_dr.fitting.loop import descend
 from eigengs_dr.fitting.objective import Pixels, data_of
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solve import solve

@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 from ..backend.arrays import Float, types_in
 from ..backend.selection import select
 from ..fitting.control import Redistribute, Relocate
-from ..fitting.descent import State, begin, descend, last
+from ..fitting.descent import State, begin
+from ..fitting.loop import descend, last
 from ..fitting.method import Method
 from ..fitting.objective import Affine, Extent, Part, Pixels, data_of, values_in
 from ..fitting.options import FitOptions

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..fitting.descent import begin, descend, last
+from ..fitting.descent import begin
+from ..fitting.loop import descend, last
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..backend.progress import shows_progress
 from ..backend.selection import select
+from ..fitting.control import Diverged
 from ..fitting.fit import Fit, fit_images
 from ..fitting.objective import is_codes
 from ..fitting.options import FitOptions, refuse_unknown
@@ -177,4 +178,7 @@ def _is_groupable(image: EncodedImage, options: FitOptions) -> bool:
 
 def _fit_group(images: list[EncodedImage], options: FitOptions) -> list[Fit]:
     """Fit one image, or several that may be in one batch."""
-    return fit_images(images, options)
+    try:
+        return fit_images(images, options)
+    except Diverged:
+        return [fit_images([image], options)[0] for image in images]

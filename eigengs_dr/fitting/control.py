@@ -1,8 +1,9 @@
 """Controls: what adds, moves and removes Gaussians between the steps of a descent.
 
-`Surplus` asks for more Gaussians than wanted, `Redistribute` places all anew after the first steps,
-`Relocate` moves those of least use, and lets the surplus go, and `Perturb` shakes all. Each acts
-before steps of its own, and with it the optimiser starts anew.
+`Retreat` undoes steps that have raised the error, `Surplus` allows more Gaussians than requested,
+`Redistribute` places all anew after the first steps, `Relocate` moves those of least use and lets
+the surplus go, and `Perturb` shakes all. Each acts before steps of its own. Where it changes the
+Gaussians, the optimiser starts anew.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import Float, make_divisor, types_of, upload
+from ..backend.arrays import Float, make_divisor, types_of
 from ..raster.kernels import sum_by_image
-from .exchange import among, blend, exchange, exchange_levels
+from .exchange import among, exchange, exchange_levels
 from .placement.adaptive import place_adaptive, redistribute
 from .placement.density import squared_error
 from .solve import solve
@@ -28,9 +29,9 @@ EVERY = 45
 """Steps between two rounds of relocation."""
 
 UNTIL, MIN_ROUNDS, MAX_ROUNDS = 0.65, 2, 72
-"""The share of a descent that has rounds, and their numbers. In 100 steps more steps gain more than
-rounds would, for the same time. With 5,000 steps, 72 rounds gain 0.07 and 0.1 dB over 40 (4
-training photos, 0.0127 and 0.0254 Gaussians a pixel)."""
+"""Rounds end after this share of a descent; their smallest and largest number. In 100 steps more
+steps gain more than rounds would, for the same time. With 5,000 steps, 72 rounds gain 0.07 and 0.1
+dB over 40 (4 training photos, 0.0127 and 0.0254 Gaussians a pixel)."""
 
 FULL_ROUNDS = 10
 """Number of rounds from which on noise and surplus have their full strength. A short descent does
@@ -60,12 +61,12 @@ def _strength(number: int) -> float:
 
 @dataclass(frozen=True)
 class Surplus:
-    """Lets a redistribution place more Gaussians than asked for; relocations let them go again.
+    """Lets a redistribution place more Gaussians than requested; relocations remove them again.
 
     Attributes
     ----------
     share : float
-        Surplus of a long descent, relative to the number asked for. With 0.0127 Gaussians a pixel,
+        Surplus of a long descent, relative to the number requested. With 0.0127 Gaussians a pixel,
         1,000 steps and 9 training photos, 0.5, 1 and 2 gain 0.23, 0.24 and 0.12 dB.
     max_density : float
         Most Gaussians a pixel of a set with a surplus. Denser sets do not converge in 1,000 steps.
@@ -107,8 +108,8 @@ class Surplus:
 class Redistribute:
     """Places all Gaussians anew after the first steps, denser where these left more error.
 
-    Gaussians that the user chose stay, unless they then have a larger error than a placement by the
-    image has almost at once: where a start is useless.
+    A start that the user chose is kept, unless its error then exceeds that of a fresh placement
+    after three steps of the colour solve.
 
     Attributes
     ----------
@@ -122,9 +123,9 @@ class Redistribute:
     solve_steps: int = 10
 
     TRIED_STEPS = 3
-    """Steps of the colour solve of a placement after which a start that the user chose must be no
-    worse. Sets of a moved image, of another image and of a model have 0.4 to 1.1 times its squared
-    error, a heap and Gaussians outside of the image more than 10 times (three training photos)."""
+    """Steps of the colour solve of the placement with which a chosen start is compared. Sets of a
+    moved image, of another image and of a model have 0.4 to 1.1 times its squared error, a heap and
+    Gaussians outside of the image more than 10 times (three training photos)."""
 
     MIN_RATIO = 10
     """Smallest ratio of the steps of a descent to those before a redistribution."""
@@ -160,14 +161,15 @@ class Redistribute:
         if before <= after:
             return state
         anew = solve(anew, objective, self.solve_steps, warm_start=True)
-        return replace(state.replaced(anew), speed=())
+        # The start has been judged, not the rates: steps of a useless start may raise its error.
+        return replace(state.replaced(anew), speed=1.0)
 
 
 @dataclass(frozen=True)
 class Relocate:
     """Moves the Gaussians of least use to where they reduce the error most, again and again.
 
-    What is more than asked for leaves, about as many in each round. With levels, the Gaussians of
+    The surplus leaves, about as many in each round. With levels, the Gaussians of
     each level move inside of it.
 
     Attributes
@@ -212,7 +214,7 @@ class Relocate:
 
 @dataclass(frozen=True)
 class Perturb:
-    """Adds noise to means and shapes, less from round to round, so that a poor minimum is left.
+    """Adds noise to means and shapes, less from round to round, to escape a poor minimum.
 
     Kheradmand et al. ("3D Gaussian splatting as Markov chain Monte Carlo", NeurIPS 2024) add noise
     to means. Here shapes get noise too, and each Gaussian gets as much as the image can bear, see
@@ -246,7 +248,9 @@ class Perturb:
         squares, images = state.squares, objective.grid.images
         if squares is None:
             squares = sum_by_image(squared_error(gaussians, objective), objective.grid)
-        own = range(state.total) if objective.part is None else range(*_ends(objective.part.own))
+        own = range(state.total)
+        if objective.part is not None:
+            own = own[objective.part.own]
         curvature = objective.model.mean_curvature(objective.grid, objective.channels)
         error = squares / (curvature * dr.opaque(type(squares), max(1, len(own))))
         seed = int(np.random.SeedSequence([key, step]).generate_state(1)[0])
@@ -257,25 +261,25 @@ class Perturb:
         return state.replaced(replace(gaussians, mean=mean, factor=factor).bounded())
 
 
-def _ends(own: slice) -> tuple[int, int]:
-    return own.start, own.stop
-
-
 @dataclass(frozen=True)
 class Retreat:
-    """Returns to where the optimiser started, at lower rates, if the error has risen since.
+    """Returns to where the optimiser started, at lower rates, if the error has risen much since.
 
-    It comes before the other controls. The steps of its checks double, so that rates which are far
-    too high do little harm.
+    Put it before the other controls: it judges what they have not touched yet. The steps of its
+    checks double, so that rates which are far too high do little harm.
 
     Attributes
     ----------
+    rise : float
+        Ratio of the squared errors above which it returns. The first steps from a good set raise
+        the error of fits that end well.
     factor : float
         Factor of all learning rates after a return.
     first : int
         Steps before the first check.
     """
 
+    rise: float = 4.0
     factor: float = 0.4
     first: int = 10
 
@@ -292,22 +296,28 @@ class Retreat:
     def __call__(
         self, state: State, objective: Pixels, step: int, iterations: int, key: int
     ) -> State:
-        """Return the state, or for images whose error has risen, the one to return to."""
+        """Return the state, or the one to return to.
+
+        Raises
+        ------
+        Diverged
+            If the error of an image of a batch has risen.
+        """
         if objective.levels or objective.part or state.fixed is None:
             return state
-        images, current = objective.grid.images, dr.detach(state.gaussians)
-        errors = [
-            sum_by_image(squared_error(g, objective), objective.grid)
-            for g in (state.fixed, current)
-        ]
-        before, after = (error.numpy() for error in errors)
-        risen = ~(after <= before)
-        if not risen.any():
+        before, after = (
+            sum_by_image(squared_error(dr.detach(g), objective), objective.grid).numpy()
+            for g in (state.fixed, state.gaussians)
+        )
+        if (after <= self.rise * before).all():
             return state
-        returns = upload(types_of(current.mean).Float, np.repeat(risen, state.total))
-        current = blend(state.fixed, current, returns)
-        speed = np.array(state.speed or [1.0] * images) * np.where(risen, self.factor, 1.0)
-        return replace(state.replaced(current), speed=tuple(speed.tolist()))
+        if objective.grid.images > 1:
+            raise Diverged
+        return replace(state.replaced(state.fixed), speed=self.factor * state.speed)
+
+
+class Diverged(Exception):
+    """Images of a batch do not fit together: one has to go back, and the others have not."""
 
 
 SHAPE_SHARE = 0.5

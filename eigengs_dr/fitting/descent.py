@@ -1,13 +1,13 @@
-"""The state of a descent, the loop over its steps, and the program of one step.
+"""The state of a descent, its tile lists, and the program of one step.
 
-A step takes three kernels: the sum over Gaussians, which writes the derivative of the objective
-instead of an image; the adjoint; and the optimiser, with one lane per Gaussian.
+A step takes three kernels, with levels two more for each: the sum over Gaussians, which writes the
+derivative of the objective instead of an image; the adjoint; and the optimiser, with one lane per
+Gaussian. `eigengs_dr.fitting.loop.descend` takes the steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
@@ -15,7 +15,6 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of, upload
-from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, take
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.binning.lists import TileLists
@@ -31,7 +30,7 @@ LOSS_EPSILON = 1e-10
 
 
 class Moving(NamedTuple):
-    """What a step changes.
+    """What a step takes and returns.
 
     Attributes
     ----------
@@ -41,7 +40,7 @@ class Moving(NamedTuple):
         The state of the optimiser for each variable.
     time : Float, shape (1,)
         Steps since the optimiser started.
-    speed : Float, shape (1,) or (N,)
+    speed : Float, shape (1,)
         Factor of all learning rates.
     packed : Float
         The parameters of the set for the kernels.
@@ -66,15 +65,15 @@ class State:
     gaussians : Gaussians
         The current set, of a batch image after image.
     count : int
-        Number of Gaussians of an image that are asked for.
+        Requested number of Gaussians of an image.
     surplus : int
         How many more a control may place before the last ones have left.
     chosen : bool
-        Whether the user chose the Gaussians: controls then move them only for the better.
+        Whether the user chose the Gaussians: a redistribution then keeps those that are of use.
     squares : Float or None, shape (images,)
         The sums of ``h (p - t)^2`` that a control has measured before this step.
-    speed : tuple of float
-        Factor of all learning rates, for each image; () for 1.
+    speed : float
+        Factor of all learning rates.
     fixed : Gaussians or None
         The set at which the optimiser started, whose variables move; None until the next step,
         which starts the optimiser.
@@ -82,7 +81,7 @@ class State:
     since : int
         The step at which the optimiser started.
     lists : tuple of TileLists
-        Of the current set, one for each of the numbers of the levels, and of all.
+        Of the current set: one for each level, and one for the whole set.
     until : int
         The step that needs new lists.
     """
@@ -92,7 +91,7 @@ class State:
     surplus: int = 0
     chosen: bool = False
     squares: Float | None = None
-    speed: tuple[float, ...] = ()
+    speed: float = 1.0
     fixed: Gaussians | None = None
     moving: Moving | None = None
     since: int = 0
@@ -101,79 +100,12 @@ class State:
 
     def replaced(self, gaussians: Gaussians) -> State:
         """Return the state with another set, from which the optimiser starts anew."""
-        return replace(self, gaussians=gaussians, fixed=None, moving=None, lists=())
+        return replace(self, gaussians=gaussians, squares=None, fixed=None, moving=None, lists=())
 
     @property
     def total(self) -> int:
         """Number of Gaussians of an image."""
         return len(self.gaussians) // dr.width(self.gaussians.background[0])
-
-
-def descend(
-    objective: Pixels,
-    method: Method,
-    state: State,
-    iterations: int,
-    key: int = 0,
-    part: range | None = None,
-) -> Generator[State, None, None]:
-    """Yield the state after every step of a descent: the loop of every fit.
-
-    Parameters
-    ----------
-    objective : Pixels
-    method : Method
-    state : State
-        See `begin`.
-    iterations : int
-        Number of steps of the whole descent, by which rates fall and controls act.
-    key : int, optional
-        All random numbers depend on it and on the step.
-    part : range, optional
-        The steps to take, by default all; the optimiser starts anew at the first.
-
-    Yields
-    ------
-    State
-        Steps run asynchronously: its arrays may not be computed yet. After the last control there
-        are as many Gaussians as asked for.
-    """
-    part = range(iterations) if part is None else part
-    acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
-    factors, largest = method.rate_factors(iterations, state.chosen), 0
-    rates = rate_table(objective.types, method, factors)
-    with release_later(state), freeze_program(step_program(objective, method)) as take_step:
-        for step in part:
-            for control, steps in acts:
-                if step in steps:
-                    state = control(state, objective, step, iterations, key)
-            if state.moving is None:
-                state = started(state, method, step, objective.grid.images)
-            if not state.lists or step >= state.until:
-                state = _listed(state, objective, method, factors, step, part.stop)
-            largest = max(largest, len(state.gaussians))
-            moving, moved = take_step(
-                largest,
-                state.moving,
-                state.fixed,
-                objective.model,
-                list(state.lists),
-                rates,
-                dr.opaque(objective.types.UInt, step),
-            )
-            state = replace(state, moving=moving, gaussians=moved, squares=None)
-            yield state
-
-
-def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussians:
-    """Take all steps of a descent; return its last set without derivatives.
-
-    `gaussians` is the set before the first step, for a descent of no steps.
-    """
-    with closing(states):
-        for state in states:
-            gaussians = state.gaussians
-    return dr.detach(gaussians)
 
 
 def begin(gaussians: Gaussians, images: int = 1, chosen: bool = False) -> State:
@@ -185,6 +117,8 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
     """Return the state in which the optimiser starts at the current set, before a step."""
     gaussians = dr.detach(state.gaussians)
     encoded = method.coordinates.encode(gaussians)
+    if unknown := set(method.rates) - set(encoded):
+        raise ValueError(f"rates name {min(unknown)!r}; the variables are {', '.join(encoded)}")
     variables = {name: dr.detach(encoded[name]) for name in method.rates}
     dr.eval(variables)
     moments = {name: method.optimizer.start(value) for name, value in variables.items()}
@@ -194,17 +128,12 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
         color = [row + zeros for row in gaussians.color]
         scale = rate_scale_of(color, method.rate_exponent, images)
         dr.eval(scale)
-    speed = upload(types.Float, np.array(state.speed or (1.0,)))
-    if len(state.speed) > 1:
-        image, _ = make_divisor(types, state.total).divmod(dr.arange(types.UInt, len(gaussians)))
-        speed = dr.gather(types.Float, speed, image)
-        dr.eval(speed)
-    time = dr.opaque(types.Float, 0)
+    time, speed = dr.opaque(types.Float, 0), dr.opaque(types.Float, state.speed)
     moving = Moving(variables, moments, time, speed, pack(gaussians), scale)
     return replace(state, fixed=gaussians, moving=moving, since=step, lists=())
 
 
-def _listed(
+def listed(
     state: State,
     objective: Pixels,
     method: Method,
@@ -214,7 +143,7 @@ def _listed(
 ) -> State:
     """Make the tile lists of the current set; they last until `end`, or until it moved too far."""
     assert state.fixed is not None and state.moving is not None
-    slowed = [factor * max(state.speed, default=1.0) for factor in factors]
+    slowed = [factor * state.speed for factor in factors]
     until, moves = next_build(method, slowed, step, end, state.since)
     pad, growth = method.coordinates.reach(state.fixed, moves)
     if state.moving.rate_scale is not None:

@@ -242,18 +242,6 @@ def in_order(gaussians: Gaussians, images: int = 1) -> Gaussians:
     return take(gaussians, order_along_hilbert(canvas, (x, y)))
 
 
-def blend(one: Gaussians, other: Gaussians, share: Float) -> Gaussians:
-    """Return the Gaussians of one set where a share (N,) is 1, and of another where it is 0.
-
-    Backgrounds do not move in a descent, so both have the same.
-    """
-    rows = {}
-    for name in ("mean", "factor", "color"):
-        a, b = (getattr(g, name) for g in (one, other))
-        rows[name] = type(a)([dr.select(share > 0, u, v) for u, v in zip(a, b, strict=True)])
-    return replace(other, **rows)
-
-
 def _core(objective: Pixels, part: Part) -> Float:
     """Return 1 for the values of the pixels to which a part may move, and 0 for others."""
     width, height = objective.size
@@ -366,6 +354,8 @@ def _without(gaussians: Gaussians, moved: UInt, dropped: int, images: int) -> Ga
 
 def exchange_levels(gaussians: Gaussians, objective: Pixels, share: float) -> Gaussians:
     """Move the Gaussians of least use in each level to where the image up to it has most error.
+
+    A step of the colour solve adapts the colours of a level and of those before it.
 
     With 850, 1,190 and 1,530 Gaussians on 256x256 pixels of a training photo, these levels gain
     0.36, 0.62 and 0.75 dB in 1,000 steps. Solves for the colours of the first level, and a

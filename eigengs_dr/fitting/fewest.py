@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -20,9 +20,9 @@ import drjit as dr
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import MAX_PSNR
 from .control import Perturb, Redistribute, Relocate, Surplus
-from .descent import begin, descend
+from .descent import begin
 from .exchange import densify, prune
-from .loop import FitProgress, Refinement, Score
+from .loop import FitProgress, Refinement, Score, descend
 from .measure import Row
 from .method import Method
 from .objective import Pixels
@@ -124,7 +124,8 @@ def fewest(
     most : int
         Largest number of Gaussians.
     iterations : int, optional
-        Steps of a fit with a known number; the search takes up to about twice as many.
+        Steps of a fit with a known number; the search takes up to about twice as many, and a
+        quarter more where the first fit is far off.
     key, progress, interrupted : optional
         See `eigengs_dr.fitting.loop.refine`.
 
@@ -139,24 +140,18 @@ def fewest(
     tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
     planned = MAX_TRIES * tries + fit + MAX_POLISHES * polish
     run = _Run(objective, method, start, score, goal, key, progress, interrupted, planned)
-    try:
-        estimate = _estimate(run, most, tries)
-        if not interrupted() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
-            longest = round(MAX_LENGTH * iterations)
-            trial = _fit_estimate(run, estimate, most, fit, longest)
-            # If the iterations are few, or two fits have used them up, polish all the same.
-            sure = SURE_DROPS if trial.missing <= 0 else SURE_POLISHES
-            most_steps = max(longest, run.step + sure * polish)
-            _polish(run, trial, most, polish, most_steps)
-        ended = interrupted()
-    except KeyboardInterrupt:
-        ended = True
-    if ended:
-        run.progress = None  # it may have raised the interrupt
-        with suppress(KeyboardInterrupt):
-            _trim(run)
+    estimate = _estimate(run, most, tries)
+    if not run.ended() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
+        longest = round(MAX_LENGTH * iterations)
+        trial = _fit_estimate(run, estimate, most, fit, longest)
+        # If the iterations are few, or two fits have used them up, polish all the same.
+        sure = SURE_DROPS if trial.missing <= 0 else SURE_POLISHES
+        most_steps = max(longest, run.step + sure * polish)
+        _polish(run, trial, most, polish, most_steps)
+    if run.ended():
+        _trim(run)
     met = "met" if run.best.missing <= 0 else "out of reach"
-    stopped = "interrupted" if ended else met
+    stopped = "interrupted" if run.ended() else met
     return Refinement(run.best.gaussians, run.trace, run.step, stopped, run.best.row)
 
 
@@ -181,6 +176,7 @@ class _Run:
     progress: FitProgress | None
     interrupted: Callable[[], bool]
     planned: int
+    stopped: bool = False
     step: int = 0
     db_per_doubling: float = DB_PER_DOUBLING
     trace: list[Row] = field(default_factory=list)
@@ -204,8 +200,8 @@ class _Run:
                 self.step = before + step
                 if self.progress and self.step % 10 == 0:
                     dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
-                    self.progress(self.step, self.planned, self.trace[-1])
-                if self.interrupted():
+                    self.show(self.trace[-1])
+                if self.ended():
                     break
         # An interrupt may come before the last relocation.
         return self.score(prune(dr.detach(current.gaussians), self.objective, current.count))
@@ -223,9 +219,20 @@ class _Run:
         trial = _Trial(gaussians, goal - min(figures[figure], MAX_PSNR), row)
         if len(self.trace) == 1 or _better(trial, self.best):
             self.best = trial
-        if self.progress:
-            self.progress(self.step, self.planned, row)
+        self.show(row)
         return trial
+
+    def show(self, row: Row) -> None:
+        """Call `progress`, which may end the search by a `KeyboardInterrupt`."""
+        if self.progress and not self.stopped:
+            try:
+                self.progress(self.step, self.planned, row)
+            except KeyboardInterrupt:
+                self.stopped = True
+
+    def ended(self) -> bool:
+        """Return whether somebody has ended the search."""
+        return self.stopped or self.interrupted()
 
 
 def _better(a: _Trial, b: _Trial) -> bool:
@@ -260,7 +267,7 @@ def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
         close = last is not None and abs(count - len(placed)) <= TRY_TOLERANCE * len(placed)
         placed = run.redistribute(trial.gaussians, count)
         last, before = trial, run.score(placed)
-        if close or run.interrupted():
+        if close or run.ended():
             break
     return _Estimate(trial.gaussians, placed)
 
@@ -269,7 +276,7 @@ def _fit_estimate(run: _Run, estimate: _Estimate, most: int, steps: int, most_st
     """Fit the estimated number; if it was far off, fit once more, in the steps that are left."""
     trial, number = _fit(run, estimate, steps), len(estimate.placed)
     count = _count_for_gain(run, number, trial.missing, most)
-    if run.interrupted() or count - number <= FIT_TOLERANCE * number:
+    if run.ended() or count - number <= FIT_TOLERANCE * number:
         return trial
     again = _Estimate(trial.gaussians, run.redistribute(trial.gaussians, count))
     return _fit(run, again, max(1, min(steps, most_steps - run.step)))
@@ -310,7 +317,7 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
     `most_steps` limits the steps of the search: if `densify` finds few places, it would not end.
     """
     least_growth, rounds, gain = 1.02, 0, POLISH_GAIN
-    while run.step + steps <= most_steps and not run.interrupted():
+    while run.step + steps <= most_steps and not run.ended():
         count, found = len(trial.gaussians), run.best
         if found.missing <= 0 and rounds >= MAX_POLISHES:
             return

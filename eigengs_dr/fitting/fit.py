@@ -21,16 +21,17 @@ from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians, scale_channels
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
+from .control import Redistribute, Surplus
 from .descent import begin
 from .fewest import fewest
-from .levels import place_levels, sort_levels, without_placement
+from .levels import place_levels, sort_levels
 from .loop import FitProgress, Refinement, Score, refine, sets_of
 from .maps import Map, MapImage, balance, combine, read_maps, score_maps
 from .measure import Row, psnrs
 from .method import DEFAULT, Method
 from .objective import Affine, Pixels, data_of, fitted, picture, restored
 from .options import FitOptions, Goal, Start, named_options
-from .pixels import Image, PixelsOrPath, check_weight, read_pixels
+from .pixels import Image, PixelsOrPath, check_channels, check_weight, read_pixels
 from .place import Adaptive
 from .start import check_start, load_start, set_in, start_from, types_for
 
@@ -49,9 +50,9 @@ class Fit:
         goals the key margin: the decibels above its goal of the map that is farthest from it. Row 0
         shows the set before refinement. Seconds count from the call of `fit`; they include
         placement, upload, the colour solve and the measurements.
-        A descent has more Gaussians than asked for in its first two thirds, see
-        `eigengs_dr.fitting.control.Surplus`; those sets have no rows. With a weight, the squared
-        errors of all PSNRs are weighted.
+        A descent may have more Gaussians than requested until two thirds of its steps are taken,
+        see `eigengs_dr.fitting.control.Surplus`; those sets have no rows. With a weight, the
+        squared errors of all PSNRs are weighted, by the mean over the channels.
         With space "data", psnr_ycbcr is the PSNR of the data, with their range as the peak, or 1
         for codes between 0 and 1; psnr_rgb is that of codes after rounding to 8 bits, and NaN for
         other data, which have none. With space "normal" both have the peak 1. With space "radiance"
@@ -167,8 +168,8 @@ def fit(
     start : Gaussians, Fit, path-like or EigenGS, optional
         Instead of a placement, Gaussians to start from, scaled to the size of the image: the set of
         the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
-        that it makes of the image, which suits many images. Where a start turns out to be useless,
-        the first steps place the Gaussians anew.
+        that it makes of the image, which suits many images. The set gets the cutoff of the method.
+        A start that turns out to be useless in the first steps is placed anew.
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
@@ -179,18 +180,20 @@ def fit(
         light above 1, "linear" becomes "radiance", and "ycbcr" and "rgb" become "log": a texture
         would clamp their sums.
     weight : array_like, shape (H, W) or (H, W, C), optional
-        Factors of the squared errors of pixels, or of their channels in the space of the colours;
-        finite and at least 0. A pixel of weight 0 does not count; it may be NaN.
+        Factors of the squared errors of pixels, or of their channels in the space of the colours,
+        for maps of pixels alone; finite and at least 0. A pixel of weight 0 does not count; it may
+        be NaN.
     method : Method, optional
         How to fit, by default `DEFAULT`; `eigengs_dr.paper` has those of the papers.
     seed : int, optional
-        Seed of all random numbers: those of the noise that relocations add to means and shapes.
+        Seed of all random numbers: of the noise by which means and shapes are perturbed, and of
+        the placements that draw some.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
-        Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
-        trace, or a row of a set with more Gaussians than asked for.
+        A callable is called every 10 steps as ``progress(iteration, iterations, row)`` with the
+        last row of the trace, or a row of a set with more Gaussians than requested.
     encoding : {"srgb", "linear"}, optional
         What the pixels of the image are: sRGB codes, or light as in renderings. By default what the
         image says (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
@@ -243,16 +246,16 @@ def fit(
     )
     factors = check_weight(weight)
     if isinstance(image, Mapping):
-        if start is not None or space is not None or method.needs_model:
+        if start is not None or space is not None:
             raise ValueError(
                 "maps take no start and no space; a Map says the space of one: "
                 "Map(image, space='data')"
             )
-        goal = options.goal
-        maps = read_maps(image, goal, factors, encoding)
-        if goal is None and maps[0].goal is not None:
-            goal = Goal(max(m.goal for m in maps if m.goal is not None))
-            options = replace(options, target_psnr=goal)
+        maps = read_maps(image, options.goal, factors, encoding)
+        if options.goal is None and maps[0].goal is not None:
+            if gaussians is not None:
+                raise ValueError("gaussians and goals of maps exclude each other; give one of them")
+            options = replace(options, target_psnr=maps[0].goal)
         return fit_maps(maps, options, factors, started, progress)
     source = os.path.basename(image) if isinstance(image, (str, os.PathLike)) else ""
     try:
@@ -280,6 +283,7 @@ def fit_images(
     pixels, space = [p for p, _ in read], read[0][1]
     height, width, channels = pixels[0].shape
     options.check_image(width, height, channels)
+    check_channels(weight, channels)
     if start is not None:
         check_start(set_in(start), (width, height), channels, space, options)
     types, mean_image = types_for(start, options.backend), None
@@ -324,12 +328,13 @@ def fit_maps(
     height, width = images[0].pixels.shape[:2]
     channels, types = sum(i.pixels.shape[2] for i in images), types_for(None, options.backend)
     options.check_image(width, height, channels)
+    check_channels(weight, 1)
     goal = options.goal
     with defer_interrupts() as interrupted:
         first = options.count_for(width * height)
         if goal:
             first = options.first_try(width * height, channels)
-        factors = balance(images, options.method, first, types, weight)
+        factors = balance(images, options, first, types, weight)
         objective = combine(images, factors, types, weight)
 
         def score(gaussians: Gaussians) -> list[Row]:
@@ -368,8 +373,8 @@ def _refined(
     method, iterations, key = options.method, options.iterations, options.seed
     (width, height), channels = objective.size, objective.channels
     counts, chosen = options.levels, begun is not None
-    if method.place != Adaptive():  # the choice of a placement is not undone
-        method = without_placement(method)
+    if counts or method.place != Adaptive():  # the choice of a placement is not undone
+        method = method.without(Surplus, Redistribute)
     if counts:
         begun = place_levels(objective, method, counts, iterations, key, interrupted)
         objective = replace(objective, levels=counts[:-1])

@@ -10,15 +10,16 @@ work: they depend on each other, and the first quarter does not form an image.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 
 from ..gaussian.gaussians import Gaussians, concatenate
-from .control import Redistribute, Surplus
-from .descent import begin, descend
+from .descent import begin
 from .exchange import removal_cost
+from .loop import descend
 from .method import Method
 from .objective import Pixels
 
@@ -52,20 +53,16 @@ def place_levels(
     gaussians = method.place_and_solve(objective, counts[0], key)
     for level, count in enumerate(counts[1:], 1):
         nested = replace(objective, levels=tuple(counts[: level - 1]))
-        for state in descend(nested, method, begin(gaussians), steps, key):
-            gaussians = state.gaussians
-            if interrupted():
-                break
+        with closing(descend(nested, method, begin(gaussians), steps, key)) as states:
+            for state in states:
+                gaussians = state.gaussians
+                if interrupted():
+                    break
         gaussians = dr.detach(gaussians)
         added = method.place_and_solve(objective.minus(gaussians), count - len(gaussians), key)
         # The background is one for all levels: a new one would change the earlier levels.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
     return gaussians
-
-
-def without_placement(method: Method) -> Method:
-    """Return a method for sets that are placed: nothing places all Gaussians anew."""
-    return method.without(Surplus, Redistribute)
 
 
 def sort_levels(gaussians: Gaussians, objective: Pixels, counts: Sequence[int]) -> Gaussians:

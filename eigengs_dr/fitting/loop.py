@@ -1,22 +1,91 @@
-"""A descent with a trace: the best sets, their PSNRs on the way, and when it ends."""
+"""The loop of every fit: controls, steps, and the best set on the way."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import numpy as np
 
+from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
-from .descent import State, descend
+from .descent import State, listed, rate_table, started, step_program
 from .exchange import prune
 from .measure import Row
 from .method import Method
 from .objective import Pixels
+
+
+def descend(
+    objective: Pixels,
+    method: Method,
+    state: State,
+    iterations: int,
+    key: int = 0,
+    part: range | None = None,
+) -> Generator[State, None, None]:
+    """Yield the state after every step of a descent: the loop of every fit.
+
+    Parameters
+    ----------
+    objective : Pixels
+    method : Method
+    state : State
+        See `begin`.
+    iterations : int
+        Number of steps of the whole descent, by which rates fall and controls act.
+    key : int, optional
+        All random numbers depend on it and on the step.
+    part : range, optional
+        The steps to take, by default all.
+
+    Yields
+    ------
+    State
+        Steps run asynchronously: its arrays may not be computed yet. After the last control there
+        are as many Gaussians as requested.
+    """
+    part = range(iterations) if part is None else part
+    acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
+    factors, largest = method.rate_factors(iterations, state.chosen), 0
+    rates = rate_table(objective.types, method, factors)
+    with release_later(state), freeze_program(step_program(objective, method)) as take_step:
+        for step in part:
+            for control, steps in acts:
+                if step in steps:
+                    state = control(state, objective, step, iterations, key)
+            if state.moving is None:
+                state = started(state, method, step, objective.grid.images)
+            if not state.lists or step >= state.until:
+                state = listed(state, objective, method, factors, step, part.stop)
+            largest = max(largest, len(state.gaussians))
+            moving, moved = take_step(
+                largest,
+                state.moving,
+                state.fixed,
+                objective.model,
+                list(state.lists),
+                rates,
+                dr.opaque(objective.types.UInt, step),
+            )
+            state = replace(state, moving=moving, gaussians=moved, squares=None)
+            yield state
+
+
+def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussians:
+    """Take all steps of a descent; return its last set without derivatives.
+
+    `gaussians` is the set before the first step, for a descent of no steps.
+    """
+    with closing(states):
+        for state in states:
+            gaussians = state.gaussians
+    return dr.detach(gaussians)
+
 
 FitProgress = Callable[[int, int, Row], None]
 
@@ -27,15 +96,15 @@ the best."""
 
 @dataclass(frozen=True)
 class Refinement:
-    """Result of a descent for one image.
+    """Result of a descent for one image, perhaps of a batch.
 
     Attributes
     ----------
     gaussians : Gaussians
-        The set with the highest psnr_ycbcr in the trace; of a batch, the sets of all images.
+        The set with the highest psnr_ycbcr in the trace; the batch with it, if there is one.
     trace : list of dict
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb, for sets with as many
-        Gaussians as asked for.
+        Gaussians as requested.
     iterations : int
         Number of steps.
     stopped : str
@@ -99,7 +168,7 @@ class Best:
         return all(one.stopped == "exact" for one in self.found)
 
     def judge(self, step: int, gaussians: Gaussians) -> None:
-        """Measure a set. One with more Gaussians than asked for does not compare."""
+        """Measure a set. One with more Gaussians than requested does not compare."""
         rows = self.score(gaussians)
         self.row = {"iteration": step, **rows[0]}
         if len(gaussians) > len(self.found) * self.state.count:
@@ -113,8 +182,8 @@ class Best:
             for one, row in zip(self.found, rows, strict=True)
         ]
 
-    def interrupted(self, objective: Pixels) -> None:
-        """Measure what the last step reached, without the Gaussians that are not asked for."""
+    def end_early(self, objective: Pixels) -> None:
+        """Measure the best set with a surplus, and that of the last step, both without it."""
         if len(self.found) > 1:
             raise KeyboardInterrupt
         larger = [self.larger] if self.larger else []
@@ -147,10 +216,10 @@ def refine(
         Largest number of steps.
     score : Score
     key : int, optional
-        See `eigengs_dr.fitting.descent.descend`.
+        See `eigengs_dr.fitting.loop.descend`.
     progress : callable, optional
         Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
-        trace, or that of a set with more Gaussians than asked for. It may raise `KeyboardInterrupt`
+        trace, or that of a set with more Gaussians than requested. It may raise `KeyboardInterrupt`
         to end the refinement.
     interrupted : callable, optional
         Called before every step; True ends the refinement. See
@@ -159,7 +228,7 @@ def refine(
     Returns
     -------
     list of Refinement
-        For each image, a set never worse than the start, with as many Gaussians as asked for. After
+        For each image, a set never worse than the start, with as many Gaussians as requested. After
         an interrupt, the last row of the trace measures the last step.
 
     Raises
@@ -177,8 +246,9 @@ def refine(
     except KeyboardInterrupt:
         stopped = True
     if stopped:
-        best.interrupted(objective)
-    return [replace(one, gaussians=dr.detach(one.gaussians)) for one in best.found]
+        best.end_early(objective)
+    batches = {id(one.gaussians): dr.detach(one.gaussians) for one in best.found}
+    return [replace(one, gaussians=batches[id(one.gaussians)]) for one in best.found]
 
 
 def trace_steps(iterations: int) -> set[int]:

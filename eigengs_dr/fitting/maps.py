@@ -21,9 +21,8 @@ from ..image.metrics import target_key
 from ..image.pixels import ImageError
 from ..storage.npz import BadValue
 from .measure import Row, psnrs
-from .method import Method
 from .objective import Data, Pixels, data_of, is_codes, picture
-from .options import Goal
+from .options import FitOptions, Goal
 from .pixels import read_pixels
 from .placement.density import squares_by_channel
 
@@ -162,9 +161,7 @@ def combine(
         layers = [np.ones_like(d.values) if d.curvature is None else d.curvature for d in parts]
         curvature = np.concatenate(layers, axis=2)
         if weight is not None:
-            curvature *= np.atleast_3d(weight).mean(axis=2, keepdims=True)
-    elif weight is not None:
-        curvature = weight.mean(axis=2) if weight.ndim == 3 else weight
+            curvature *= np.atleast_3d(weight)
     objective = Pixels.of(Data(values, shown, curvature), "data", types)
     firsts = [own.start for own in slices([image.map(1) for image in images])]
     pictures = [
@@ -182,7 +179,7 @@ def _join(parts: Sequence[Image], factors: Sequence[float]) -> Image:
 
 def balance(
     images: Sequence[MapImage],
-    method: Method,
+    options: FitOptions,
     count: int,
     types: ArrayTypes,
     weight: Image | None = None,
@@ -198,7 +195,7 @@ def balance(
         logs = np.array(goals) / 20 * np.log(10)
         logs += np.log([i.data.affine.scale * p for i, p in zip(images, peaks, strict=True)])
     else:
-        errors = _first_errors(images, method, count, types, weight)
+        errors = _first_errors(images, options, count, types, weight)
         logs = -0.5 * np.log(np.maximum(errors, MIN_MSE))
     factors = np.exp(logs - logs.mean()).tolist()
     return [image.factor * factor for image, factor in zip(images, factors, strict=True)]
@@ -211,7 +208,7 @@ def _peak_is_one(image: MapImage) -> bool:
 
 def _first_errors(
     images: Sequence[MapImage],
-    method: Method,
+    options: FitOptions,
     count: int,
     types: ArrayTypes,
     weight: Image | None,
@@ -220,7 +217,7 @@ def _first_errors(
     if len(images) == 1:
         return [1.0]
     objective = combine(images, [1.0] * len(images), types, weight)
-    start = method.place_and_solve(objective, count)
+    start = options.method.place_and_solve(objective, count, options.seed)
     sums = [s[0] for s in squares_by_channel(start, objective)]
     area = objective.grid.width * objective.grid.height
     ends = np.cumsum([image.pixels.shape[2] for image in images])

@@ -100,7 +100,7 @@ class Goal:
                 f"target_psnr is {self.psnr}; it must be above 0 and at most {MAX_PSNR:g}"
             )
         if self.space not in ("rgb", "ycbcr"):
-            raise ValueError(f"target_space {self.space!r} is unknown; use one of rgb, ycbcr")
+            raise ValueError(f"Goal: space {self.space!r} is unknown; use one of rgb, ycbcr")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1")
 
@@ -251,6 +251,8 @@ def level_counts(count: int, levels: Levels) -> list[int]:
     >>> level_counts(9000, [5000, 7000, 9000])
     [5000, 7000, 9000]
     """
+    if count < 1:
+        raise ValueError(f"count is {count}; it must be at least 1")
     if not isinstance(levels, (int, np.integer)):
         return _check_counts(count, levels)
     most = 1

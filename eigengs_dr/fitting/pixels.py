@@ -103,18 +103,22 @@ def check_weight(weight: ArrayLike | None) -> Image | None:
     return np.asarray(factors / factors.mean(dtype=np.float64), np.float32)
 
 
+def check_channels(weight: Image | None, channels: int) -> None:
+    """Raise ValueError unless weights (H, W) or (H, W, C) are those of so many channels."""
+    if weight is not None and weight.ndim == 3 and weight.shape[2] not in (1, channels):
+        raise ValueError(
+            f"weight has {weight.shape[2]} channels, but the fit has {channels}; give (H, W), or "
+            f"(H, W, {channels})"
+        )
+
+
 def _filled(image: EncodedImage, weight: Image) -> NDArray[Any]:
     """Return pixels in which those without any weight have the value of the nearest others."""
-    pixels = np.array(image.pixels)
+    pixels = np.asarray(image.pixels)
     if pixels.ndim not in (2, 3) or pixels.shape[:2] != weight.shape[:2]:
         height, width = weight.shape[:2]
         raise ValueError(
             f"weight is for {width}x{height} pixels, but the image has shape {pixels.shape}"
-        )
-    channels = pixels.shape[2] if pixels.ndim == 3 else 1
-    if weight.ndim == 3 and weight.shape[2] not in (1, channels):
-        raise ValueError(
-            f"weight has {weight.shape[2]} channels, but the image has shape {pixels.shape}"
         )
     ignored = ~(weight.reshape(*weight.shape[:2], -1) > 0).any(axis=2)
     if ignored.any():

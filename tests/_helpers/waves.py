@@ -7,7 +7,8 @@ import pytest
 
 from _helpers.sets import random_scene
 from eigengs_dr.fitting.control import Redistribute, Surplus
-from eigengs_dr.fitting.descent import begin, descend
+from eigengs_dr.fitting.descent import begin
+from eigengs_dr.fitting.loop import descend
 from eigengs_dr.fitting.method import DEFAULT
 from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.image.color import rgb_to_ycbcr

@@ -10,8 +10,8 @@ import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, objective_of, picture, squared_error, ycbcr_psnr
 from _helpers.sets import check_equal
 from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Retreat, Surplus, rounds
-from eigengs_dr.fitting.descent import begin, descend
-from eigengs_dr.fitting.loop import refine
+from eigengs_dr.fitting.descent import begin
+from eigengs_dr.fitting.loop import descend, refine
 from eigengs_dr.fitting.objective import Part
 
 COUNT, STEPS = 30, 100
