@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.ndimage import correlate1d
+from scipy.spatial import cKDTree
 
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
@@ -77,6 +78,20 @@ def plain_pieces(density, count):
         for place in (column, row)
     ]
     return np.diff(moments, axis=1).T * (count / before[-1])
+
+
+def plain_lloyd(mean, density):
+    """Centroids of the pixels nearest to each centre; pixels with two of them must have no mass."""
+    height, width = density.shape
+    y, x = np.indices(density.shape).reshape(2, -1)
+    pixel = np.floor(mean).clip(0, [width - 1, height - 1]) + 0.5
+    _, owner = cKDTree(pixel).query(np.stack([x, y], 1) + 0.5)
+    mass, left, top = (
+        np.bincount(owner, density.ravel() * v, len(mean)) for v in (1, x + 0.5, y + 0.5)
+    )
+    moved = np.array(mean, np.float64)
+    moved[mass > 0] = np.stack([left, top], 1)[mass > 0] / mass[mass > 0, None]
+    return moved
 
 
 def plain_shapes(energy, density):

@@ -134,7 +134,7 @@ def test_data_without_weight_do_not_set_the_range():
         (1.0, r"weight has shape \(\); expected"),
         (np.ones((0, 4)), "weight has shape"),
         (np.ones((SIDE, SIDE + 1)), "weight is for 49x48 pixels, but the image has shape"),
-        (np.ones((SIDE, SIDE, 2)), "weight has 2 channels, but the image has shape"),
+        (np.ones((SIDE, SIDE, 2)), "weight has 2 channels, but the fit has 3"),
     ],
 )
 def test_weights_that_are_refused(image, weight, words):

@@ -1,4 +1,4 @@
-"""Centres of equal mass: pieces of a Hilbert curve through the pixels.
+"""Centres of equal mass: pieces of a Hilbert curve through the pixels, and a Lloyd step.
 
 Masses and moments are sums of integers, in fixed point: they do not depend on the order in which a
 device adds.
@@ -6,13 +6,15 @@ device adds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import reduce
 
 import drjit as dr
 
-from ...backend.arrays import Float, UInt, make_divisor
+from ...backend.arrays import Bool, Float, UInt, make_divisor
 from ...raster.parameters import gather_run
-from .filters import PIXELS, SIDE, Canvas
+from .filters import PIXELS, SIDE, Canvas, scan, turned
 
 
 def _curve_in_tile() -> list[tuple[int, int]]:
@@ -213,6 +215,106 @@ def _moments_in_tile(
         mass -= taken
         moments = dr.fma(taken, column, moments[0]), dr.fma(taken, row, moments[1])
     return moments
+
+
+NONE = 1 << 29
+"""The key of a pixel without a centre; others are below."""
+
+BITS = 7
+"""Bits of a distance along an axis in a key."""
+
+HALF = 1 << BITS - 1
+
+REACH = 3.0
+"""Largest distance along an axis from a pixel to its centre, in mean distances of centres. The few
+pixels farther away do not count."""
+
+FRACTION = 30
+"""Bits behind the point of a mass."""
+
+LOCAL = dr.ReduceMode.Local
+"""Copies of an array for each thread, which is how Dr.Jit adds to small ones, make a program of its
+size."""
+
+
+def lloyd_step(
+    canvas: Canvas, mean: tuple[Float, Float], density: Float, spacing: float
+) -> tuple[Float, Float]:
+    """Take one Lloyd step: move each centre to the centroid of the pixels nearest to it.
+
+    It gains 0.10 dB of photos before the first step of a descent, and 0.00 dB after 100 and 1,000
+    steps; of smooth images, 0.9 dB before the first step and 0.6 dB after 30 (8 crops of 96x96
+    pixels, 40 and 300 Gaussians). A search so needs about 3 % fewer Gaussians.
+
+    A centre counts as the middle of its pixel; of several in one pixel, only the last moves. The
+    squares of distances along both axes add up. Therefore the nearest centre is found along columns
+    first, and of those found along rows. A key holds the square, and both distances.
+
+    Parameters
+    ----------
+    mean : pair of Float, shape (N,)
+        In pixels, image after image.
+    density : Float, shape (pixels,)
+        In tile layout.
+    spacing : float
+        Mean distance of centres in pixels.
+
+    Returns
+    -------
+    x, y : Float, shape (N,)
+    """
+    types = canvas.types
+    Int, UInt = types.Int, types.UInt
+    UInt64, Double = dr.uint64_array_t(UInt), dr.float64_array_t(types.Float)
+    count = dr.width(mean[0])
+    place, column, row = pixel_of(canvas, mean)
+    last = dr.zeros(UInt, dr.width(density))
+    dr.make_opaque(last)
+    dr.scatter_reduce(dr.ReduceOp.Max, last, dr.arange(UInt, count) + 1, place, mode=LOCAL)
+    keys = dr.select(last > 0, Int(0), NONE)
+    dr.eval(keys)
+    tiles = dr.opaque(Int, min(math.ceil(REACH * spacing / SIDE), HALF // SIDE - 1))
+    for axis in (1, 0):
+        keys = _nearest_along(canvas, keys, tiles, axis)
+
+    # The centroids
+    x, y, first, _ = canvas.pixels()
+    away = [((keys >> shift) & (2 * HALF - 1)) - HALF for shift in (0, BITS)]
+    found = (keys < NONE) & (density > 0)
+    owner = dr.gather(UInt, last, canvas.place(first, x + away[0], y + away[1]), found) - 1
+    sums = [dr.zeros(UInt64, count) for _ in range(3)]
+    dr.make_opaque(sums)
+    mass = UInt64(density * dr.opaque(types.Float, 2.0**FRACTION))
+    terms = mass, mass * UInt64(HALF - away[0]), mass * UInt64(HALF - away[1])
+    for array, term in zip(sums, terms, strict=True):
+        dr.scatter_reduce(dr.ReduceOp.Add, array, term, owner, found, mode=LOCAL)
+    dr.eval(sums)
+    x, y = (
+        dr.select(
+            sums[0] > 0, types.Float(Double(c) + Double(m) / Double(sums[0]) - (HALF - 0.5)), old
+        )
+        for c, m, old in zip((column, row), sums[1:], mean, strict=True)
+    )
+    dr.eval(x, y)
+    return x, y
+
+
+def _nearest_along(canvas: Canvas, keys: UInt, tiles: UInt, axis: int) -> UInt:
+    """Return the smallest keys along an axis."""
+    IntX = dr.int32_array_t(canvas.types.FloatX)
+
+    def look(lines: list, distance: UInt, first: UInt, inside: Bool, state: list) -> list:
+        cost = [
+            dr.select(inside, (k * k << 2 * BITS) + ((k + HALF) << BITS * axis), NONE)
+            for k in (distance + offset for offset in range(1 - SIDE, SIDE))
+        ]
+        return [
+            reduce(dr.minimum, (lines[k] + cost[k - own + SIDE - 1] for k in range(SIDE)), nearest)
+            for own, nearest in enumerate(state)
+        ]
+
+    start = [dr.full(IntX, NONE, (SIDE, 1)) for _ in range(SIDE)]
+    return turned(canvas, scan(canvas, keys, axis, tiles, look, start, "nearest centre"))
 
 
 def pixel_of(canvas: Canvas, mean: tuple[Float, Float]) -> tuple[UInt, UInt, UInt]:
