@@ -285,11 +285,9 @@ def _fit_estimate(run: _Run, estimate: _Estimate, most: int, steps: int, most_st
 def _fit(run: _Run, estimate: _Estimate, steps: int) -> _Trial:
     """Fit the estimated number, with a surplus that is placed as well and leaves."""
     tried, placed = estimate
-    control = run.method.control(Surplus)
-    if isinstance(control, Surplus):
-        more = control.number(len(placed), placed.width * placed.height, steps)
-    else:
-        more = 0
+    surplus, more = run.method.control(Surplus), 0
+    if surplus:
+        more = surplus.number(len(placed), placed.width * placed.height, steps)
     if more:
         placed = run.redistribute(tried, len(placed) + more)
     return run.descend(placed, steps, surplus=more)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,9 @@ class Model(Protocol):
 
     def dense_mean(self, width: int, height: int) -> NDArray[np.float32]:
         """Return the pixels (height, width, C) that a set of the mean "dense" lacks."""
+
+
+Kind = TypeVar("Kind")
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,9 @@ class Method:
     solve_steps: int = 10
     cutoff: float = CUTOFF
 
+    needs_model = False
+    """Whether the start must be a model."""
+
     def __post_init__(self) -> None:
         for name, value in plain_numbers(vars(self), Method.__annotations__).items():
             object.__setattr__(self, name, value)
@@ -123,8 +129,8 @@ class Method:
         if not self.rates or not all(rate > 0 for rate in self.rates.values()):
             raise ValueError(f"rates are {dict(self.rates)}; each must be above 0")
         surplus, relocate = self.control(Surplus), self.control(Relocate)
-        often = relocate.every if isinstance(relocate, Relocate) else 0
-        if isinstance(surplus, Surplus) and surplus.every and not 0 < often <= surplus.every:
+        often = relocate.every if relocate else 0
+        if surplus and surplus.every and not 0 < often <= surplus.every:
             raise ValueError(
                 "controls: a Surplus leaves by a Relocate that comes as often; add one, or leave "
                 "the Surplus out"
@@ -151,7 +157,7 @@ class Method:
         control = self.control(Redistribute)
         return sum(control.steps(iterations)) if control else 0
 
-    def control(self, kind: type) -> Control | None:
+    def control(self, kind: type[Kind]) -> Kind | None:
         """Return the first control of a type, if there is one."""
         return next((c for c in self.controls if isinstance(c, kind)), None)
 
@@ -176,9 +182,6 @@ class Method:
         if self.place.has_colors:
             return gaussians
         return solve(gaussians, objective, self.solve_steps, warm_start=True)
-
-    needs_model = False
-    """Whether the start must be a model."""
 
     def start_from_model(
         self, objective: Pixels, model: Model, pixels: NDArray[np.float32]

@@ -17,13 +17,12 @@ from eigengs_dr.fitting.control import Perturb
 from eigengs_dr.fitting.descent import (
     MAX_RATE_SCALE,
     begin,
-    last,
     next_build,
     rate_scale_of,
     rate_table,
     started,
 )
-from eigengs_dr.fitting.loop import descend
+from eigengs_dr.fitting.loop import descend, last
 from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.optimizer import Adam
 from eigengs_dr.image.color import rgb_to_ycbcr
