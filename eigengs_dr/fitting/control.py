@@ -283,6 +283,9 @@ class Retreat:
     factor: float = 0.4
     first: int = 10
 
+    LEAST = 1e-8
+    """Mean squared error up to which nothing returns: a set that is exact can only get worse."""
+
     def steps(self, iterations: int) -> list[int]:
         """Return the steps of the checks.
 
@@ -309,7 +312,9 @@ class Retreat:
             sum_by_image(squared_error(dr.detach(g), objective), objective.grid).numpy()
             for g in (state.fixed, state.gaussians)
         )
-        if (after <= self.rise * before).all():
+        (width, height), channels = objective.size, objective.channels
+        least = self.LEAST * width * height * channels
+        if (after <= np.maximum(self.rise * before, least)).all():
             return state
         if objective.grid.images > 1:
             raise Diverged
