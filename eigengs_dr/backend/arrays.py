@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from types import ModuleType
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import drjit as dr
 import numpy as np
@@ -21,11 +21,6 @@ import numpy as np
 from . import types as kinds
 from .selection import BACKENDS
 from .types import DrJitArray, Rows, Values
-
-# For `eigengs_dr.fitting` alone, until it takes those of `types`: no checker refutes these.
-Float = Any
-UInt = Any
-Bool = Any
 
 Kind = TypeVar("Kind", bound=DrJitArray)
 Number = TypeVar("Number", kinds.Float, Rows)

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
         index: int
         state: object
+        shape: tuple[int, ...]
 
         def __init__(self, *values: object) -> None: ...
         def __len__(self) -> int: ...
@@ -100,7 +101,6 @@ if TYPE_CHECKING:
     class Tensor(DrJitArray):
         """A tensor of floats."""
 
-        shape: tuple[int, ...]
         array: Float
 
         def __getitem__(self, part: object) -> Tensor: ...

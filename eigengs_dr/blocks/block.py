@@ -25,8 +25,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import Float, types_in
+from ..backend.arrays import types_in
 from ..backend.selection import select
+from ..backend.types import Float
 from ..fitting.control import Redistribute, Relocate
 from ..fitting.descent import State, begin
 from ..fitting.loop import descend, last
@@ -151,6 +152,7 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
     """Measure how many Gaussians a block needs, relative to others, before any fit."""
     objective = _objective(task, settings)
     canvas, _, density = _density(objective, settings)
+    assert objective.model.target is not None
     values = objective.picture(objective.model.target).numpy()[task.block.core]
     total = values.sum(axis=(0, 1), dtype=np.float64)
     return Surveyed(_mass(canvas, density, task.block), total)

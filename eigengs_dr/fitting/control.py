@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import Float, make_divisor, types_of
+from ..backend.arrays import make_divisor, types_of
+from ..backend.types import Float, Rows
 from ..raster.kernels import sum_by_image
 from .exchange import among, exchange, exchange_levels
 from .placement.adaptive import place_adaptive, redistribute
@@ -333,15 +334,15 @@ MAX_NOISE = 1.0
 
 
 def perturb(
-    mean: Float,
-    factor: Float,
+    mean: Rows,
+    factor: Rows,
     color: list,
     own: range,
     error: Float,
     strength: float,
     seed: int,
     images: int = 1,
-) -> tuple[Float, Float]:
+) -> tuple[Rows, Rows]:
     """Add noise to the means and the factors of some Gaussians.
 
     A Gaussian with the factor F, the size s (the geometric mean of its standard deviations) and the

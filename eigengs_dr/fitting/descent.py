@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import ArrayTypes, Float, UInt, make_divisor, types_of, upload
+from ..backend.arrays import ArrayTypes, make_divisor, types_of, upload
+from ..backend.types import Float, FloatLike, Rows, UInt
 from ..gaussian.gaussians import Gaussians, take
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.binning.lists import TileLists
@@ -49,7 +50,7 @@ class Moving(NamedTuple):
     """
 
     variables: Variables
-    moments: dict[str, tuple]
+    moments: dict[str, tuple[Rows, ...]]
     time: Float
     speed: Float
     packed: Float
@@ -308,7 +309,7 @@ def _pull_back(
         return {name: dr.grad(value) for name, value in traced.items()}
 
 
-def _prefix(pad: Any, count: int) -> Any:
+def _prefix(pad: FloatLike, count: int) -> FloatLike:
     """Return the first `count` entries of an array, or a number as it is."""
     if isinstance(pad, float) or dr.width(pad) in (1, count):
         return pad

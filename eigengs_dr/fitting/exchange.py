@@ -9,8 +9,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import Bool, Float, UInt, make_divisor, types_of
+from ..backend.arrays import make_divisor, types_of
 from ..backend.recording import record
+from ..backend.types import Bool, Float, UInt
 from ..gaussian.gaussians import Gaussians, concatenate, take
 from ..raster.binning.lists import TileLists
 from ..raster.binning.tiles import Grid
@@ -270,6 +271,7 @@ def _value(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float,
     squares : Float, shape (images,)
         ``sum h (p - t)^2`` of each image, where it counts.
     """
+    assert scene.model.target is not None
     types, channels = types_of(scene.model.target), len(scene.colors[0])
     slope, lanes = scene.slope(scene.colors)
     squares = sum(sum_lanes(lanes, scene.lists))
@@ -340,10 +342,11 @@ def _least(cost: Float, number: int, images: int) -> UInt:
     return moved
 
 
-def _without(gaussians: Gaussians, moved: UInt, dropped: int, images: int) -> Gaussians:
+def _without(gaussians: Gaussians, moved: UInt | None, dropped: int, images: int) -> Gaussians:
     """Drop the last `dropped` of the moved Gaussians of each image, from `_least`."""
     if not dropped:
         return gaussians
+    assert moved is not None
     types, leaving = types_of(gaussians.mean), dr.width(moved) // images
     image, rank = make_divisor(types, dropped).divmod(dr.arange(types.UInt, images * dropped))
     place = image * dr.opaque(types.UInt, leaving) + dr.opaque(types.UInt, leaving - dropped) + rank

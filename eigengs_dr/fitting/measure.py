@@ -7,14 +7,15 @@ A few bytes go to the host.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import Float, types_of
+from ..backend.arrays import types_of
 from ..backend.recording import record
+from ..backend.types import Float, Record
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import (
     RGB_TO_YCBCR,
@@ -40,7 +41,7 @@ from ..raster.render import bin_gaussians, pixels_inside
 from .objective import Picture
 from .solve import spread
 
-Row: TypeAlias = dict[str, Any]
+Row: TypeAlias = Record
 """A row of a trace: its numbers by name, and under "maps" those of every map."""
 
 

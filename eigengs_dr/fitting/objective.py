@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, Float, types_of, upload
+from ..backend.arrays import ArrayTypes, types_of, upload
+from ..backend.types import Float, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import LIGHT, UNBOUNDED, rgb_to_ycbcr, to_coded, to_linear, to_log
 from ..image.pixels import MAX_PIXEL
@@ -43,7 +44,7 @@ class Quadratic(NamedTuple):
         h for all channels of a pixel, or for each; None is 1 for all pixels of the image.
     """
 
-    target: Float
+    target: Float | None
     curvature: Float | None = None
 
     def compare(
@@ -58,11 +59,13 @@ class Quadratic(NamedTuple):
     def curvatures(self, grid: Grid) -> Float:
         """Return the curvature of every pixel, 0 outside the image: one value, or one a channel."""
         if self.curvature is None:
+            assert self.target is not None
             return pixels_inside(types_of(self.target), grid)
         return self.curvature
 
     def mean_target(self, grid: Grid, channels: int) -> list:
         """Return the mean of the target weighed by the curvature: a Float (images,) a channel."""
+        assert self.target is not None
         types = types_of(self.target)
         if self.curvature is None:
             area = dr.opaque(types.Float, 1 / (grid.width * grid.height))
@@ -75,6 +78,7 @@ class Quadratic(NamedTuple):
 
     def mean_curvature(self, grid: Grid, channels: int) -> Float:
         """Return the mean of the curvature over the pixels and channels, a Float (images,)."""
+        assert self.target is not None
         types = types_of(self.target)
         if self.curvature is None:
             return dr.full(types.Float, 1, grid.images)
@@ -230,6 +234,7 @@ class Pixels:
     @property
     def types(self) -> ArrayTypes:
         """Backend and precision."""
+        assert self.model.target is not None
         return types_of(self.model.target)
 
     @property
@@ -249,7 +254,7 @@ class Pixels:
         dr.eval(left)
         return replace(self, model=self.model._replace(target=left), shown=left)
 
-    def picture(self, values: Float) -> Any:
+    def picture(self, values: Float) -> Tensor:
         """Return an image in tile layout as a tensor (H, W, C)."""
         return to_tensor(values, self.grid, self.channels)
 

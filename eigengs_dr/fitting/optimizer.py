@@ -8,7 +8,7 @@ from typing import Protocol
 
 import drjit as dr
 
-from ..backend.arrays import Float
+from ..backend.types import Float, Rows
 
 
 class Optimizer(Protocol):
@@ -19,12 +19,12 @@ class Optimizer(Protocol):
     steps of all variables.
     """
 
-    def start(self, value: Float) -> tuple:
+    def start(self, value: Rows) -> tuple[Rows, ...]:
         """Return the moments of a variable before the first step, evaluated."""
 
     def step(
-        self, value: Float, gradient: Float, moments: tuple, rate: Float, time: Float
-    ) -> tuple:
+        self, value: Rows, gradient: Rows, moments: tuple[Rows, ...], rate: Float, time: Float
+    ) -> tuple[Rows, tuple[Rows, ...]]:
         """Return the value of a variable and its moments after a step.
 
         Parameters
@@ -40,7 +40,7 @@ class Optimizer(Protocol):
         """
 
 
-def zeros_like(value: Float) -> Float:
+def zeros_like(value: Rows) -> Rows:
     """Return evaluated zeros with the type and the shape of an array."""
     zeros = dr.zeros(type(value), value.shape)
     dr.make_opaque(zeros)
@@ -94,13 +94,13 @@ class Adam:
         if not all(0 <= beta < 1 for beta in betas):
             raise ValueError(f"Adam: betas are {betas}; each must be in [0, 1)")
 
-    def start(self, value: Float) -> tuple:
+    def start(self, value: Rows) -> tuple[Rows, ...]:
         """Return the moments before the first step; see `Optimizer`."""
         return zeros_like(value), zeros_like(value)
 
     def step(
-        self, value: Float, gradient: Float, moments: tuple, rate: Float, time: Float
-    ) -> tuple:
+        self, value: Rows, gradient: Rows, moments: tuple[Rows, ...], rate: Float, time: Float
+    ) -> tuple[Rows, tuple[Rows, ...]]:
         """Return the value and the moments after a step; see `Optimizer`."""
         m, v = moments
         m = dr.lerp(gradient, m, self.beta_1)

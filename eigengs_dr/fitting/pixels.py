@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
+from ..backend.types import PathLike, Values
 from ..image.color import rendered_as
 from ..image.io import check_data, check_image, read_image
 from ..image.pixels import MAX_PIXEL, MIN_PIXEL, EncodedImage, ImageError
 
-PixelsOrPath: TypeAlias = Any
-"""An image: array_like pixels, a ``mitsuba.Bitmap``, or the path or the address of a file."""
+PixelsOrPath: TypeAlias = ArrayLike | PathLike | EncodedImage
+"""An image: array_like pixels, such as a ``mitsuba.Bitmap``; pixels that know their encoding; or
+the path or the address of a file."""
 
 Image = NDArray[np.float32]
 
@@ -112,7 +114,7 @@ def check_channels(weight: Image | None, channels: int) -> None:
         )
 
 
-def _filled(image: EncodedImage, weight: Image) -> NDArray[Any]:
+def _filled(image: EncodedImage, weight: Image) -> Values:
     """Return pixels in which those without any weight have the value of the nearest others."""
     pixels = np.asarray(image.pixels)
     if pixels.ndim not in (2, 3) or pixels.shape[:2] != weight.shape[:2]:

@@ -14,8 +14,9 @@ from dataclasses import replace
 
 import drjit as dr
 
-from ..backend.arrays import Float, UInt, rcp, release_memory, types_of
+from ..backend.arrays import rcp, release_memory, types_of
 from ..backend.recording import record
+from ..backend.types import Float, UInt
 from ..gaussian.gaussians import Gaussians, whole
 from ..raster.adjoint import adjoint
 from ..raster.binning.lists import TileLists
@@ -132,6 +133,7 @@ def _begin(
 
     A held background keeps its value.
     """
+    assert model.target is not None
     channels, grid, types = len(x[0]), lists.grid, types_of(model.target)
     error, lanes = apply(shape, x, lists, cutoff, model)
     squares = sum_lanes(lanes, lists)
@@ -155,7 +157,7 @@ def _begin(
 def _step(
     shape: list,
     state: State,
-    curvature: Float,
+    curvature: Float | None,
     enough: list,
     inverse: Unknowns,
     lists: TileLists,
@@ -189,7 +191,7 @@ def take_step(
     shape: list,
     x: Unknowns,
     error: Float,
-    curvature: Float,
+    curvature: Float | None,
     inverse: Unknowns,
     lists: TileLists,
     cutoff: float,
@@ -225,7 +227,7 @@ def _advance(
     x: Unknowns,
     p: Unknowns,
     rz: list,
-    curvature: Float,
+    curvature: Float | None,
     lists: TileLists,
     cutoff: float,
 ) -> tuple[Unknowns, Float, list]:
@@ -234,9 +236,9 @@ def _advance(
     Return x, ``q = H A p``, and ``alpha = rz / <A p, q>``.
     """
     q, lanes = apply(shape, p, lists, cutoff, Quadratic(None, curvature))
-    curvature = sum_lanes(lanes, lists)
+    lengths = sum_lanes(lanes, lists)
     # A channel that is solved except for rounding stops: its directions would grow without bound.
-    alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, curvature, strict=True)]
+    alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, lengths, strict=True)]
     dr.eval(alpha)
     return add_multiple(x, alpha, p, lists.image), q, alpha
 
@@ -283,7 +285,7 @@ def correlate(
     channels: int,
     lists: TileLists,
     cutoff: float,
-    factors: Float = None,
+    factors: Float | None = None,
 ) -> list:
     """Return for each channel the correlations of an image with every Gaussian.
 
@@ -342,12 +344,12 @@ def dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
     return [sum_by_image(c, grid) + b for c, b in zip(color, background, strict=True)]
 
 
-def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: UInt) -> Unknowns:
+def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: UInt | None) -> Unknowns:
     """Return ``x + factor y``; a factor has one value for each image, see `spread`."""
     color = [dr.fma(spread(f, image), b, a) for a, f, b in zip(x[0], factors, y[0], strict=True)]
     return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
 
 
-def spread(values: Float, image: UInt) -> Float:
+def spread(values: Float, image: UInt | None) -> Float:
     """Return the value of the image of each entry; `image` is None if there is only one."""
     return values if image is None else dr.gather(type(values), values, image)

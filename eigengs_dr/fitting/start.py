@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -12,13 +11,13 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_in, types_of
 from ..backend.selection import select
-from ..gaussian.gaussians import Gaussians, one_image, set_of
+from ..gaussian.gaussians import Fitted, Gaussians, one_image, set_of
 from .method import Method, Model
 from .objective import Pixels
-from .options import FitOptions
+from .options import FitOptions, Start
 
 
-def load_start(start: Any, backend: str | None) -> Gaussians | Model:
+def load_start(start: Start | Fitted, backend: str | None) -> Gaussians | Model:
     """Return the set or the model of a start, without the derivatives of the caller.
 
     Raises

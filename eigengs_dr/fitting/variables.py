@@ -7,10 +7,11 @@ from typing import Protocol, TypeAlias
 
 import drjit as dr
 
-from ..backend.arrays import Float, rsqrt, types_of
+from ..backend.arrays import rsqrt, types_of
+from ..backend.types import Float, FloatLike, Rows
 from ..gaussian.gaussians import Gaussians
 
-Variables: TypeAlias = dict[str, Float]
+Variables: TypeAlias = dict[str, Rows]
 """Variables by name: arrays of Dr.Jit with one or several numbers for each Gaussian."""
 
 ImageSize: TypeAlias = tuple[Float, Float] | None
@@ -33,7 +34,7 @@ class Coordinates(Protocol):
     def project(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Variables:
         """Return the variables, moved back into their bounds."""
 
-    def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[Float, float]:
+    def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[FloatLike, float]:
         """Return how far ellipses reach, in pixels and as a factor, if variables move so far."""
 
 
@@ -58,15 +59,16 @@ class Relative:
     def decode(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Gaussians:
         """Return the set of variables; see `Coordinates`."""
         unit = _size(fixed)
-        units = {"mean": unit, "factor": 1 / unit, "color": 1}
-        return replace(fixed, **{name: value * units[name] for name, value in variables.items()})
+        units: dict[str, FloatLike] = {"mean": unit, "factor": 1 / unit, "color": 1}
+        fields: dict = {name: value * units[name] for name, value in variables.items()}
+        return replace(fixed, **fields)
 
     def project(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Variables:
         """Return the variables of bounded Gaussians; see `Coordinates`."""
         inside = _in_units(self.decode(fixed, variables).bounded(size), _size(fixed))
         return {name: inside[name] for name in variables}
 
-    def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[Float, float]:
+    def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[FloatLike, float]:
         """Return how far Gaussians reach after some steps; see `Coordinates`."""
         # An array, because another literal in every build would compile the kernels again.
         share = dr.opaque(types_of(fixed.mean).Float, MOVE_SHARE * moves.get("mean", 0.0))

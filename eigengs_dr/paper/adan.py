@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from ..backend.arrays import Float
+from ..backend.types import Float, Rows
 from ..fitting.optimizer import debias, zeros_like
 
 
@@ -45,13 +45,13 @@ class Adan:
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ValueError(f"Adan: betas are {self.betas}; each must be in [0, 1)")
 
-    def start(self, value: Float) -> tuple:
+    def start(self, value: Rows) -> tuple[Rows, ...]:
         """Return the moments and the gradient before the first step; see `Optimizer`."""
         return tuple(zeros_like(value) for _ in range(4))
 
     def step(
-        self, value: Float, gradient: Float, moments: tuple, rate: Float, time: Float
-    ) -> tuple:
+        self, value: Rows, gradient: Rows, moments: tuple[Rows, ...], rate: Float, time: Float
+    ) -> tuple[Rows, tuple[Rows, ...]]:
         """Return the value, the moments and the gradient after a step; see `Optimizer`."""
         m, v, n, previous = moments
         beta_1, beta_2, beta_3 = self.betas

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from ..backend.arrays import Float, tanh, types_of
+from ..backend.arrays import tanh, types_of
+from ..backend.types import Float, FloatLike
 from ..fitting.variables import ImageSize, Variables
 from ..gaussian.covariance import cholesky_from_factor, factor_from_cholesky
 from ..gaussian.gaussians import Gaussians
@@ -59,7 +60,7 @@ class Cholesky:
         inside = type(variables["cholesky"])(dr.maximum(l1, least), l2, dr.maximum(l3, least))
         return {**variables, "cholesky": inside}
 
-    def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[Float, float]:
+    def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[FloatLike, float]:
         """Return how far ellipses reach; see `eigengs_dr.fitting.variables.Coordinates`."""
         side = 0.5 * max(fixed.width, fixed.height)  # the slope of tanh is at most 1
         return moves.get("mean", 0.0) * side + moves.get("cholesky", 0.0) * fixed.cutoff, 1.0

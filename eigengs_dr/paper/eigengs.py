@@ -34,6 +34,7 @@ class EigenGSMethod(Method):
         The picture of the objective has the mean image as its base.
         """
         mean = model.dense_mean(*objective.size)
+        assert objective.model.target is not None
         left = objective.model.target - batch_to_tiles(objective.types, mean)
         base = batch_to_tiles(objective.types, mean_picture(mean, objective.space))
         pictures = tuple(picture._replace(base=base) for picture in objective.pictures)

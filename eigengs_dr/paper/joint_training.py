@@ -14,9 +14,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, Float, types_in, types_of, upload
+from ..backend.arrays import ArrayTypes, types_in, types_of, upload
 from ..backend.recording import freeze_program
 from ..backend.selection import select
+from ..backend.types import Float, Rows
 from ..fitting.place import random_shapes
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
@@ -238,6 +239,7 @@ def _move_group(
     time: Float,
 ) -> tuple[list, list]:
     """Move the weights of a group, and add its gradient of the shapes to `slopes`."""
+    moments: Sequence[Rows]
     rows, *moments = group
     packed = pack_parameters([*shape, *rows])
     delta, _ = residual(packed, [type(target)(0)] * GROUP, lists, radius, target)
@@ -252,6 +254,7 @@ def _move_shape(
     shape: list, gradient: list, size: tuple[int, int], rate: Float, time: Float
 ) -> list:
     """Move the means and factors of all Gaussians along the gradient of the kernels' parameters."""
+    moments: Sequence[Rows]
     rows, *moments = shape
     with dr.resume_grad():
         traced = type(rows)(rows)

@@ -169,7 +169,7 @@ def residual(
     start: list,
     lists: TileLists,
     radius: float,
-    target: Float,
+    target: Float | None,
     curvature: Float | None = None,
 ) -> tuple[Float, list]:
     """Sum the Gaussians of every tile, and compare them with an image, in one pass over memory.

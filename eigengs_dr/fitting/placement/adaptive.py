@@ -32,10 +32,11 @@ from dataclasses import replace
 
 import drjit as dr
 
-from ...backend.arrays import Float, release_memory
+from ...backend.arrays import release_memory
 from ...backend.recording import record
+from ...backend.types import Float, Rows
 from ...gaussian.file import CUTOFF
-from ...gaussian.gaussians import Gaussians, Rows
+from ...gaussian.gaussians import Gaussians
 from ...raster.binning.tiles import Grid
 from ...raster.kernels import sum_by_image
 from ...raster.parameters import gather_run

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from ...backend.arrays import Float, rcp, types_of
+from ...backend.arrays import rcp, types_of
 from ...backend.recording import record
+from ...backend.types import Float
 from ...gaussian.gaussians import Gaussians, whole
 from ...raster.binning.lists import TileLists
 from ...raster.kernels import forward, sum_by_image, sum_lanes
@@ -96,6 +97,7 @@ def _mean_by_image(values: Float, lists: TileLists) -> Float:
 @record
 def _squares(shape: list, x: Unknowns, model: Quadratic, lists: TileLists, cutoff: float) -> Float:
     """Return ``h (p - t)^2`` of every pixel, added over the channels; evaluated."""
+    assert model.target is not None
     types, channels = types_of(model.target), len(x[0])
     error, _ = apply(shape, x, lists, cutoff, Quadratic(model.target))
     dr.eval(error)

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol, TypeVar
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, Bool, Float, UInt
+from ...backend.arrays import ArrayTypes
+from ...backend.types import Bool, Float, UInt
 from ...raster.binning.tiles import TILE, Grid, GridArrays
 from ...raster.parameters import gather_run
 
@@ -23,6 +24,16 @@ PIXELS = SIDE * SIDE
 
 TRUNCATION = 2.5
 """Radius of the weights along an axis, in standard deviations; with 3, peaks gain 0.00 dB."""
+
+State = TypeVar("State")
+Number = TypeVar("Number", Float, UInt, covariant=True)
+
+
+class Line(Protocol[Number]):
+    """The rows of an array of several, of floats or of integers."""
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, row: int, /) -> Number: ...
 
 
 @dataclass(frozen=True)
@@ -60,11 +71,11 @@ class Canvas:
         column, row = self.sizes.first_pixel(tile)
         return self.types.Int(column), self.types.Int(row)
 
-    def channels(self, image: Float) -> int:
+    def channels(self, image: Float | UInt) -> int:
         """Return the number of values of a pixel."""
         return dr.width(image) // (self.grid.tiles * PIXELS)
 
-    def first_tile(self, image: UInt) -> UInt:
+    def first_tile(self, image: UInt | None) -> UInt:
         """Return the first tile of an image, which is None if there is only one."""
         if image is None or self.sizes.image is None:
             return self.types.UInt(0)
@@ -75,7 +86,7 @@ class Canvas:
         tile = self.types.UInt((y >> 2) * self.sizes.nx + (x >> 2)) + first
         return tile * PIXELS + self.types.UInt((y & 3) * SIDE + (x & 3))
 
-    def pixels(self, index: UInt = None) -> tuple[UInt, UInt, UInt, Bool]:
+    def pixels(self, index: UInt | None = None) -> tuple[UInt, UInt, UInt, Bool]:
         """Return column, row, first tile of the image, and whether it is inside, of pixels.
 
         They are those of an index in tile layout, by default all: a lane owns a pixel.
@@ -90,7 +101,7 @@ class Canvas:
         inside = (column < width) & (row < height)
         return column, row, self.first_tile(self.sizes.image_of(tile)), inside
 
-    def store(self, values: list) -> Float:
+    def store(self, values: list[Number]) -> Number:
         """Write the values of all tiles, a list by pixels and channels; return the image."""
         result = dr.empty(type(values[0]), self.grid.tiles * len(values))
         rows = dr.replace_type_t(self.types.FloatX, dr.type_v(result))
@@ -161,13 +172,13 @@ def shrunk(canvas: Canvas, image: Float, small: Canvas, times: int) -> Float:
 
 def scan(
     canvas: Canvas,
-    source: Float,
+    source: Float | UInt,
     axis: int,
     tiles: UInt,
-    visit: Callable[..., Any],
-    state: Any,
+    visit: Callable[[list, UInt, UInt, Bool, State], State],
+    state: State,
     label: str,
-) -> Any:
+) -> State:
     """Visit the tiles around each tile along an axis; return the last state. A lane owns a tile.
 
     Images alternate between the layout of tiles by rows and by columns: with the first axis the
@@ -193,7 +204,7 @@ def scan(
     length = SIDE * canvas.channels(source)
     kind = dr.int32_array_t(types.FloatX) if dr.is_integral_v(source) else types.FloatX
 
-    def look(distance: UInt, state: Any) -> tuple:
+    def look(distance: UInt, state: State) -> tuple[UInt, State]:
         first = here + distance * SIDE
         inside = (first >= 0) & (first < side)
         start = (own + distance * step) * SIDE
@@ -212,7 +223,7 @@ def scan(
     )[1]
 
 
-def turned(canvas: Canvas, lines: list) -> Float:
+def turned(canvas: Canvas, lines: list[Line[Number]]) -> Number:
     """Store lines from `scan`, tiles by columns if they were by rows, and vice versa; evaluated."""
     channels = len(lines[0]) // SIDE
     values = [
@@ -289,9 +300,9 @@ def weighted_sums(canvas: Canvas, image: Float, weights: Weights, means: bool = 
             sums, totals = list(state[0]), list(state[1])
             weight = []
             for offset in range(1 - SIDE, SIDE):
-                k = distance + offset
-                near = dr.exp2(weights.slope * dr.square(types.Float(k)))
-                weight.append(dr.select(dr.abs(k) <= radius, near, 0))
+                away = distance + offset
+                near = dr.exp2(weights.slope * dr.square(types.Float(away)))
+                weight.append(dr.select(dr.abs(away) <= radius, near, 0))
             for k in range(SIDE):
                 counts = inside & (first + k < end)
                 for own in range(SIDE):

@@ -16,8 +16,9 @@ from typing import NamedTuple
 
 import drjit as dr
 
-from ...backend.arrays import Float, UInt, make_divisor
+from ...backend.arrays import make_divisor
 from ...backend.recording import record
+from ...backend.types import Float, Rows, UInt
 from ...raster.parameters import gather_run
 from .filters import PIXELS, SIDE, Canvas, neighbourhood, radius_of
 
@@ -49,7 +50,7 @@ class Peaks(NamedTuple):
         The image, and the place of the peak among those of its image.
     """
 
-    mean: Float
+    mean: Rows
     color: list
     image: UInt
     rank: UInt

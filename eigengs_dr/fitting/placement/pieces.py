@@ -12,7 +12,8 @@ from functools import reduce
 
 import drjit as dr
 
-from ...backend.arrays import Bool, Float, UInt, make_divisor
+from ...backend.arrays import make_divisor
+from ...backend.types import Bool, Float, UInt
 from ...raster.parameters import gather_run
 from .filters import PIXELS, SIDE, Canvas, scan, turned
 
@@ -127,9 +128,9 @@ def stratify_along_hilbert(canvas: Canvas, density: Float, count: int) -> tuple[
     mass = fixed(sum(values))
     own = [mass]
     lines = [values[k::SIDE] for k in range(SIDE)], [values[k : k + SIDE] for k in (0, 4, 8, 12)]
-    for corner, axis in zip(canvas.corner(canvas.tile), lines, strict=True):
+    for edge, axis in zip(canvas.corner(canvas.tile), lines, strict=True):
         moment = sum(sum(line) * (k + 0.5) for k, line in enumerate(axis))
-        own.append(fixed(moment) + UInt64(corner) * mass)
+        own.append(fixed(moment) + UInt64(edge) * mass)
     sums = [dr.empty(UInt64, grid.tiles) for _ in own]
     for array, value in zip(sums, own, strict=True):
         dr.scatter(array, value, rank)
