@@ -285,7 +285,8 @@ class Retreat:
     first: int = 10
 
     LEAST = 1e-8
-    """Mean squared error up to which nothing returns: a set that is exact can only get worse."""
+    """Mean squared error up to which nothing returns: a set that is exact can only get worse, and
+    the loop has kept it."""
 
     def steps(self, iterations: int) -> list[int]:
         """Return the steps of the checks.
@@ -315,7 +316,7 @@ class Retreat:
         )
         (width, height), channels = objective.size, objective.channels
         least = self.LEAST * width * height * channels
-        if (after <= np.maximum(self.rise * before, least)).all():
+        if ((after <= self.rise * before) | (before <= least)).all():
             return state
         if objective.grid.images > 1:
             raise Diverged
