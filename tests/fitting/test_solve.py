@@ -121,9 +121,12 @@ def test_what_zero_steps_give_with_weights(backend):
 
 
 def test_equal_weights_are_none(backend):
+    """But for the rounding of the mean, with which a solve starts."""
     gaussians = random_scene().on(backend)
     plain = solve(gaussians, noise(), 4).to_arrays()
-    check_equal(solve(gaussians, noise(), 4, weight=np.ones(SIZE[::-1], np.float32)), plain)
+    found = solve(gaussians, noise(), 4, weight=np.ones(SIZE[::-1], np.float32)).to_arrays()
+    for name in ("color", "background"):
+        np.testing.assert_allclose(found[name], plain[name], atol=1e-5)
 
 
 def test_what_zero_steps_give(backend):
