@@ -247,8 +247,9 @@ def refine(
         stopped = True
     if stopped:
         best.end_early(objective)
-    batches = {id(one.gaussians): dr.detach(one.gaussians) for one in best.found}
-    return [replace(one, gaussians=batches[id(one.gaussians)]) for one in best.found]
+    batches = {id(one.gaussians): one.gaussians for one in best.found}
+    detached = {name: dr.detach(batch) for name, batch in batches.items()}
+    return [replace(one, gaussians=detached[id(one.gaussians)]) for one in best.found]
 
 
 def trace_steps(iterations: int) -> set[int]:
@@ -271,5 +272,6 @@ def split(batch: Gaussians) -> list[Gaussians]:
 
 def sets_of(found: Sequence[Refinement]) -> list[Gaussians]:
     """Return the best set of each image of a batch."""
-    batches = {id(one.gaussians): split(one.gaussians) for one in found}
-    return [batches[id(one.gaussians)][k] for k, one in enumerate(found)]
+    batches = {id(one.gaussians): one.gaussians for one in found}
+    sets = {name: split(batch) for name, batch in batches.items()}
+    return [sets[id(one.gaussians)][k] for k, one in enumerate(found)]
