@@ -279,9 +279,8 @@ def _value(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float,
     cost, diagonal = scene.weigh(slope)
     if inside is not None:
         cost = dr.select(among(dr.arange(types.UInt, dr.width(cost)), own), cost, dr.inf)
-        error, _ = apply(
-            scene.shape, scene.colors, scene.lists, scene.cutoff, Quadratic(scene.model.target)
-        )
+        h = scene.model.curvatures_of_values(scene.lists.grid, channels)
+        error = dr.select(h > 0, slope / h, 0)
         squares = sum(channel_sums(slope * error * inside, channels, scene.lists.grid))
     return cost, diagonal, squares
 

@@ -63,6 +63,13 @@ class Quadratic(NamedTuple):
             return pixels_inside(types_of(self.target), grid)
         return self.curvature
 
+    def curvatures_of_values(self, grid: Grid, channels: int) -> Float:
+        """Return the curvature of every value, shape (pixels * channels,); 0 outside the image."""
+        h = self.curvatures(grid)
+        types, number = types_of(h), dr.width(h) // (grid.tiles * grid.pixels)
+        value = dr.arange(types.UInt, grid.tiles * grid.pixels * channels)
+        return dr.gather(types.Float, h, value // (channels // number))
+
     def mean_target(self, grid: Grid, channels: int) -> list:
         """Return the mean of the target weighed by the curvature: a Float (images,) a channel."""
         assert self.target is not None
@@ -70,9 +77,7 @@ class Quadratic(NamedTuple):
         if self.curvature is None:
             area = dr.opaque(types.Float, 1 / (grid.width * grid.height))
             return [s * area for s in channel_sums(self.target, channels, grid)]
-        index = dr.arange(types.UInt, dr.width(self.target))
-        own = dr.width(self.curvature) // (grid.tiles * grid.pixels)
-        h = dr.gather(types.Float, self.curvature, index // (channels // own))
+        h = self.curvatures_of_values(grid, channels)
         weights, sums = (channel_sums(v, channels, grid) for v in (h, h * self.target))
         return [dr.select(w > 0, s / w, 0) for s, w in zip(sums, weights, strict=True)]
 
