@@ -24,9 +24,10 @@ from ..raster.render import picture_of
 from .control import Redistribute, Surplus
 from .descent import begin
 from .fewest import fewest
+from .loss import Loss, LossFunction, LossObjective, View
 from .levels import place_levels, sort_levels
 from .loop import FitProgress, Refinement, Score, refine, sets_of
-from .maps import Map, MapImage, balance, combine, read_maps, score_maps
+from .maps import Map, MapImage, balance, combine, read_maps, score_maps, views_of
 from .measure import Row, psnrs
 from .method import DEFAULT, Method
 from .objective import Affine, Pixels, data_of, fitted, picture, restored
@@ -88,6 +89,7 @@ class Fit:
     mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
     psnr_ycbcr: float = math.nan
     psnr_rgb: float = math.nan
+    loss: float = math.nan
     source: str = field(default="", repr=False)
     maps: dict[str, dict[str, float]] = field(default_factory=dict, repr=False)
 
@@ -127,7 +129,7 @@ class FitInterrupted(KeyboardInterrupt):
 @shows_progress
 @door
 def fit(
-    image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map],
+    image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map] | None = None,
     gaussians: int | Sequence[int] | None = None,
     iterations: int = 1000,
     target_psnr: float | Goal | None = None,
@@ -139,6 +141,8 @@ def fit(
     backend: str | None = None,
     progress: Any = None,
     encoding: str | None = None,
+    loss: Loss | LossFunction | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Fit:
     """Fit an image by a given number of Gaussians, or by as few as a target PSNR needs.
 
@@ -243,6 +247,7 @@ def fit(
         seed=seed,
         backend=backend,
         encoding=encoding,
+        loss=loss,
     )
     factors = check_weight(weight)
     if isinstance(image, Mapping):
@@ -300,16 +305,19 @@ def fit_images(
             base = objective.pictures[0].base
             if base is not None:
                 mean_image = objective.picture(base).numpy()
+        if options.loss is not None:
+            view = View("", space, range(channels), *data[0].affine)
+            objective = LossObjective.of_loss(options.loss, [view], objective)
 
         def score(gaussians: Gaussians) -> list[Row]:
             seconds = (time.perf_counter() - started) / len(images)
             [figures] = psnrs(gaussians, objective.pictures).transpose(0, 2, 1)
             return [
-                {"seconds": seconds, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
+                {"seconds": seconds, **objective.judged(gaussians), "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
                 for ycbcr, rgb in figures.tolist()
             ]
 
-        figure = target_key(space, options.goal.space) if options.goal else ""
+        figure = target_key(space, options.goal.space) if options.goal else "margin"
         found, seconds_init = _refined(
             objective, options, begun, score, figure, started, progress, interrupted
         )
@@ -332,14 +340,18 @@ def fit_maps(
     goal = options.goal
     with defer_interrupts() as interrupted:
         first = options.count_for(width * height)
-        if goal:
+        if options.searches:
             first = options.first_try(width * height, channels)
         factors = balance(images, options, first, types, weight)
         objective = combine(images, factors, types, weight)
+        if options.loss is not None:
+            views = views_of(images, factors)
+            objective = LossObjective.of_loss(options.loss, views, objective)
 
         def score(gaussians: Gaussians) -> list[Row]:
             row = score_maps(gaussians, objective, images, goal.space if goal else "rgb")
-            return [{"seconds": time.perf_counter() - started, **row}]
+            seconds = time.perf_counter() - started
+            return [{"seconds": seconds, **objective.judged(gaussians), **row}]
 
         [found], seconds_init = _refined(
             objective, options, None, score, "margin", started, progress, interrupted
@@ -380,13 +392,13 @@ def _refined(
         objective = replace(objective, levels=counts[:-1])
     elif begun is None:
         count = options.count_for(width * height)
-        if options.goal:
+        if options.searches:
             count = options.first_try(width * height, channels)
         begun = method.place_and_solve(objective, count, key)
     seconds_init = (time.perf_counter() - started) / objective.grid.images
-    if options.goal:
+    if options.searches:
         most = options.most_for(width * height, channels)
-        goal = options.goal.psnr if figure != "margin" else 0.0
+        goal = options.goal.psnr if options.goal and figure != "margin" else 0.0
         found = fewest(
             objective,
             method,
@@ -436,8 +448,9 @@ def _finished(
                 iterations=one.iterations,
                 stopped=one.stopped,
                 mean_image=mean_image,
-                psnr_ycbcr=one.row["psnr_ycbcr"],
-                psnr_rgb=one.row["psnr_rgb"],
+                psnr_ycbcr=one.row.get("psnr_ycbcr", math.nan),
+                psnr_rgb=one.row.get("psnr_rgb", math.nan),
+                loss=one.row.get("loss", math.nan),
                 maps=one.row.get("maps", {}),
             )
         )

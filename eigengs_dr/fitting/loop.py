@@ -53,11 +53,13 @@ def descend(
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
     factors, largest = method.rate_factors(iterations, state.chosen), 0
     rates = rate_table(objective.types, method, factors)
-    with release_later(state), freeze_program(step_program(objective, method)) as take_step:
+    program = step_program(objective, method)
+    with release_later(state), objective.models() as model_at, freeze_program(program) as take_step:
         for step in part:
-            for control, steps in acts:
-                if step in steps:
-                    state = control(state, objective, step, iterations, key)
+            acting = [control for control, steps in acts if step in steps]
+            squares = objective.around(state.gaussians) if acting else objective
+            for control in acting:
+                state = control(state, squares, step, iterations, key)
             if state.moving is None:
                 state = started(state, method, step, objective.grid.images)
             if not state.lists or step >= state.until:
@@ -67,7 +69,7 @@ def descend(
                 largest,
                 state.moving,
                 state.fixed,
-                objective.model,
+                model_at(state),
                 list(state.lists),
                 rates,
                 dr.opaque(objective.types.UInt, step),
@@ -90,8 +92,7 @@ def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussian
 FitProgress = Callable[[int, int, Row], None]
 
 Score = Callable[[Gaussians], list[Row]]
-"""``score(gaussians)`` returns a row for each image of a batch; its psnr_ycbcr decides which set is
-the best."""
+"""``score(gaussians)`` returns a row for each image of a batch; see `merit` for what is best."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class Refinement:
     Attributes
     ----------
     gaussians : Gaussians
-        The set with the highest psnr_ycbcr in the trace; the batch with it, if there is one.
+        The set with the highest `merit` in the trace; the batch with it, if there is one.
     trace : list of dict
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb, for sets with as many
         Gaussians as requested.
@@ -122,12 +123,17 @@ class Refinement:
     def judged(self, gaussians: Gaussians, row: Row) -> Refinement:
         """Return the result with another row of its trace, and the set if it is the best."""
         self.trace.append(row)
-        best = row["psnr_ycbcr"] > self.row.get("psnr_ycbcr", -math.inf)
-        stopped = "exact" if row["psnr_ycbcr"] > MAX_PSNR else self.stopped
+        best = not self.row or merit(row) > merit(self.row)
+        stopped = "exact" if merit(row) > MAX_PSNR else self.stopped
         step = row["iteration"]
         if best:
             return replace(self, gaussians=gaussians, row=row, stopped=stopped, iterations=step)
         return replace(self, stopped=stopped, iterations=step)
+
+
+def merit(row: Row) -> float:
+    """Return the number of a row that the best set has most of: its PSNR, or less of its loss."""
+    return -row["loss"] if "loss" in row else row["psnr_ycbcr"]
 
 
 class Best:
@@ -172,7 +178,7 @@ class Best:
         rows = self.score(gaussians)
         self.row = {"iteration": step, **rows[0]}
         if len(gaussians) > len(self.found) * self.state.count:
-            figure = self.row["psnr_ycbcr"]
+            figure = merit(self.row)
             if self.larger is None or figure > self.larger[0]:
                 self.larger = figure, step, gaussians
             return
@@ -189,7 +195,7 @@ class Best:
         larger = [self.larger] if self.larger else []
         for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
             if step not in [row["iteration"] for row in self.found[0].trace]:
-                self.judge(step, prune(dr.detach(gaussians), objective, self.state.count))
+                self.judge(step, prune(dr.detach(gaussians), objective.around(gaussians), self.state.count))
         self.found = [
             replace(one, stopped="interrupted", iterations=self.step) for one in self.found
         ]

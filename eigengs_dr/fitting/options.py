@@ -20,6 +20,7 @@ from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
 from .control import Redistribute
+from .loss import Loss
 from .method import DEFAULT, Method, Model
 from .place import Adaptive
 
@@ -124,6 +125,7 @@ class FitOptions:
     seed: int = 0
     backend: str | None = None
     encoding: str | None = None
+    loss: Loss | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.gaussians, Sequence) and not isinstance(self.gaussians, str):
@@ -145,6 +147,8 @@ class FitOptions:
         check_encoding(self.encoding)
         if self.space is not None and self.space not in SPACES:
             raise ValueError(f"space {self.space!r} is unknown; use one of {', '.join(SPACES)}")
+        if self.loss is not None and not isinstance(self.loss, Loss):
+            object.__setattr__(self, "loss", Loss(self.loss))
         if not isinstance(self.method, Method):
             raise TypeError(f"method is {self.method!r}; pass a Method, such as eigengs_dr.DEFAULT")
         if self.method.needs_model and not isinstance(self.start, Model):
@@ -159,16 +163,18 @@ class FitOptions:
         places = self.method.place == Adaptive() and self.start is None
         if self.levels and not (places and not self.method.needs_model):
             raise ValueError("levels need the placement Adaptive and no start; leave them out")
-        if self.goal is None:
+        if self.levels and self.loss is not None:
+            raise ValueError("levels are for the squared error; leave them or the loss out")
+        if not self.searches:
             return
         if self.gaussians is not None:
             raise ValueError(
-                "gaussians and target_psnr exclude each other; give one of them, or "
+                "gaussians and a target exclude each other; give one of them, or "
                 "target_psnr=Goal(psnr, max_gaussians=...)"
             )
         if not places or self.method.control(Redistribute) is None:
             raise ValueError(
-                "target_psnr needs a method that places Gaussians by the image and redistributes "
+                "a target needs a method that places Gaussians by the image and redistributes "
                 "them, such as DEFAULT, and no start"
             )
 
@@ -176,6 +182,11 @@ class FitOptions:
     def goal(self) -> Goal | None:
         """The goal of a search."""
         return self.target_psnr if isinstance(self.target_psnr, Goal) else None
+
+    @property
+    def searches(self) -> bool:
+        """Whether the number of Gaussians is the smallest that reaches something."""
+        return self.goal is not None or (self.loss is not None and self.loss.target is not None)
 
     @property
     def levels(self) -> tuple[int, ...]:
