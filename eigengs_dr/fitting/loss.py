@@ -114,33 +114,31 @@ class View(NamedTuple):
     offset: float = 0.0
 
 
-def show(views: Sequence[View], sums: Float, grid: Grid, channels: int) -> list[Float]:
-    """Return the pictures of sums in tile layout, each as rows of pixels; differentiable.
+def show(views: Sequence[View], sums: Float, channels: int) -> list[Float]:
+    """Return the pictures of sums, all as rows of pixels; differentiable.
 
-    Cost: a permutation, and a gather for each channel.
+    Cost: a gather for each channel; none for one picture of sums as they are.
     """
-    types = types_of(sums)
-    rows = to_tensor(sums, grid, channels).array
-    if len(views) == 1 and views[0][1:] == (views[0].space, range(channels), 1.0, 0.0):
-        if views[0].space in ("rgb", "linear", "radiance", "data"):
-            return [rows]
-    first = dr.arange(types.UInt, grid.width * grid.height) * channels
-    pictures = []
+    types, pictures = types_of(sums), []
+    first = dr.arange(types.UInt, dr.width(sums) // channels) * channels
     for view in views:
+        if view[1:] in [(space, range(channels), 1.0, 0.0) for space in AS_THEY_ARE]:
+            return [sums]
         planes = [
-            dr.fma(
-                dr.gather(types.Float, rows, first + k, mode=dr.ReduceMode.NoConflicts),
-                view.scale,
-                view.offset,
-            )
+            dr.gather(types.Float, sums, first + k, mode=dr.ReduceMode.NoConflicts)
             for k in view.channels
         ]
+        planes = [dr.fma(plane, view.scale, view.offset) for plane in planes]
         if view.space == "log":
             planes = [from_log(plane) for plane in planes]
         elif view.space == "normal":
             planes = unit_codes(planes)
         pictures.append(dr.ravel(types.FloatX(decode(view.space, planes))))
     return pictures
+
+
+AS_THEY_ARE = ("rgb", "linear", "radiance", "data")
+"""Spaces whose sums are the picture."""
 
 
 @dataclass
@@ -204,19 +202,24 @@ class LossObjective(Pixels):
     @contextmanager
     def models(self) -> Iterator[Callable[[State], Slope]]:
         """Give the derivative at the picture of each step, see `Pixels.models`."""
-        with freeze_program(self.draw) as draw, freeze_program(self.pull_back) as pull_back:
+        with freeze_program(self.draw) as draw, freeze_program(self.to_slope) as to_slope:
 
             def model_at(state: State) -> Slope:
                 assert state.moving is not None and state.fixed is not None
                 radius, background = kernel_radius(state.fixed.cutoff), state.fixed.background
                 sums, shown = draw(state.moving.packed, list(background), state.lists[-1], radius)
-                value, slopes = self.derivative(shown, self.loss.parameters)
-                if self.loss.parameters is not None:
-                    self.loss.parameters.step()
-                self.calls.add(value)
-                return Slope(pull_back(sums, slopes))
+                return Slope(to_slope(sums, self.step(shown)))
 
             yield model_at
+
+    def step(self, shown: Sequence[Float]) -> list[Float]:
+        """Return the derivatives by the pictures of a step; parameters of the user take theirs."""
+        parameters = self.loss.parameters
+        value, slopes = self.derivative(shown, parameters)
+        if parameters is not None:
+            parameters.step()
+        self.calls.add(value)
+        return slopes
 
     def draw(
         self, packed: Float, background: list, lists: TileLists, radius: float
@@ -224,22 +227,32 @@ class LossObjective(Pixels):
         """Return the sums of a set in tile layout, and the pictures that the loss sees."""
         sums = forward(packed, background, lists, radius)
         dr.eval(sums)
-        shown = show(self.views, sums, self.grid, self.channels)
-        if self.loss.bounds is not None:
-            shown = [dr.clip(picture, *self.loss.bounds) for picture in shown]
-        return sums, shown
+        return sums, self.seen(to_tensor(sums, self.grid, self.channels).array)
 
-    def pull_back(self, sums: Float, slopes: list[Float]) -> Float:
-        """Return the derivative by the sums from that by the pictures; see `Slope`."""
+    def seen(self, sums: Float) -> list[Float]:
+        """Return the pictures that the loss sees of sums, both as rows of pixels."""
+        shown = show(self.views, sums, self.channels)
+        if self.loss.bounds is None:
+            return shown
+        return [dr.clip(picture, *self.loss.bounds) for picture in shown]
+
+    def to_slope(self, sums: Float, slopes: list[Float]) -> Float:
+        """Return the derivative by sums in tile layout, see `Slope`, from those by the pictures."""
+        number = self.grid.width * self.grid.height * self.channels
+        return self.pull_back(sums, slopes, in_tiles=True) * (0.5 * number)
+
+    def pull_back(self, sums: Float, slopes: list[Float], in_tiles: bool = False) -> Float:
+        """Return the derivative by sums, as rows of pixels or tiles, from those by the pictures."""
         with dr.resume_grad():
             traced = type(sums)(sums)
             dr.enable_grad(traced)
-            shown = show(self.views, traced, self.grid, self.channels)
+            rows = to_tensor(traced, self.grid, self.channels).array if in_tiles else traced
+            shown = show(self.views, rows, self.channels)
             for picture, slope in zip(shown, slopes, strict=True):
                 dr.set_grad(picture, self._bounded(dr.detach(picture), slope))
             dr.enqueue(dr.ADMode.Backward, shown)
             dr.traverse(dr.ADMode.Backward)
-            return dr.grad(traced) * (0.5 * self.grid.width * self.grid.height * self.channels)
+            return dr.grad(traced)
 
     def _bounded(self, picture: Float, slope: Float) -> Float:
         """Return a derivative by a picture that pulls values into the bounds, and none out."""
@@ -339,7 +352,7 @@ class LossObjective(Pixels):
         packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
         sums, shown = self.draw(packed, background, lists, radius)
-        slope = self.pull_back(sums, self.derivative(shown)[1])
+        slope = self.pull_back(sums, self.derivative(shown)[1], in_tiles=True)
         block, inside = grid.pixels * self.channels, pixels_inside(self.types, grid)
         each = dr.arange(self.types.UInt, dr.width(sums)) // self.channels
         error = (sums - model.target) * dr.gather(self.types.Float, inside, each)
