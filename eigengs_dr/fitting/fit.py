@@ -18,13 +18,15 @@ from ..backend.notebook import to_html
 from ..backend.progress import shows_progress
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
-from ..gaussian.gaussians import Gaussians, scale_channels
+from ..gaussian.gaussians import Gaussians, one_image, scale_channels
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
+from .coarse import COARSE_TO_FINE
 from .control import Redistribute, Surplus
 from .descent import begin
 from .fewest import fewest
 from .loss import Loss, LossFunction, LossObjective, View
+from .from_loss import Spaces, refine_loss, views_of_spaces
 from .levels import place_levels, sort_levels
 from .loop import FitProgress, Refinement, Score, refine, sets_of
 from .maps import Map, MapImage, balance, combine, read_maps, score_maps, views_of
@@ -134,9 +136,9 @@ def fit(
     iterations: int = 1000,
     target_psnr: float | Goal | None = None,
     start: Start | None = None,
-    space: str | None = None,
+    space: str | Mapping[str, str] | None = None,
     weight: ArrayLike | None = None,
-    method: Method = DEFAULT,
+    method: Method | None = None,
     seed: int = 0,
     backend: str | None = None,
     progress: Any = None,
@@ -237,21 +239,26 @@ def fit(
     Gaussians(100, 32x32 pixels, maps albedo, roughness, cutoff=3)
     """
     started = time.perf_counter()
+    spaces, space = space, space if isinstance(space, str) else None
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
         target_psnr=target_psnr,
         start=start,
         space=space,
-        method=method,
+        method=method or (COARSE_TO_FINE if image is None else DEFAULT),
         seed=seed,
         backend=backend,
         encoding=encoding,
         loss=loss,
     )
     factors = check_weight(weight)
+    if image is None:
+        return fit_loss(size, spaces, options, started, progress)
+    if size is not None:
+        raise ValueError("size is for a loss without an image; leave it or the image out")
     if isinstance(image, Mapping):
-        if start is not None or space is not None:
+        if start is not None or spaces is not None:
             raise ValueError(
                 "maps take no start and no space; a Map says the space of one: "
                 "Map(image, space='data')"
@@ -283,6 +290,8 @@ def fit_images(
     """
     started, source = time.perf_counter(), options.start
     start = None if source is None else load_start(source, options.backend)
+    if isinstance(start, Gaussians):
+        one_image(start)
     wanted = options.space or (set_in(start).space if start is not None else "ycbcr")
     read = [read_pixels(image, wanted, weight, options.encoding) for image in images]
     pixels, space = [p for p, _ in read], read[0][1]
@@ -323,6 +332,46 @@ def fit_images(
         )
     affines = [d.affine for d in data]
     return _finished(found, affines, mean_image, started, seconds_init)
+
+
+def fit_loss(
+    size: tuple[int, int] | None,
+    spaces: Spaces,
+    options: FitOptions,
+    started: float,
+    progress: FitProgress | None = None,
+) -> Fit:
+    """Fit a loss without an image; see `fit` for results and errors."""
+    if options.loss is None or size is None:
+        raise ValueError(
+            "fit needs an image, or a loss and the size of its picture: "
+            "fit(loss=f, size=(width, height))"
+        )
+    if options.goal is not None or options.levels:
+        raise ValueError(
+            "without an image there is no PSNR and there are no levels; give the loss a target"
+        )
+    start = None if options.start is None else load_start(options.start, options.backend)
+    if start is not None and not isinstance(start, Gaussians):
+        raise ValueError("a model needs an image to start from; give a set")
+    if start is not None and spaces is None:
+        spaces = {m.name: m.space for m in start.maps} or start.space
+    views, maps = views_of_spaces(spaces)
+    channels, (width, height) = sum(len(view.channels) for view in views), size
+    options.check_image(width, height, channels)
+    if start is not None:
+        space = "data" if maps else views[0].space
+        check_start(start, size, channels, space, options)
+        cutoff = float(options.method.cutoff)
+        start = replace(start.scaled(width, height), cutoff=cutoff, maps=()).bounded()
+    with defer_interrupts() as interrupted:
+        types = types_for(start, options.backend)
+        found, seconds_init = refine_loss(
+            options.loss, size, views, options, types, start, started, progress, interrupted
+        )
+    found = replace(found, gaussians=replace(found.gaussians, maps=maps))
+    [result] = _finished([found], [Affine()], None, started, seconds_init)
+    return result
 
 
 def fit_maps(

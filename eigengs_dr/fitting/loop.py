@@ -92,7 +92,8 @@ def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussian
 FitProgress = Callable[[int, int, Row], None]
 
 Score = Callable[[Gaussians], list[Row]]
-"""``score(gaussians)`` returns a row for each image of a batch; see `merit` for what is best."""
+"""``score(gaussians)`` returns a row for each image of a batch; `Pixels.merit` of it says
+which set is the best."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class Refinement:
     Attributes
     ----------
     gaussians : Gaussians
-        The set with the highest `merit` in the trace; the batch with it, if there is one.
+        The set with the highest `Pixels.merit` in the trace; the batch with it, if there is one.
     trace : list of dict
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb, for sets with as many
         Gaussians as requested.
@@ -120,20 +121,15 @@ class Refinement:
     stopped: str = "iterations"
     row: Row = field(default_factory=Row)
 
-    def judged(self, gaussians: Gaussians, row: Row) -> Refinement:
+    def judged(self, gaussians: Gaussians, row: Row, objective: Pixels) -> Refinement:
         """Return the result with another row of its trace, and the set if it is the best."""
         self.trace.append(row)
-        best = not self.row or merit(row) > merit(self.row)
-        stopped = "exact" if merit(row) > MAX_PSNR else self.stopped
+        best = not self.row or objective.merit(row) > objective.merit(self.row)
+        stopped = "exact" if row.get("psnr_ycbcr", 0.0) > MAX_PSNR else self.stopped
         step = row["iteration"]
         if best:
             return replace(self, gaussians=gaussians, row=row, stopped=stopped, iterations=step)
         return replace(self, stopped=stopped, iterations=step)
-
-
-def merit(row: Row) -> float:
-    """Return the number of a row that the best set has most of: its PSNR, or less of its loss."""
-    return -row["loss"] if "loss" in row else row["psnr_ycbcr"]
 
 
 class Best:
@@ -141,9 +137,10 @@ class Best:
 
     Parameters
     ----------
+    objective : Pixels
     state : State
         Before the first step.
-    images, iterations : int
+    iterations : int
     score : Score
     progress : callable, optional
         See `refine`.
@@ -151,13 +148,14 @@ class Best:
 
     def __init__(
         self,
+        objective: Pixels,
         state: State,
-        images: int,
         iterations: int,
         score: Score,
         progress: FitProgress | None = None,
     ) -> None:
-        self.found = [Refinement(state.gaussians) for _ in range(images)]
+        self.objective = objective
+        self.found = [Refinement(state.gaussians) for _ in range(objective.grid.images)]
         self.iterations, self.score, self.progress = iterations, score, progress
         self.marks, self.step, self.state = trace_steps(iterations), 0, state
         self.row = Row()
@@ -178,24 +176,27 @@ class Best:
         rows = self.score(gaussians)
         self.row = {"iteration": step, **rows[0]}
         if len(gaussians) > len(self.found) * self.state.count:
-            figure = merit(self.row)
+            figure = self.objective.merit(self.row)
             if self.larger is None or figure > self.larger[0]:
                 self.larger = figure, step, gaussians
             return
         self.larger = None
         self.found = [
-            one if one.stopped == "exact" else one.judged(gaussians, {"iteration": step, **row})
+            one
+            if one.stopped == "exact"
+            else one.judged(gaussians, {"iteration": step, **row}, self.objective)
             for one, row in zip(self.found, rows, strict=True)
         ]
 
-    def end_early(self, objective: Pixels) -> None:
+    def end_early(self) -> None:
         """Measure the best set with a surplus, and that of the last step, both without it."""
         if len(self.found) > 1:
             raise KeyboardInterrupt
         larger = [self.larger] if self.larger else []
         for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
             if step not in [row["iteration"] for row in self.found[0].trace]:
-                self.judge(step, prune(dr.detach(gaussians), objective.around(gaussians), self.state.count))
+                near = self.objective.around(gaussians)
+                self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
         self.found = [
             replace(one, stopped="interrupted", iterations=self.step) for one in self.found
         ]
@@ -242,7 +243,7 @@ def refine(
     KeyboardInterrupt
         If the refinement of a batch is interrupted.
     """
-    best = Best(state, objective.grid.images, iterations, score, progress)
+    best = Best(objective, state, iterations, score, progress)
     try:
         ended = best.offer(0, state)
         with closing(descend(objective, method, state, iterations, key)) as states:
@@ -252,7 +253,7 @@ def refine(
     except KeyboardInterrupt:
         stopped = True
     if stopped:
-        best.end_early(objective)
+        best.end_early()
     batches = {id(one.gaussians): one.gaussians for one in best.found}
     detached = {name: dr.detach(batch) for name, batch in batches.items()}
     return [replace(one, gaussians=detached[id(one.gaussians)]) for one in best.found]

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..backend.arrays import types_of
 from ..backend.recording import freeze_program
-from ..backend.types import Float, Tensor
+from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import decode, from_log, unit_codes
 from ..raster.binning.lists import TileLists
@@ -299,6 +299,17 @@ class LossObjective(Pixels):
         if self.loss.target is None:
             return {"loss": loss}
         return {"loss": loss, "margin": 10 * math.log10(self.loss.target / max(loss, TINY))}
+
+    def merit(self, row: Record) -> float:
+        """Return the number of a row of which the best set has most: less of its loss.
+
+        The last set is the best where losses do not compare: with parameters, which are those of
+        the last step; or with neither an image nor a judge, where steps may see other cameras.
+        """
+        compares = self.loss.judge is not None or bool(self.pictures)
+        if self.loss.parameters is not None or not compares:
+            return float(row["iteration"])
+        return -float(row["loss"])
 
     def judge(self, shown: Sequence[Float]) -> float:
         """Return the value by which pictures, as rows of pixels, are compared."""

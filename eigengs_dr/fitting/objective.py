@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_of, upload
-from ..backend.types import Float, Tensor
+from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import LIGHT, UNBOUNDED, rgb_to_ycbcr, to_coded, to_linear, to_log
 from ..image.pixels import MAX_PIXEL
@@ -281,6 +281,10 @@ class Pixels:
     def judged(self, gaussians: Gaussians) -> dict[str, float]:
         """Return what a row of a trace has beside PSNRs: nothing."""
         return {}
+
+    def merit(self, row: Record) -> float:
+        """Return the number of a row of a trace of which the best set has most: its PSNR."""
+        return float(row["psnr_ycbcr"])
 
     def minus(self, gaussians: Gaussians) -> Pixels:
         """Return the objective for Gaussians that are added to these, which stay as they are."""

@@ -1,0 +1,187 @@
+"""A fit of a loss without an image: texels first, then the number of Gaussians, then these."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import drjit as dr
+import numpy as np
+
+from ..backend.arrays import ArrayTypes
+from ..gaussian.channels import TextureMap, check_maps, slices
+from ..gaussian.gaussians import Gaussians, whole
+from ..image.color import LIGHT, SPACES, to_coded, to_log
+from ..raster.kernels import forward
+from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
+from ..raster.render import bin_gaussians, to_tensor
+from ..storage.npz import BadValue
+from .coarse import Coarse, coarse_picture
+from .descent import begin
+from .loop import FitProgress, Refinement, descend, last, refine
+from .loss import Loss, LossObjective, View
+from .measure import Row
+from .method import DEFAULT
+from .objective import GREY, Data, Pixels
+from .options import PIXELS_PER_FIRST_GAUSSIAN, FitOptions, max_gaussians_for
+
+Spaces: TypeAlias = "str | Mapping[str, str] | None"
+"""The space of a picture, or those of several maps by name; data have one channel."""
+
+LEAST_GAIN = 0.02
+"""Relative gain of the loss for which the number of Gaussians is doubled. On the scenes of
+``bench inverse`` with the photo "coffee", the numbers so chosen end within 0.3 dB of the best."""
+
+
+def views_of_spaces(spaces: Spaces) -> tuple[list[View], tuple[TextureMap, ...]]:
+    """Return what the channels of a set show, and the maps of the set.
+
+    Raises
+    ------
+    ValueError
+        If a space or a name is none.
+    """
+    named = spaces if isinstance(spaces, Mapping) else {"": spaces or "ycbcr"}
+    for space in named.values():
+        if space not in SPACES:
+            raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(SPACES)}")
+    maps = tuple(
+        TextureMap(name, space, 1 if space == "data" else 3) for name, space in named.items()
+    )
+    if isinstance(spaces, Mapping):
+        try:
+            check_maps(maps, sum(m.channels for m in maps))
+        except BadValue as error:
+            raise ValueError(str(error)) from None
+    views = [
+        View(m.name, m.space, range(own.start, own.stop))
+        for m, own in zip(maps, slices(maps), strict=True)
+    ]
+    return views, maps if isinstance(spaces, Mapping) else ()
+
+
+def refine_loss(
+    loss: Loss,
+    size: tuple[int, int],
+    views: Sequence[View],
+    options: FitOptions,
+    types: ArrayTypes,
+    start: Gaussians | None,
+    started: float,
+    progress: FitProgress | None,
+    interrupted: Callable[[], bool],
+) -> tuple[Refinement, float]:
+    """Descend on a loss from nothing, or from a set; return the seconds before Gaussians move too.
+
+    A pyramid of texels takes the first steps, see `Coarse`. Gaussians are fitted to its picture: a
+    given number, or numbers that double while the loss gains from it. They take the other steps.
+    """
+    channels = sum(len(view.channels) for view in views)
+    space = "data" if views[0].name else views[0].space
+
+    def near(values: np.ndarray) -> LossObjective:
+        values = np.asarray(values, np.float32).reshape(size[1], size[0], channels)
+        if space in LIGHT:
+            values = np.maximum(values, 0)
+        shown = to_coded(values) if space in LIGHT else values
+        return LossObjective.of_loss(loss, views, Pixels.of(Data(values, shown), space, types))
+
+    def timed(row: Row) -> Row:
+        return {"seconds": time.perf_counter() - started, **row}
+
+    taken, trace = 0, []
+    if start is None:
+        place = options.method.place
+        coarse = place if isinstance(place, Coarse) else Coarse()
+        objective = near(np.zeros(size[0] * size[1] * channels))
+
+        def ended(step: int) -> bool:
+            nonlocal taken
+            taken = step
+            if progress and step % 10 == 0:
+                dr.sync_thread()
+                progress(step, options.iterations, timed({}))
+            return interrupted()
+
+        bounds, steps = loss.bounds or (0.0, 1.0), round(coarse.share * options.iterations)
+        first = [value for view in views for value in _grey(view.space, len(view.channels), bounds)]
+        sums = coarse_picture(objective, coarse, steps, first, bounds[1] - bounds[0], ended)
+        objective = replace(near(sums.numpy()), calls=objective.calls)
+        trace = [timed({"iteration": taken, "loss": objective.judge(objective.seen(sums))})]
+        start, numbers = _start(objective, options, coarse, interrupted)
+        trace += [timed({"iteration": taken, **row}) for row in numbers]
+    else:
+        objective = near(_sums(start, channels))
+    seconds_init = time.perf_counter() - started
+    refined = refine(
+        objective,
+        options.method,
+        begin(start, chosen=True),
+        options.iterations - taken,
+        lambda gaussians: [timed(objective.judged(gaussians))],
+        options.seed,
+        progress and (lambda step, steps, r: progress(step + taken, options.iterations, r)),
+        interrupted,
+    )[0]
+    rows = [{**r, "iteration": r["iteration"] + taken} for r in refined.trace]
+    found = replace(refined, trace=trace + rows, iterations=refined.iterations + taken)
+    return found, seconds_init
+
+
+def _grey(space: str, channels: int, bounds: tuple[float, float]) -> list[float]:
+    """Return the sums of a picture of which nothing is known."""
+    if space == "normal":
+        return [0.5, 0.5, 1.0]
+    if space in LIGHT:
+        return [GREY] * channels
+    middle = float(to_log(np.float32(GREY))) if space == "log" else sum(bounds) / 2
+    return [middle] * channels
+
+
+def _sums(gaussians: Gaussians, channels: int) -> np.ndarray:
+    """Return the sums of a set as rows of pixels."""
+    lists = bin_gaussians(gaussians, adjoint=False)
+    packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
+    radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
+    with dr.suspend_grad():
+        drawn = forward(packed, background, lists, radius)
+        return to_tensor(drawn, lists.grid, channels).numpy()
+
+
+def _start(
+    objective: LossObjective,
+    options: FitOptions,
+    coarse: Coarse,
+    interrupted: Callable[[], bool],
+) -> tuple[Gaussians, list[Row]]:
+    """Fit Gaussians to the image of an objective; return rows of the numbers that were tried."""
+    width, height = objective.size
+    image = Pixels(**{name: getattr(objective, name) for name in Pixels.__dataclass_fields__})
+    method = replace(DEFAULT, cutoff=options.method.cutoff)
+
+    def fitted(count: int) -> Gaussians:
+        start = method.place_and_solve(image, count, options.seed)
+        states = descend(image, method, begin(start), coarse.fit_steps, options.seed)
+        return last(states, start)
+
+    loss, pixels = objective.loss, width * height
+    if options.gaussians is not None or (loss.judge is None and loss.target is None):
+        return fitted(options.count_for(pixels)), []
+    most, count = max_gaussians_for(pixels, objective.channels), pixels // FIRST_PIXELS
+    best, rows = None, []
+    while count <= most and not (best and interrupted()):
+        gaussians = fitted(max(1, count))
+        rows.append({"gaussians": len(gaussians), **objective.judged(gaussians)})
+        if best is not None and rows[-1]["loss"] > (1 - LEAST_GAIN) * rows[-2]["loss"]:
+            break
+        best, count = gaussians, 2 * max(1, count)
+        if loss.target is not None and rows[-1]["loss"] <= loss.target:
+            break
+    assert best is not None
+    return best, rows
+
+
+FIRST_PIXELS = 2 * PIXELS_PER_FIRST_GAUSSIAN
+"""Pixels per Gaussian of the smallest number that is tried."""
