@@ -172,7 +172,7 @@ def ssim(a: Any, b: Any, weight: Any = None) -> Any:
         RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
         [0, 1]). Their order does not matter. Tensors are of floats from ``drjit.llvm.ad`` or that
         of another backend, with any number of channels. An array beside a tensor is uploaded at
-        every call: in a loop, give two tensors, and in `drjit.freeze` nothing else.
+        every call; what `drjit.freeze` records keeps the array that it saw.
     weight : array_like, or tensor, shape (H, W), (H, W, 1) or (H, W, C), optional
         Factors w of the similarity s of the window around each pixel, or of each channel of it;
         finite and at least 0, which is not checked of a tensor. The mean is then

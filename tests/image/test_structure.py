@@ -1,4 +1,4 @@
-"""SSIM of tensors: against scikit-image, finite differences in float64, and SSIM of NumPy arrays."""
+"""SSIM of tensors against scikit-image, finite differences in float64, and SSIM of NumPy arrays."""
 
 import drjit as dr
 import numpy as np
