@@ -58,8 +58,9 @@ def similarity(
 ) -> Float:
     """Compute the mean SSIM of two pictures; differentiable by both in both modes.
 
-    Value and derivative take 4 programs, whose cost is told at their functions, and the memory of
-    8 to 9 pictures in between.
+    Value and derivative take 4 programs; their costs stand at their functions. They hold 7 planes
+    of the size of a picture at once, or 10 with derivatives by both. In single precision the value
+    has an error of 1e-6 for photos and up to 1e-4 for flat pictures, where variances cancel.
 
     Parameters
     ----------
