@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from ..backend.doors import door
 from ..gaussian.covariance import factor_from_covariance
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
@@ -97,6 +98,7 @@ def grid_of(size: tuple[int, int], count: int) -> Shapes:
     return mean, np.tile([sharpness, 0, sharpness], (count, 1))
 
 
+@door
 def lattices(
     size: tuple[int, int],
     sides: Sequence[int],
