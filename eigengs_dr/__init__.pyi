@@ -13,6 +13,7 @@ from .fitting.fit import Fit, FitInterrupted, fit
 from .fitting.maps import Map
 from .fitting.method import DEFAULT, Method
 from .fitting.options import Goal, level_counts
+from .fitting.place import lattices
 from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, sample, save_image
 from .image.metrics import ms_ssim, psnr, ssim
@@ -49,6 +50,7 @@ __all__ = [
     "fit_large",
     "fit_many",
     "from_tensors",
+    "lattices",
     "level_counts",
     "load_image",
     "ms_ssim",

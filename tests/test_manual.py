@@ -41,13 +41,6 @@ def numbers(tensor):
     return np.array(dr.detach(tensor).numpy(), np.float64)
 
 
-def test_the_loss_of_the_page_is_ssim(own_loop):
-    pictures = [np.clip(numbers(eg.render(own_loop[name])), 0, 1) for name in ("found", "start")]
-    tensors = [own_loop["TensorXf"](p.astype(np.float32)) for p in pictures]
-    found = own_loop["ssim"](*tensors).array[0]
-    assert abs(found - eg.ssim(*pictures)) < 1e-5
-
-
 def test_the_loops_of_the_page_fit(own_loop):
     """The frozen loop takes the steps of the plain one, but for the lists of five steps."""
     image = own_loop["image"]

@@ -71,12 +71,7 @@ def gaussians(mi: Any, name: str) -> Unknown:
     """Describe a texture by lattices of Gaussians."""
     from eigengs_dr.plugins import keep_in_bounds, texture_of
 
-    places = [(np.indices((n, n)).reshape(2, -1).T + 0.5) * TEXELS / n for n in LATTICES]
-    narrow = np.concatenate([np.full(n * n, n / (0.65 * TEXELS)) for n in LATTICES])
-    factor = np.stack([narrow, 0 * narrow, narrow], axis=1)
-    size, grey = (TEXELS, TEXELS), [GREY] * 3
-    mean, color = np.concatenate(places), np.zeros((len(narrow), 3))
-    found = eg.Gaussians.from_arrays(mean, factor, color, grey, size=size, space="linear")
+    found = eg.lattices((TEXELS, TEXELS), LATTICES, [GREY] * 3, space="linear")
     rates = {"mean": 0.2, "factor": 0.02, "color": 0.01, "background": 0.005}
     texture = texture_of(found, cutoff=CUTOFF)
     tensors = mi.traverse(mi.load_dict(texture))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from ..backend.arrays import ArrayTypes, types_of
+from ..backend.arrays import ArrayTypes, gather_run, types_of
 from ..backend.types import Bool, Float, Mask, UInt
 from ..gaussian.gaussians import Gaussians
 
@@ -97,17 +97,6 @@ def pack_parameters(values: list) -> Float:
     packed = dr.empty(types.Float, stride * count)
     dr.scatter(packed, types.FloatX(rows), dr.arange(types.UInt, count))
     return packed
-
-
-def gather_run(
-    types: ArrayTypes, source: Float | UInt, index: UInt, length: int, active: Mask
-) -> list:
-    """Gather ``source[index * length : (index + 1) * length]``, in packets if the length is even.
-
-    Return a list of `length` Float.
-    """
-    shape = (length, dr.width(index))
-    return list(dr.gather(types.FloatX, source, index, active, shape=shape))
 
 
 def unpack_parameters(packed: Float, index: UInt, number: int, active: Mask = True) -> list:
