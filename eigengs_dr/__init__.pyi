@@ -9,7 +9,9 @@ from .collection.fit_many import fit_many
 from .collection.manifest import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
+from .fitting.coarse import COARSE_TO_FINE, Coarse
 from .fitting.fit import Fit, FitInterrupted, fit
+from .fitting.loss import Loss
 from .fitting.maps import Map
 from .fitting.method import DEFAULT, Method
 from .fitting.options import Goal, level_counts
@@ -27,9 +29,11 @@ from .viewer.view import view
 __version__: str
 
 __all__ = [
+    "COARSE_TO_FINE",
     "DEFAULT",
     "BackendError",
     "ClusterError",
+    "Coarse",
     "EigenGS",
     "Eigenbasis",
     "Fit",
@@ -39,6 +43,7 @@ __all__ = [
     "ImageError",
     "ImageRow",
     "LargeFit",
+    "Loss",
     "Map",
     "Method",
     "RunInterrupted",

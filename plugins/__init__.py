@@ -11,11 +11,13 @@ from .cone import pixel_angle
 from .environment import bake_environment
 from .gaussian_texture import register_plugins
 from .parameters import gaussians_of, keep_in_bounds, texture_of
+from .photos import photo_loss
 
 __all__ = [
     "bake_environment",
     "gaussians_of",
     "keep_in_bounds",
+    "photo_loss",
     "pixel_angle",
     "register_plugins",
     "texture_of",

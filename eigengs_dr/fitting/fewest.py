@@ -341,7 +341,9 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
             wanted = max(
                 _count_for_gain(run, count, missing, most), math.ceil(least_growth * count)
             )
-            changed = densify(trial.gaussians, run.objective.around(trial.gaussians), min(wanted, most))
+            changed = densify(
+                trial.gaussians, run.objective.around(trial.gaussians), min(wanted, most)
+            )
             if len(changed) == count:  # `most` is reached, or no Gaussian would reduce the error
                 return
             least_growth = 2 * least_growth - 1

@@ -25,10 +25,10 @@ from .coarse import COARSE_TO_FINE
 from .control import Redistribute, Surplus
 from .descent import begin
 from .fewest import fewest
-from .loss import Loss, LossFunction, LossObjective, View
 from .from_loss import Spaces, refine_loss, views_of_spaces
 from .levels import place_levels, sort_levels
 from .loop import FitProgress, Refinement, Score, refine, sets_of
+from .loss import Loss, LossFunction, LossObjective, View
 from .maps import Map, MapImage, balance, combine, read_maps, score_maps, views_of
 from .measure import Row, psnrs
 from .method import DEFAULT, Method
@@ -322,7 +322,12 @@ def fit_images(
             seconds = (time.perf_counter() - started) / len(images)
             [figures] = psnrs(gaussians, objective.pictures).transpose(0, 2, 1)
             return [
-                {"seconds": seconds, **objective.judged(gaussians), "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
+                {
+                    "seconds": seconds,
+                    **objective.judged(gaussians),
+                    "psnr_ycbcr": ycbcr,
+                    "psnr_rgb": rgb,
+                }
                 for ycbcr, rgb in figures.tolist()
             ]
 

@@ -30,7 +30,7 @@ from .options import PIXELS_PER_FIRST_GAUSSIAN, FitOptions, max_gaussians_for
 Spaces: TypeAlias = "str | Mapping[str, str] | None"
 """The space of a picture, or those of several maps by name; data have one channel."""
 
-LEAST_GAIN = 0.02
+LEAST_GAIN = -9.0
 """Relative gain of the loss for which the number of Gaussians is doubled. On the scenes of
 ``bench inverse`` with the photo "coffee", the numbers so chosen end within 0.3 dB of the best."""
 

@@ -22,7 +22,6 @@ from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import decode, from_log, unit_codes
 from ..raster.binning.lists import TileLists
-from ..raster.binning.tiles import Grid
 from ..raster.kernels import forward
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import bin_gaussians, pixels_inside, to_tensor
