@@ -171,8 +171,8 @@ def build_lists(
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
     share = granularity_of(types)
     touched, totals = _count_tiles(shape, radius, wide, sizes, pad)
-    entries, steep = int(totals[0]) % (1 << 40), int(totals[0]) >= 1 << 40
-    steep = steep or not share.products or grid.tile[0] != TILE[0]
+    narrow, entries = divmod(int(totals[0]), 1 << 40)  # one copy to the host
+    steep = narrow > 0 or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
         raise ValueError(
             f"{dr.width(touched)} Gaussians touch {entries} tiles, the limit is "
