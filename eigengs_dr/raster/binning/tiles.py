@@ -37,8 +37,9 @@ class Granularity(NamedTuple):
         Whether weights along a row continue one exponential by products, where that is accurate. On
         a GPU an exponential is one instruction, and products would cost more.
     block : int
-        Pieces whose results one lane adds first, so that no lane adds all of a Gaussian that covers
-        the image; 0 adds all in one lane. One lane of a GPU is 100 times slower than all of them.
+        Where a Gaussian that covers the image would keep one lane busy while all others wait, as on
+        a GPU: the number of pieces whose results one lane adds, before another adds these blocks.
+        Lists then have a lane for each entry. With 0, one lane lists and adds all of a Gaussian.
     """
 
     rows: int
