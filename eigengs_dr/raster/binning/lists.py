@@ -542,11 +542,11 @@ def _sort_stably(key: UInt, value: UInt, bits: int) -> tuple[UInt, UInt]:
 def _search(size: UInt, values: UInt, bound: UInt) -> UInt:
     """Return how many of the first `size` values, which ascend, are below each bound.
 
-    The steps depend on the number of bits of the width only, so that few programs serve all sizes;
-    `drjit.binary_search` has the size in its program.
+    The steps depend on the number of bits of the width only, rounded up, so that few programs serve
+    all sizes; `drjit.binary_search` has the size in its program.
     """
     UInt, found = type(values), dr.zeros(type(values), dr.width(bound))
-    for bit in reversed(range(dr.width(values).bit_length())):
+    for bit in reversed(range(-(-dr.width(values).bit_length() // 4) * 4)):
         index = found + (1 << bit)
         valid = index <= size
         below = dr.gather(UInt, values, index - 1, valid) < bound
