@@ -338,7 +338,8 @@ def _find_tiles(
 ) -> UInt:
     """Return the tiles of `_emit_tiles` with a lane for each, which walks the rows of its Gaussian.
 
-    A lane for each Gaussian takes 15 ms for one of 200,000 tiles, and a GPU waits for it.
+    With a lane for each Gaussian, and one that adds all of its pieces, a GPU waits for the largest
+    one: a fit of 2048x2048 pixels and 320,000 Gaussians took 5.7 s instead of 1.1 s (H200).
     """
     start, last = slots
     i, count = dr.arange(types.UInt, capacity), dr.opaque(types.UInt, dr.width(last))
