@@ -14,7 +14,14 @@ from numpy.typing import ArrayLike
 from eigengs_dr.fitting.loss import Loss
 
 JUDGED = 4
-"""Most photos whose held-out pixels are rendered for one value; they are spread over all."""
+"""Photos with held-out pixels, spread over all."""
+
+MANY_PHOTOS = 8
+"""Photos from which on some pixels are held out by default. With three, a held-out pixel leaves a
+hole in the texture that no other photo sees, and the number that suits holes is far too small."""
+
+HELD_OUT = 0.2
+"""Share of the pixels of a judged photo that are held out by default."""
 
 JUDGE_SAMPLES = 2
 """Samples of a held-out pixel in each of two renderings, as a multiple of those of a step. The
@@ -30,7 +37,7 @@ def photo_loss(
     sensors: Sequence[mi.Sensor | int] | None = None,
     integrator: mi.Integrator | None = None,
     spp: int = 4,
-    held_out: float = 0.1,
+    held_out: float | None = None,
     bounds: tuple[float, float] | None = (0.0, 1.0),
     parameters: Any = None,
     seed: int = 0,
@@ -38,8 +45,8 @@ def photo_loss(
     """Return the squared error of renderings against photos, for `eigengs_dr.fit`.
 
     A step puts the picture into the scene as texels, and renders one photo after another. So it
-    costs what a step of texels costs. Some pixels of the photos are held out: their error is the
-    ``loss`` of the trace, and says how many Gaussians the scene needs.
+    costs what a step of texels costs. With many photos, some pixels are held out: their error is
+    the ``loss`` of the trace, and says how many Gaussians the scene needs.
 
     Parameters
     ----------
@@ -58,8 +65,9 @@ def photo_loss(
     spp : int, optional
         Samples a pixel of a step.
     held_out : float, optional
-        Share of the pixels that no step sees, in [0, 1). With 0, the trace has the error of the
-        first photo, and the number of Gaussians is not chosen.
+        Share of the pixels of four photos that no step sees, in [0, 1). With 0, the trace has the
+        error of the first photo, and the number of Gaussians is not chosen. By default 0.2 with 8
+        photos or more, and 0 with fewer.
     bounds : (float, float), optional
         See `eigengs_dr.Loss`.
     parameters : optimiser, optional
@@ -112,9 +120,15 @@ def photo_loss(
         for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
     ]
     generator, first = np.random.default_rng(seed), seed * STEPS_OF_A_SEED
+    if held_out is None:
+        held_out = HELD_OUT if len(targets) >= MANY_PHOTOS else 0.0
+    number_judged = min(JUDGED, len(targets))
+    judged = [k * len(targets) // number_judged for k in range(number_judged)]
     hidden = [
-        mi.TensorXf(np.float32(generator.random((*target.shape[:2], 1)) < held_out))
-        for target in targets
+        mi.TensorXf(
+            np.float32(generator.random((*target.shape[:2], 1)) < held_out * (number in judged))
+        )
+        for number, target in enumerate(targets)
     ]
 
     def show(picture: Any) -> None:
@@ -136,14 +150,12 @@ def photo_loss(
 
     def judge(picture: Any) -> Any:
         show(picture)
-        judged = min(JUDGED, len(targets))
-        numbers = [k * len(targets) // judged for k in range(judged)]
         products = [
             difference(number, first, JUDGE_SAMPLES * spp)
             * difference(number, first + 1, JUDGE_SAMPLES * spp)
-            for number in numbers
+            for number in judged
         ]
-        means = [_mean(p, hidden[n]) for p, n in zip(products, numbers, strict=True)]
+        means = [_mean(p, hidden[n]) for p, n in zip(products, judged, strict=True)]
         return sum(means) / len(means)
 
     return Loss(function, bounds, parameters, judge if held_out else None)

@@ -26,6 +26,10 @@ LEAST_SIDE = 4
 """Shorter side of the coarsest level in texels, at least."""
 
 
+NOISY = Adam(0.5, 0.999, 1e-8)
+"""Adam for derivatives with the noise of a rendering."""
+
+
 @dataclass(frozen=True)
 class Coarse(Adaptive):
     """Places Gaussians by the picture that a pyramid of texels finds for a loss.
@@ -48,7 +52,7 @@ class Coarse(Adaptive):
     share: float = 0.5
     rate: float = 0.005
     decay: float = 0.05
-    optimizer: Optimizer = Adam(0.5, 0.999, 1e-8)
+    optimizer: Optimizer = NOISY
     fit_steps: int = 150
 
 
@@ -56,10 +60,11 @@ COARSE_TO_FINE = replace(
     DEFAULT,
     place=Coarse(),
     controls=(),
-    optimizer=Adam(0.5, 0.999, 1e-8),
-    rates={"mean": 0.025, "factor": 0.015, "color": 0.00175},
-    decay=0.05,
+    optimizer=NOISY,
+    rates={"mean": 0.0125, "factor": 0.0075, "color": 0.0009},
+    decay=1.0,
     rate_exponent=0.0,
+    average=0.8,
 )
 """The method of a loss without an image: a pyramid of texels, then Gaussians that move little, for
 derivatives with the noise of a rendering. The rates were chosen on the scenes of ``bench inverse``

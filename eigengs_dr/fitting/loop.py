@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import drjit as dr
 import numpy as np
 
+from ..backend.arrays import types_of
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
@@ -86,6 +87,24 @@ def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussian
         for state in states:
             gaussians = state.gaussians
     return dr.detach(gaussians)
+
+
+def averaged(states: Generator[State, None, None], first: int) -> Generator[State, None, None]:
+    """Yield the states of a descent with the mean of all sets after the first ones.
+
+    With noisy derivatives, the mean is closer to the minimum than any of the sets (Polyak and
+    Juditsky, "Acceleration of stochastic approximation by averaging", 1992).
+    """
+    with closing(states):
+        mean: list = []
+        for step, state in enumerate(states):
+            current = state.gaussians
+            moved = [dr.detach(rows) for rows in (current.mean, current.factor, current.color)]
+            share = dr.opaque(types_of(current.mean).Float, 1 / max(1, step - first + 1))
+            mean = [m + (r - m) * share for m, r in zip(mean or moved, moved, strict=True)]
+            dr.eval(mean)
+            fields = dict(zip(("mean", "factor", "color"), mean, strict=True))
+            yield replace(state, gaussians=replace(current, **fields))
 
 
 FitProgress = Callable[[int, int, Row], None]
@@ -245,7 +264,10 @@ def refine(
     best = Best(objective, state, iterations, score, progress)
     try:
         ended = best.offer(0, state)
-        with closing(descend(objective, method, state, iterations, key)) as states:
+        states = descend(objective, method, state, iterations, key)
+        if method.average:
+            states = averaged(states, round((1 - method.average) * iterations))
+        with closing(states):
             while not (ended or interrupted()) and best.step < iterations:
                 ended = best.offer(best.step + 1, next(states))
         stopped = interrupted()
