@@ -9,11 +9,13 @@ except ImportError as error:
 
 from .cone import pixel_angle
 from .environment import bake_environment
+from .follow import follow
 from .gaussian_texture import register_plugins
 from .parameters import gaussians_of, keep_in_bounds, texture_of
 
 __all__ = [
     "bake_environment",
+    "follow",
     "gaussians_of",
     "keep_in_bounds",
     "pixel_angle",

@@ -25,7 +25,7 @@ from eigengs_dr.raster.render import decode_parameters
 
 from . import properties
 from .color import STEP, luminance, show_all, slope_of, upload_table, upsample
-from .cone import footprint_inputs, seen_metric
+from .cone import current_angle, footprint_inputs, seen_metric
 from .emission import Emission, Survey, emission_of, make_survey, outside_of_recordings
 from .lookup import (
     list_gaussians,
@@ -82,8 +82,9 @@ def gaussian_texture() -> type:
             Return values as they are, neither decoded nor clamped.
         prefilter : float or boolean, default: 0
             Angle of a pixel in radians, below 1, see `pixel_angle`: lookups average over the
-            footprint of the pixel; 0 looks at points. Footprints that rays carry (Mitsuba 3.10) go
-            before the angle, and ``true`` takes them alone. Slopes of bump maps ignore footprints.
+            footprint of the pixel; 0 looks at points. With ``true`` the texture follows a sensor:
+            call `follow` before a rendering, as ``eigengs-dr scene`` does. Footprints that rays
+            carry (Mitsuba 3.10) go before both. Slopes of bump maps ignore footprints.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         """
@@ -97,25 +98,32 @@ def gaussian_texture() -> type:
             self.raw = properties.raw(props)
             self.cutoff = properties.cutoff(props, start.cutoff)
             self.angle, self.follows = properties.prefilter(props)
-            self.inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
+            self.prefilter = dr.opaque(mi.Float, self.angle)
+            self.sensor: mi.Sensor | None = None
             self.wrap = properties.wrap_mode(props)
             self.to_uv = properties.to_uv(props)
             self.width, self.height = start.width, start.height
             self.space, self.channels = start.space, start.channels
             self.spectra = upload_table() if mi.is_spectral else None
+            properties.check_known(props)
             self.parameters_changed([])
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             for name, tensor in self.source.tensors.items():
                 callback.put(name, tensor, mi.ParamFlags.Differentiable)
             callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
+            if self.sensor is not None:
+                self.prefilter = current_angle(self.sensor)
+            callback.put("prefilter", self.prefilter, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
             if not keys or "to_uv" in keys:
                 properties.check_invertible(self.to_uv)
                 self.transform = mi.Transform3f(self.to_uv)
                 dr.make_opaque(self.transform)  # another transform compiles no other programs
-            if set(keys) != {"to_uv"}:
+            if "prefilter" in keys:
+                self._set_prefilter()
+            if not keys or set(keys) - {"to_uv", "prefilter"}:
                 self._take_over(not keys or any(key in SHAPES for key in keys))
             sampled = getattr(self, "emission", None) is not None
             self.survey: Survey | None = None
@@ -141,6 +149,26 @@ def gaussian_texture() -> type:
                 lists = self.table.lists
             self.table = make_table(lists, self.cutoff, source.tensors, decode)
             self.part = slice(None)
+
+        def follow(self, sensor: mi.Sensor) -> None:
+            """Take footprints of the pixels of a sensor from now on, see `follow`."""
+            current_angle(sensor)  # it raises where there is none
+            filtered, self.sensor = self.filtered(), sensor
+            if not filtered:
+                self._take_over(True)
+
+        def _set_prefilter(self) -> None:
+            """Take over the parameter ``prefilter``, which may switch footprints on or off."""
+            angle = properties.check_angle(float(dr.slice(self.prefilter)))
+            filtered, self.angle, self.sensor, self.follows = self.filtered(), angle, None, False
+            if filtered != self.filtered():
+                self._take_over(True)
+
+        def _pixel(self) -> Float | None:
+            """Return the angle of a pixel; None if rays alone know it."""
+            if self.sensor is not None:
+                return current_angle(self.sensor)
+            return self.prefilter if self.angle else None
 
         # --- Lookups -----------------------------------------------------------------------------
 
@@ -191,8 +219,9 @@ def gaussian_texture() -> type:
 
         def _color(self, si: Interaction, active: Mask) -> list:
             """Look up the channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
-            where = (self.wrap, self.angle, *np.array(self.to_uv.matrix).flat)
-            sums = reused(self.table, where, si, self.inputs, lambda: self._look_up(si))[self.part]
+            where = (self.wrap, self.angle, id(self.sensor), *np.array(self.to_uv.matrix).flat)
+            inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
+            sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))[self.part]
             background = self.table.background[self.part]
             shown = show_all(self, [s + b for s, b in zip(sums, background, strict=True)])
             _, _, inside = self.point(si.uv)
@@ -206,7 +235,7 @@ def gaussian_texture() -> type:
             # B of a transform with the rows of B^-1
             turned = self.transform.inverse_transpose
             inverse = tuple(turned[j, i] for i in range(2) for j in range(2))
-            seen = seen_metric(si, inverse, self.angle)
+            seen = seen_metric(si, inverse, self._pixel())
             if self.wrap == "clamp":  # a footprint beyond the border may see what lies inside
                 u, v = self.transform @ si.uv
                 x, y = (
@@ -278,13 +307,14 @@ def gaussian_texture() -> type:
 
         def filtered(self) -> bool:
             """Return whether lookups average over a footprint; Mitsuba 3.10 asks."""
-            return self.follows or self.angle > 0
+            return self.follows or self.sensor is not None or self.angle > 0
 
         def is_spatially_varying(self) -> bool:
             return True
 
         def to_string(self) -> str:
-            angle = "true" if self.follows else f"{self.angle:g}"
+            follows = self.follows or self.sensor is not None
+            angle = "true" if follows else f"{self.angle:g}"
             transform = str(self.to_uv).replace("\n", "\n  ")
             return (
                 f'GaussianTexture[\n  name = "{self.file}",\n'

@@ -32,18 +32,19 @@ class TestMistakes:
             ({"wrap_mode": "bounce"}, "wrap_mode 'bounce' is unknown; use one of repeat, mirror"),
             ({"cutoff": 0.0}, "cutoff is 0.0; it must be above 0 and at most 12"),
             ({"prefilter": -1.0}, "prefilter is -1.0; it is the angle of a pixel"),
-            ({"prefiltre": 1.0}, "prefiltre"),
+            ({"prefiltre": 1.0}, "it has no property prefiltre"),
             ({"space": "cmyk"}, "space 'cmyk'"),
             ({"raw": "false"}, "raw is 'false'; it must be a boolean"),
             ({"cutoff": "wide"}, "cutoff is 'wide'; it must be a number"),
-            ({"prefilter": True}, "prefilter = true needs Mitsuba 3.10, and this is 3.9"),
-            ({"prefilter": False}, "prefilter is False; it must be a number"),
+            ({"prefilter": False}, "prefilter is False; it must be true, or the angle of a pixel"),
             ({"width": 31.5}, "width is 31.5; it must be an integer"),
         ],
     )
     def test_of_properties(self, properties, message):
-        with pytest.raises(RuntimeError, match=message):
+        with pytest.raises(RuntimeError) as caught:
             texture(gaussians(), **properties)
+        first_line = str(caught.value).splitlines()[0]
+        assert message in first_line
 
     @pytest.mark.parametrize("channels", [2, 4])
     def test_a_set_of_other_channels(self, channels):
