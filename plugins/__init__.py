@@ -11,6 +11,7 @@ from .cone import pixel_angle
 from .environment import bake_environment
 from .follow import follow
 from .gaussian_texture import register_plugins
+from .memory import resident_bytes
 from .parameters import gaussians_of, keep_in_bounds, texture_of
 
 __all__ = [
@@ -20,5 +21,6 @@ __all__ = [
     "keep_in_bounds",
     "pixel_angle",
     "register_plugins",
+    "resident_bytes",
     "texture_of",
 ]

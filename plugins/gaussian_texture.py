@@ -7,10 +7,8 @@ derivatives inside a virtual call. So the class below only passes arrays to the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -35,6 +33,7 @@ from .lookup import (
     sum_over_footprint,
     table_of_file,
 )
+from .memory import resident_bytes
 from .parameters import SHAPES, Arrays
 from .versions import Interaction, Properties, Texture, register_texture, texture_class
 
@@ -323,44 +322,11 @@ def gaussian_texture() -> type:
                 f"  space = {self.space},\n  raw = {int(self.raw)},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {angle},\n"
                 f"  cutoff = {self.cutoff:g},\n"
+                f"  resident_bytes = {resident_bytes(self)},\n"
                 f"  transform = {transform}\n]"
             )
 
     return GaussianTexture
-
-
-def resident_bytes(texture: Texture) -> int:
-    """Return the bytes of the arrays that a ``gaussian_texture`` holds in memory.
-
-    Parameters
-    ----------
-    texture : mitsuba.Texture
-
-    Returns
-    -------
-    int
-        Bytes of its parameters, lists of Gaussians, copies in the order of the lists and, with a
-        prefilter, the pyramid. Textures of one file share them, and each counts them.
-    """
-    arrays: dict[int, int] = {}
-    seen: set[int] = set()
-
-    def visit(tree: Any) -> None:
-        if tree is None or isinstance(tree, type | str) or id(tree) in seen:
-            return
-        seen.add(id(tree))
-        if dr.is_tensor_v(tree):
-            tree = tree.array
-        if dr.is_jit_v(tree) and dr.depth_v(tree) == 1:
-            arrays[tree.index] = dr.width(tree) * dr.itemsize_v(tree)
-            return
-        inner = vars(tree) if hasattr(tree, "__dict__") else tree
-        inner = inner.values() if isinstance(inner, dict) else inner
-        for one in inner if isinstance(inner, Iterable) else ():
-            visit(one)
-
-    visit(vars(texture))
-    return sum(arrays.values())
 
 
 def _name(texture: Texture) -> str:
