@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +25,13 @@ TWO_VALUES = 0.95
 
 KEPT = ("to_uv", "wrap_mode")
 """Properties of a bitmap that a ``gaussian_texture`` has too."""
+
+
+GAUSSIANS = "gaussian_texture"
+"""Name of the plugin in scenes."""
+
+UDIM = re.compile(r"<udim>|<uvtile>|%\(udim\)d", re.IGNORECASE)
+"""What stands for the number of a tile in names of files, by Mari, Mudbox and Houdini."""
 
 
 class Use(NamedTuple):
@@ -56,11 +65,10 @@ class Use(NamedTuple):
 
 
 class Parsed(NamedTuple):
-    """A scene that is parsed but not instantiated: all nodes, and the folder of its files."""
+    """A scene that is parsed but not instantiated: all nodes, with absolute names of files."""
 
     config: mi.parser.ParserConfig
     state: mi.parser.ParserState
-    folder: Path
 
 
 def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None) -> Parsed:
@@ -76,34 +84,62 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
     Raises
     ------
     ValueError
-        If the root is no scene.
+        If the root is no scene, or a file name stands for UDIM tiles.
     RuntimeError
         Mitsuba's error, if the scene does not parse.
     """
     register_plugins()
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = config.parallel = False
-    if isinstance(scene, Mapping):
-        folder, state = Path.cwd(), mi.parser.parse_dict(config, dict(scene))
-    else:
-        folder = Path(scene).resolve().parent
-        state = mi.parser.parse_file(config, str(scene), **dict(parameters or {}))
-    mi.parser.transform_all(config, state)
-    if state.root.props.plugin_name() != "scene":
-        raise ValueError("holds no scene; its root must be <scene version='3.0.0'>")
+    with _own_resolver() as resolver:  # parsing adds the folders of <path> to it
+        if isinstance(scene, Mapping):
+            state = mi.parser.parse_dict(config, dict(scene))
+        else:
+            for path in (Path(scene).resolve(), Path(scene).absolute()):  # the scene may be a link
+                resolver.prepend(str(path.parent))
+            state = mi.parser.parse_file(config, str(scene), **dict(parameters or {}))
+        mi.parser.transform_all(config, state)
+        if state.root.props.plugin_name() != "scene":
+            raise ValueError("holds no scene; its root must be <scene version='3.0.0'>")
+        for node in state.nodes:
+            _make_absolute(node.props)
     for node in state.nodes:
-        for key in file_keys(node.props):
-            path = folder / node.props[key]
-            if path.exists():
-                node.props[key] = str(path)
         if "data" in node.props and is_bitmap(node):  # an instance takes the tensor away
             node.props["data"] = mi.TensorXf(np.array(node.props["data"], np.float32))
-    return Parsed(config, state, folder)
+        if node.props.plugin_name() == GAUSSIANS:  # Mitsuba does not know what dictionaries name
+            node.type = texture_kind()
+    return Parsed(config, state)
+
+
+@contextmanager
+def _own_resolver() -> Iterator[mi.FileResolver]:
+    """Use a copy of Mitsuba's file resolver in a block."""
+    before = mi.file_resolver()
+    own = mi.FileResolver(before)
+    mi.set_file_resolver(own)
+    try:
+        yield own
+    finally:
+        mi.set_file_resolver(before)
+
+
+def _make_absolute(props: Properties) -> None:
+    """Look files up as Mitsuba does: in the folders of ``<path>``, then beside the scene."""
+    for key in file_keys(props):
+        path = Path(str(mi.file_resolver().resolve(props[key])))
+        if path.exists():
+            props[key] = str(path.absolute())
+        elif UDIM.search(props[key]):
+            raise ValueError(
+                f"{props[key]} stands for UDIM tiles, and Mitsuba reads one image a bitmap; split "
+                "the mesh by tiles, and give each part the bitmap of its tile"
+            )
 
 
 def file_keys(props: Properties) -> list[str]:
     """Return the properties that name files."""
-    return [key for key in props.keys() if key == "filename" or key.endswith("_filename")]  # noqa: SIM118
+    named = ("filename", "model") if props.plugin_name() == GAUSSIANS else ("filename",)
+    return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 
 
 def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:

@@ -15,11 +15,14 @@ from ..backend.doors import door
 from ..backend.messages import warn
 from ..backend.progress import shows_progress
 from ..backend.types import PathLike, Record
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import FIELDS, Gaussians
 from ..image.io import ImageError
+from ..plugins.properties import source_of, to_uv
+from ..plugins.versions import Properties
 from ..storage.atomic import atomic_folder, refuse_url, remove_stale
 from ..storage.locks import lock_output
 from .bitmaps import (
+    GAUSSIANS,
     KEPT,
     Parsed,
     Unsuitable,
@@ -300,8 +303,8 @@ def _file_name(use: Use, taken: set[str]) -> str:
 def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> None:
     """Put the sets in the place of the bitmaps, and name other files relative to the folder.
 
-    `made` holds the new file for the index of each node that was a bitmap. Bitmaps that stay and
-    are in memory become files too.
+    `made` holds the new file for the index of each node that was a bitmap. Bitmaps that stay, and
+    sets that were there, become files too if they are in memory.
     """
     for index, node in enumerate(parsed.state.nodes):
         props = node.props
@@ -309,8 +312,13 @@ def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> 
             for key in list(props.keys()):
                 if key not in KEPT:
                     del props[key]
-            props.set_plugin_name("gaussian_texture")
+            props.set_plugin_name(GAUSSIANS)
             props["filename"] = made[index]
+            continue
+        if props.plugin_name() == GAUSSIANS and "to_uv" in props:
+            props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML lacks
+        if props.plugin_name() == GAUSSIANS and ("mean" in props or "coefficients" in props):
+            _save_set(props, work, f"gaussians-{index}.npz")
             continue
         if (is_bitmap(node) or props.plugin_name() == "envmap") and "filename" not in props:
             file = f"bitmap-{index}.exr"
@@ -323,11 +331,21 @@ def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> 
                 props[key] = os.path.relpath(path, target)
 
 
+def _save_set(props: Properties, folder: Path, file: str) -> None:
+    """Write the arrays of a ``gaussian_texture``, or a model with its coefficients, to a file."""
+    source = source_of(props)
+    source.gaussians(source.tensors).save(folder / file)
+    for key in (*FIELDS, "width", "height", "space", "model", "coefficients"):
+        if key in props:
+            del props[key]
+    props["filename"] = file
+
+
 def _to_xml(parsed: Parsed) -> str:
     try:
         return str(mi.parser.write_string(parsed.state))
     except RuntimeError as error:
         reason = str(error).partition("] ")[2] or str(error)
         raise ValueError(
-            f"the scene cannot be written as XML ({reason}); give meshes by files"
+            f"the scene cannot be written as XML ({reason}); give meshes and volumes by files"
         ) from None

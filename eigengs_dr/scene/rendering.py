@@ -125,7 +125,7 @@ def compare_renderings(
     Parameters
     ----------
     before, after : mitsuba.Scene
-        With the same cameras.
+        With the same cameras; without an integrator, "path" renders them.
     folder : Path
         Gets before-1.png, after-1.png and difference-1.png, 8 times louder, and so on.
     spp : int or None
@@ -152,7 +152,8 @@ def compare_renderings(
 
 def _picture(scene: mi.Scene, camera: int, spp: int | None) -> NDArray[np.float32]:
     """Render a scene in sRGB, shape (H, W, 3) or (H, W, 1)."""
-    rendering = render_in_passes(scene, camera, spp)
+    renderer = scene.integrator() or mi.load_dict({"type": "path"})
+    rendering = render_in_passes(scene, camera, spp, integrator=renderer)
     light = rendering.picture("RGB")
     if not light.size:  # a renderer of AOVs alone
         light = rendering.pixels[..., :1]

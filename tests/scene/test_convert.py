@@ -9,7 +9,10 @@ import pytest
 import eigengs_dr as eg
 from _helpers.bitmap_scenes import cornell, room, save_images, sky, wall
 from _helpers.poster import mi
+from _helpers.texture import gaussians
+from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.io import load_image
+from eigengs_dr.plugins import texture_of
 from eigengs_dr.storage.locks import lock_output
 
 pytestmark = pytest.mark.mitsuba
@@ -221,6 +224,72 @@ def test_meshes_in_memory_are_refused(folder, tmp_path):
         "type": "rectangle",
         "bsdf": {"type": "mask", "opacity": veil, "bsdf": {"type": "diffuse"}},
     }
-    with pytest.raises(ValueError, match=r"cannot be written as XML .*; give meshes by files"):
+    with pytest.raises(
+        ValueError, match=r"cannot be written as XML .*; give meshes and volumes by files"
+    ):
         eg.convert_scene(scene, tmp_path / "new", spp=0, **QUICK)
     assert not list(tmp_path.iterdir())
+
+
+def test_files_are_found_as_mitsuba_finds_them(folder, tmp_path):
+    """In the folders of <path>, beside the scene, and beside the file that a link names."""
+    parts = tmp_path / "scenes" / "parts"
+    parts.mkdir(parents=True)
+    for name in ("photo.png", "normals.png", "rough.png"):
+        shutil.copy(folder / name, parts)
+    shutil.copy(folder / "normals.png", tmp_path / "scenes" / "photo.png")  # the path goes first
+    text = wall(folder).read_text().replace("<integrator", '<path value="parts"/><integrator')
+    scene = tmp_path / "scenes" / "wall.xml"
+    scene.write_text(text)
+    before = list(mi.file_resolver())
+    found = eg.convert_scene(scene, tmp_path / "new", spp=1, target_psnr=20, iterations=1)
+    assert list(mi.file_resolver()) == before
+    [photo] = [t for t in found.textures if t.file == "photo.npz"]
+    seen = eg.render(eg.Gaussians.load(tmp_path / "new" / photo.file)).numpy().mean(axis=(0, 1))
+    expected = np.array(mi.Bitmap(str(folder / "photo.png")).convert(srgb_gamma=False))
+    assert seen == pytest.approx((expected / 255).mean(axis=(0, 1)), abs=0.1)
+    assert np.array(mi.render(mi.load_file(str(found.scene)), spp=1)).mean() > 0
+    link = tmp_path / "link.xml"
+    link.symlink_to(scene)
+    eg.convert_scene(link, tmp_path / "other", spp=0, target_psnr=20, iterations=1)
+
+
+def test_a_dictionary_with_resources_and_no_integrator(folder, tmp_path):
+    scene = plain(mi, folder, {"type": "bitmap", "filename": "photo.png"})
+    scene = {"parts": {"type": "resources", "path": str(folder)}, **scene}
+    del scene["integrator"]
+    found = eg.convert_scene(scene, tmp_path / "new", **QUICK)
+    assert len(found.textures) == 1 and min(found.psnr) > 25
+
+
+@pytest.mark.parametrize("name", ["wood.<UDIM>.png", "wood.%(UDIM)d.png"])
+def test_tiles_are_named(folder, tmp_path, name):
+    scene = plain(mi, folder, {"type": "bitmap", "filename": name})
+    with pytest.raises(ValueError, match="stands for UDIM tiles, and Mitsuba reads one image"):
+        eg.convert_scene(scene, tmp_path / "new")
+
+
+def sets_in_memory():
+    """Textures that a dictionary may hold: a set, one of one channel, and a model."""
+    model = {"type": "gaussian_texture", "model": str(SHIPPED["natural"])}
+    some = np.random.default_rng(1).normal(0, 2, (3, 230)).astype(np.float32)
+    turned = mi.Transform4f().rotate([0, 0, 1], 20)
+    return [
+        texture_of(gaussians("linear"), wrap_mode="mirror", to_uv=turned),
+        texture_of(gaussians("data", channels=1)),
+        {**model, "coefficients": mi.TensorXf(some)},
+        model,
+    ]
+
+
+@pytest.mark.parametrize("kind", range(4))
+def test_sets_that_are_there_already_stay(folder, tmp_path, kind):
+    """Beside bitmaps that become sets; the scene of the caller still works."""
+    scene = plain(mi, folder, sets_in_memory()[kind])
+    found = eg.convert_scene(scene, tmp_path / "new", spp=4)
+    assert found.textures == [] and found.psnr[0] > 80
+    moved = (tmp_path / "new").rename(tmp_path / "moved")
+    if "filename" in (moved / "scene.xml").read_text():
+        again = mi.render(mi.load_file(str(moved / "scene.xml")), spp=4)
+        assert np.isfinite(np.array(again)).all()
+    mi.load_dict(scene)
