@@ -226,6 +226,7 @@ def explained(path: Path) -> Iterator[None]:
 )
 @options.number("--iterations", "Steps of optimisation for each number of Gaussians.", 100, 0)
 @options.number("--spp", "Samples a pixel; 0 renders nothing.  [default: from the scene]", least=0)
+@click.option("--replace-all", is_flag=True, help="Also bitmaps that are smaller or faster.")
 @variant_option
 @definitions_option
 @options.shared("report", "quiet")
@@ -236,16 +237,18 @@ def convert(
     target_psnr: float,
     iterations: int,
     spp: int | None,
+    replace_all: bool,
     variant: str | None,
     definitions: dict[str, str],
 ) -> None:
-    """Replace every bitmap of a Mitsuba scene by as many Gaussians as its cameras resolve.
+    """Replace the bitmaps of a Mitsuba scene by as many Gaussians as its cameras resolve.
 
     FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
     after, and 8 times their difference. If a rendering misses the PSNR, the command says so and
-    exits with code 1. Environment maps, bump maps, images of two values such as masks, data beyond
-    0 and 1, and images that no camera sees stay as they are; the command says why. Other files stay
-    where they are, and the new scene names them relative to FOLDER.
+    exits with code 1. A bitmap that takes less memory than its Gaussians, or an eighth of their
+    time, stays; the command shows both. Environment maps, bump maps, images of two values such as
+    masks, data beyond 0 and 1, and images that no camera sees stay too; the command says why. Other
+    files stay where they are, and the new scene names them relative to FOLDER.
 
     \b
     Examples:
@@ -260,12 +263,13 @@ def convert(
     started = time.perf_counter()
     with explained(scene), bar(run.quiet) as show:
         found = convert_scene(
-            scene, output, target_psnr, iterations, spp, definitions, progress=show
+            scene, output, target_psnr, iterations, spp, definitions, replace_all, progress=show
         )
     before = sum(texture.bytes for texture in found.textures)
     after = sum(texture.gaussian_bytes for texture in found.textures)
     figures: dict[str, object] = {"output": found.scene, "bytes_before": before, "bytes": after}
     figures["textures"] = [texture._asdict() for texture in found.textures]
+    figures["better"] = [texture._asdict() for texture in found.better]
     figures["left"] = [{"name": name, "reason": reason} for name, reason in found.left]
     figures["psnr_rgb"] = found.psnr
     run.write_report(figures, mi.variant().partition("_")[0])
@@ -277,14 +281,18 @@ def convert(
 
 def _table(found: ConvertedScene, before: int, after: int) -> list[str]:
     """Lay out the textures, what stayed, and how close the renderings are."""
-    rows = [("texture", "texels", "bytes", "Gaussians", "bytes", "PSNR seen")]
-    for t in found.textures:
-        figures = f"{t.bytes:,}", f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.psnr:.1f} dB"
-        rows.append((t.names[0], f"{t.width}x{t.height}", *figures))
-        rows += [(name, "(the same set)", "", "", "", "") for name in t.names[1:]]
+    rows: list[Sequence[str]] = [
+        ("texture", "texels", "bytes", "ns", "Gaussians", "bytes", "ns", "PSNR seen")
+    ]
+    for t in [*found.textures, *found.better]:
+        bitmap = f"{t.width}x{t.height}", f"{t.bytes:,}", f"{t.lookup_ns:.1f}"
+        gaussians = f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.gaussian_lookup_ns:.1f}"
+        rows.append((t.names[0], *bitmap, *gaussians, f"{t.psnr:.1f} dB"))
+        rows += [(name, "(the same set)", *[""] * 6) for name in t.names[1:]]
     lines = table(rows)
     if before:
         lines.append(f"memory: {after:,} of {before:,} bytes ({after / before:.3f})")
+    lines += [f"stays, the bitmap is better: {name}" for t in found.better for name in t.names]
     lines += [f"left alone: {name}: {reason}" for name, reason in found.left]
     psnrs = enumerate(found.psnr, 1)
     lines += [f"camera {k}: psnr_rgb {psnr:.1f} dB between the renderings" for k, psnr in psnrs]

@@ -15,7 +15,7 @@ from ..backend.doors import door
 from ..backend.messages import warn
 from ..backend.progress import shows_progress
 from ..backend.types import PathLike, Record
-from ..gaussian.gaussians import FIELDS, Gaussians
+from ..gaussian.gaussians import FIELDS
 from ..image.io import ImageError
 from ..plugins.properties import source_of, to_uv
 from ..plugins.versions import Properties
@@ -34,7 +34,8 @@ from .bitmaps import (
     space_of,
     uses_of,
 )
-from .fit_scene import SceneFit, fit_for_scene
+from .costs import costs_of
+from .fit_scene import fit_for_scene
 from .rendering import Progress, compare_renderings
 
 SCENE = "scene.xml"
@@ -44,20 +45,24 @@ NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directl
 
 
 class ConvertedTexture(NamedTuple):
-    """A bitmap that became Gaussians.
+    """An image, as bitmaps and as Gaussians.
 
     Attributes
     ----------
     names : tuple of str
         Its uses: the file, and in brackets what uses it.
     file : str
-        The new file, relative to the folder.
+        The new file, relative to the folder; "" if the bitmap stayed.
     width, height, channels : int
     bytes : int
-        Memory of the bitmap with 8 bits a value.
+        Memory of its bitmaps in the scene, see `eigengs_dr.plugins.resident_bytes`.
+    lookup_ns : float
+        Time of a lookup in the bitmap, in nanoseconds, on all cores of this machine.
     gaussians : int
     gaussian_bytes : int
-        Memory of means, shapes and colours in single precision.
+        Memory of the textures of Gaussians in the scene. Those of one wrap mode share it.
+    gaussian_lookup_ns : float
+        Time of a lookup in the Gaussians.
     psnr : float
         Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`.
     """
@@ -68,8 +73,10 @@ class ConvertedTexture(NamedTuple):
     height: int
     channels: int
     bytes: int
+    lookup_ns: float
     gaussians: int
     gaussian_bytes: int
+    gaussian_lookup_ns: float
     psnr: float
 
 
@@ -82,14 +89,18 @@ class ConvertedScene(NamedTuple):
         The new XML file. Beside it are the sets of Gaussians, and for each camera the pictures
         before-1.png, after-1.png and difference-1.png, 8 times louder.
     textures : list of ConvertedTexture
+        Bitmaps that became Gaussians.
+    better : list of ConvertedTexture
+        Bitmaps that stayed, since they take less memory or time than Gaussians.
     left : list of (str, str)
-        What stayed as it was, and why.
+        What else stayed as it was, and why.
     psnr : list of float
         psnr_rgb in dB between the renderings of each camera; both have the same random numbers.
     """
 
     scene: Path
     textures: list[ConvertedTexture]
+    better: list[ConvertedTexture]
     left: list[tuple[str, str]]
     psnr: list[float]
 
@@ -103,13 +114,15 @@ def convert_scene(
     iterations: int = 100,
     spp: int | None = None,
     parameters: Mapping[str, str] | None = None,
+    replace_all: bool = False,
     progress: Any = None,
 ) -> ConvertedScene:
-    """Replace every bitmap of a scene by as many Gaussians as its cameras resolve.
+    """Replace the bitmaps of a scene by as many Gaussians as its cameras resolve.
 
-    Uses of one image share a set. The function leaves alone what Gaussians would spoil or cannot
-    replace: environment maps, bump maps, images of two values such as masks, data beyond 0 and 1,
-    images of no shape or that no camera sees, and those that would take more Gaussians than texels.
+    Uses of one image share a set. A bitmap that takes less memory than its Gaussians, or an eighth
+    of their time, is better and stays. The function leaves alone what Gaussians would spoil or
+    cannot replace: environment maps, bump maps, images of two values such as masks, data beyond 0
+    and 1, and images of no shape or that no camera sees.
 
     Parameters
     ----------
@@ -125,6 +138,8 @@ def convert_scene(
         Samples per pixel of the renderings, by default those of the scene; 0 renders nothing.
     parameters : mapping of str to str, optional
         Values for the defaults of an XML file.
+    replace_all : bool, optional
+        Whether better bitmaps are replaced too: Gaussians are differentiable, and have no texels.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(label, done, total)``.
@@ -162,19 +177,28 @@ def convert_scene(
     refuse_url(output)
     target = Path(os.path.realpath(output))  # of a link, the folder that it names
     _check_empty(output, target)
+    settings = Settings(target_psnr, iterations, spp, replace_all)
     with lock_output(output):
         remove_stale(target.parent)
         with atomic_folder(output) as work:
-            textures, left, seen = _convert_into(
-                work, target, scene, parameters, target_psnr, iterations, spp, progress or _silent
-            )
-    for camera, decibels in enumerate(seen, 1):
+            twice = parse(scene, parameters), parse(scene, parameters)
+            result = _convert_into(work, target, twice, settings, progress or _silent)
+    for camera, decibels in enumerate(result.psnr, 1):
         if decibels < target_psnr:
             warn(
                 f"{output}: camera {camera} sees psnr_rgb {decibels:.1f} dB between the "
                 f"renderings, below the goal of {target_psnr:g}; look at difference-{camera}.png"
             )
-    return ConvertedScene(Path(output) / SCENE, textures, left, seen)
+    return result._replace(scene=Path(output) / SCENE)
+
+
+class Settings(NamedTuple):
+    """Arguments of `convert_scene`."""
+
+    target_psnr: float
+    iterations: int
+    spp: int | None
+    replace_all: bool
 
 
 def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
@@ -190,25 +214,19 @@ def _silent(label: str, done: int, total: int) -> None:
 def _convert_into(
     work: Path,
     target: Path,
-    scene: PathLike | Record,
-    parameters: Mapping[str, str] | None,
-    target_psnr: float,
-    iterations: int,
-    spp: int | None,
+    scenes: tuple[Parsed, Parsed],
+    settings: Settings,
     progress: Progress,
-) -> tuple[list[ConvertedTexture], list[tuple[str, str]], list[float]]:
+) -> ConvertedScene:
     """Write a scene and its files into a folder that becomes the target.
 
-    Returns
-    -------
-    textures, left, psnr
-        See `ConvertedScene`.
+    Of two equal `scenes` the first one is instantiated, and the second one written.
     """
-    parsed, again = parse(scene, parameters), parse(scene, parameters)
+    parsed, again = scenes
     uses, left = uses_of(parsed)
+    result = ConvertedScene(work / SCENE, [], [], left, [])
     before = mi.parser.instantiate(parsed.config, parsed.state)
     made = dict[int, str]()
-    textures = list[ConvertedTexture]()
     groups: dict[tuple[str, bool], list[Use]] = {}
     on_shapes = [mi.traverse(shape).hierarchy for shape in before.shapes()]
     for use in uses:
@@ -218,76 +236,84 @@ def _convert_into(
             left.append((use.name, NO_SHAPE))
     for number, group in enumerate(groups.values()):
         progress("textures", number, len(groups))
-        file = _file_name(group[0], {texture.file for texture in textures})
+        file = work / _file_name(group[0], {texture.file for texture in result.textures})
         pixels = read_pixels(again.state.nodes[group[0].node].props)
-        found = _convert(before, parsed, group, pixels, target_psnr, iterations)
+        found = _convert(before, parsed, group, pixels, file, settings)
         if isinstance(found, str):
             left += [(use.name, found) for use in group]
-            continue
-        found.gaussians.save(work / file)
-        made |= {use.node: file for use in group}
-        textures.append(_describe(group, file, found))
+        elif not found.file:
+            result.better.append(found)
+        else:
+            result.textures.append(found)
+            made |= {use.node: found.file for use in group}
     progress("textures", len(groups), len(groups))
     _rewrite(again, made, work, target)
-    (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
-    seen = list[float]()
-    if spp != 0:
-        after = mi.load_file(str(work / SCENE))
-        seen = compare_renderings(before, after, work, spp, progress)
-    return textures, left, seen
+    result.scene.write_text(_to_xml(again), encoding="utf-8")
+    if settings.spp != 0:
+        after = mi.load_file(str(result.scene))
+        result.psnr.extend(compare_renderings(before, after, work, settings.spp, progress))
+    return result
 
 
 # --- The textures --------------------------------------------------------------------------------
 
 
 def _convert(
-    scene: PathLike | Record,
+    scene: mi.Scene,
     parsed: Parsed,
     group: list[Use],
     pixels: NDArray[np.float32],
-    psnr: float,
-    iterations: int,
-) -> SceneFit | str:
-    """Fit the image of some uses, or return why it must stay."""
+    file: Path,
+    settings: Settings,
+) -> ConvertedTexture | str:
+    """Fit the image of some uses and save the set, or return why it must stay.
+
+    Where the bitmap is better, there is no file.
+    """
     nodes, use = parsed.state.nodes, group[0]
     # Raw colours are colours all the same; pixels in memory are raw as a rule.
     is_data = pixels.shape[2] == 1 or nodes[use.parent].props.plugin_name() == "normalmap"
+    bitmaps = [_texture(parsed, use) for use in group]
     try:
         space = space_of(pixels, use.raw and is_data)
         found = fit_for_scene(
             scene,
-            [_texture(parsed, use) for use in group],
+            bitmaps,
             pixels,
-            psnr,
+            settings.target_psnr,
             space,
-            iterations=iterations,
+            iterations=settings.iterations,
             wrap_mode=[use.wrap for use in group],
             encoding="linear",
         )
     except (Unsuitable, ImageError) as error:
         return str(error)
-    if _memory(found.gaussians) >= pixels.size:
-        return f"{len(found.gaussians):,} Gaussians take more memory than its texels"
-    return found
+    g = found.gaussians
+    g.save(file)
+    saved, wraps = {"type": GAUSSIANS, "filename": str(file)}, {use.wrap for use in group}
+    sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted(wraps)]
+    bitmap, gaussians = costs_of((bitmaps, sets), use.raw, g.channels)
+    stays = bitmap.is_better_than(gaussians) and not settings.replace_all
+    if stays:
+        file.unlink()
+    return ConvertedTexture(
+        names=tuple(use.name for use in group),
+        file="" if stays else file.name,
+        width=g.width,
+        height=g.height,
+        channels=g.channels,
+        bytes=bitmap.bytes,
+        lookup_ns=bitmap.nanoseconds,
+        gaussians=len(g),
+        gaussian_bytes=gaussians.bytes,
+        gaussian_lookup_ns=gaussians.nanoseconds,
+        psnr=min(found.psnr),
+    )
 
 
 def _texture(parsed: Parsed, use: Use) -> mi.Texture:
     """Return the texture of a scene that was made from what was parsed."""
     return parsed.state.nodes[use.parent].props[use.slot]
-
-
-def _memory(gaussians: Gaussians) -> int:
-    """Return the bytes of means, shapes and colours in single precision."""
-    channels = gaussians.channels
-    return 4 * (len(gaussians) * (5 + channels) + channels)
-
-
-def _describe(group: list[Use], file: str, found: SceneFit) -> ConvertedTexture:
-    g = found.gaussians
-    names = tuple(use.name for use in group)
-    size = g.width, g.height, g.channels
-    memory = g.width * g.height * g.channels, len(g), _memory(g)
-    return ConvertedTexture(names, file, *size, *memory, min(found.psnr))
 
 
 def _file_name(use: Use, taken: set[str]) -> str:

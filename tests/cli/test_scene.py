@@ -250,13 +250,19 @@ def test_without_mitsuba(scene, tmp_path):
 
 def test_convert(tmp_path):
     scene = sky(save_images(tmp_path))
-    settings = ("--psnr", 25, "--iterations", 5, "-D", "spp=2", *LLVM)
-    told = said("convert", scene, "-o", tmp_path / "new", *settings, "--report", tmp_path / "r")
+    settings = ("--psnr", 25, "--iterations", 5, "-D", "spp=2", *LLVM, "--report", tmp_path / "r")
+    told = said("convert", scene, "-o", tmp_path / "new", "--replace-all", *settings)
     for words in ("32x32", "(the same set)", "memory: ", "left alone: leaf.png", "camera 1: "):
         assert words in told
     report = json.loads((tmp_path / "r").read_text())
-    assert report["bytes"] < report["bytes_before"] and len(report["left"]) == 5
+    [texture] = report["textures"]
+    assert report["bytes"] == texture["gaussian_bytes"] > report["bytes_before"] == 2 * 32 * 32 * 3
+    assert report["better"] == [] and len(report["left"]) == 5
     assert (tmp_path / "new" / "scene.xml").exists()
+    told = said("convert", scene, "-o", tmp_path / "other", *settings)
+    assert "stays, the bitmap is better: photo.png (diffuse.reflectance)" in told
+    [better] = json.loads((tmp_path / "r").read_text())["better"]
+    assert better["gaussian_bytes"] == texture["gaussian_bytes"] and better["file"] == ""
     assert_refused(run("convert", scene, "-o", tmp_path / "new"), "exists and is not empty")
 
 

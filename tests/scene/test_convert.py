@@ -13,11 +13,12 @@ from _helpers.texture import gaussians
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.io import load_image
 from eigengs_dr.plugins import texture_of
+from eigengs_dr.scene import costs
 from eigengs_dr.storage.locks import lock_output
 
 pytestmark = pytest.mark.mitsuba
 
-QUICK = {"target_psnr": 30, "iterations": 20}
+QUICK = {"target_psnr": 30, "iterations": 20, "replace_all": True}
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
         "rough.npz": ("rough.png (principled.roughness)",),
     }
     for texture in found.textures:
-        assert texture.psnr >= 30 and texture.gaussian_bytes < texture.bytes
+        assert texture.psnr >= 30 and texture.lookup_ns > 0 and texture.gaussian_lookup_ns > 0
         saved = eg.Gaussians.load(tmp_path / "new" / texture.file)
         assert len(saved) == texture.gaussians
         assert saved.space == ("linear" if texture.file == "photo.npz" else "data")
@@ -52,6 +53,52 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
     assert pictures == {f"{k}-{n}.png" for k in ("before", "after", "difference") for n in (1, 2)}
     before, after = (load_image(tmp_path / "new" / f"{k}-1.png") for k in ("before", "after"))
     assert eg.psnr(before, after) == pytest.approx(found.psnr[0], abs=0.1)
+
+
+def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
+    """A small photo takes less memory than its Gaussians, a large gradient takes more."""
+    monkeypatch.setattr(costs, "SLOWEST", np.inf)  # a busy machine times anything
+    y, x = np.mgrid[:512, :512] / 512
+    eg.save_image(folder / "soft.png", np.stack([0.2 + 0.5 * x, y * x, 0.5 + 0 * x], axis=2))
+    text = wall(folder).read_text()
+    scene = folder / "mixed.xml"
+    scene.write_text(text.replace("photo.png", "soft.png", 1))
+    settings = {**QUICK, "replace_all": False}
+    found = eg.convert_scene(scene, tmp_path / "new", **settings)
+    by_name = {t.names[0]: t for t in found.textures}
+    assert by_name["soft.png (paint.reflectance)"].bytes == 512 * 512 * 3
+    assert all(t.gaussian_bytes < t.bytes for t in found.textures)
+    assert "photo.png (principled.base_color)" in {t.names[0] for t in found.better}
+    assert found.left == []
+    for texture in found.better:
+        assert texture.file == "" and texture.gaussian_bytes >= texture.bytes
+        assert texture.psnr >= 30 and texture.gaussians > 0
+    files = {path.name for path in (tmp_path / "new").glob("*.npz")}
+    assert files == {t.file for t in found.textures}
+    assert bitmaps_in(found.scene) == len(found.better)
+
+
+def test_which_bitmap_is_better():
+    """One that takes as little memory, or an eighth of the time."""
+    small, large = costs.Cost(100, 10.0), costs.Cost(200, 10.0)
+    assert small.is_better_than(large) and small.is_better_than(small)
+    assert not large.is_better_than(small._replace(nanoseconds=79.0))
+    assert large.is_better_than(small._replace(nanoseconds=81.0))
+
+
+@pytest.mark.parametrize("kind", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_costs_of_data_and_colours_in_other_variants(folder, kind):
+    mi.set_variant(kind)
+    eg.register_plugins()
+    for file, raw, channels, space in (
+        ("photo.png", False, 3, "linear"),
+        ("rough.png", True, 1, "data"),
+        ("normals.png", True, 3, "data"),
+    ):
+        bitmap = mi.load_dict({"type": "bitmap", "filename": str(folder / file), "raw": raw})
+        set_of = mi.load_dict(texture_of(gaussians(space, channels)))
+        for cost in costs.costs_of([[bitmap], [set_of, set_of]], raw, channels):
+            assert cost.bytes > 0 and 0 < cost.nanoseconds < 1e9
 
 
 def test_what_stays_and_why(folder, tmp_path):
@@ -169,7 +216,7 @@ def test_pixels_in_memory(folder, tmp_path, kind):
     photo = {"type": "bitmap", "raw": True, "wrap_mode": "clamp", **given}
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.8, np.float32))}
     scene = plain(mi, folder, photo, lamp=sky)
-    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=30, iterations=20)
+    found = eg.convert_scene(scene, tmp_path / "new", **QUICK)
     [texture] = found.textures
     assert texture.names == ("a bitmap in memory (bsdf.reflectance)",)
     assert eg.Gaussians.load(tmp_path / "new" / texture.file).space == "linear"
@@ -188,7 +235,7 @@ def test_a_lamp_above_1_also_lights_by_what_is_hidden(folder, tmp_path):
     lamp = {"type": "rectangle", "emitter": {"type": "area", "radiance": picture}}
     board = {"type": "rectangle", "to_world": at.translate([1, 0, 0.5])}
     scene = plain(mi, folder, {"type": "rgb", "value": 0.5}, lamp=lamp, cube=board)
-    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=32, iterations=20, spp=256)
+    found = eg.convert_scene(scene, tmp_path / "new", spp=256, **QUICK)
     [texture] = found.textures
     assert found.left == [] and min(found.psnr) > 30
     saved = eg.Gaussians.load(tmp_path / "new" / texture.file)
@@ -210,7 +257,7 @@ def test_a_soft_mask_and_what_shows_through_it(folder, tmp_path):
         "bsdf": {"type": "mask", "opacity": veil, "bsdf": grey},
     }
     scene = plain(mi, folder, photo, curtain=curtain)
-    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=32, iterations=20)
+    found = eg.convert_scene(scene, tmp_path / "new", **QUICK)
     assert found.left == []
     assert {t.file for t in found.textures} == {"photo.npz", "veil.npz"}
     assert min(found.psnr) > 31
