@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -157,6 +157,19 @@ NEIGHBOURS = 1.5
 """Texels added to this radius, because bilinear lookups read neighbours, also diagonal ones."""
 
 
+class Box(NamedTuple):
+    """A part of an image, in texels."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def of(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Return the part of an image, shape (H, W, ...)."""
+        return image[self.top : self.top + self.height, self.left : self.left + self.width]
+
+
 class Visibility(NamedTuple):
     """What cameras see of a texture.
 
@@ -193,6 +206,7 @@ def visibility(
     width: int,
     height: int,
     wrap_mode: str | Sequence[str] = "repeat",
+    part: Box | None = None,
 ) -> Visibility:
     """Measure what the cameras of a scene resolve of a texture.
 
@@ -208,6 +222,8 @@ def visibility(
         Size in texels: that of the image for the texture.
     wrap_mode : {"repeat", "mirror", "clamp"}, or a sequence of them, optional
         Wrap mode of each bitmap, which Mitsuba does not tell; a ``gaussian_texture`` uses its own.
+    part : Box, optional
+        The part of the image that is measured, by default all of it. Nothing else may be seen.
 
     Returns
     -------
@@ -231,21 +247,23 @@ def visibility(
         uses.append((shapes, mi.Transform3f(scaled), getattr(node, "wrap", mode)))
         emitters = (shape.emitter() for shape in shapes)
         is_lamp |= any(e is not None and node in mi.traverse(e).hierarchy for e in emitters)
+    size, part = (width, height), part or Box(0, 0, width, height)
     lookups = [_blocks(width, height)] if is_lamp else []
     coarsest = PIXEL * max(width, height) / LAMP_BLOCKS if is_lamp else np.inf
-    footprint = np.full(height * width, coarsest, np.float32)
+    footprint = np.full(part.height * part.width, coarsest, np.float32)
     for sensor, (shapes, to_texels, wrap) in product(scene.sensors(), uses):
-        hits = trace_samples(View(scene, sensor, shapes, to_texels, wrap, (width, height)))
+        hits = trace_samples(View(scene, sensor, shapes, to_texels, wrap, size))
         if hits is None:
             continue
-        np.minimum(footprint, _min_footprint(hits, width, height), out=footprint)
-        lookups.append(_rows(hits, width, height))
+        hits = hits._replace(x=hits.x - part.left, y=hits.y - part.top)
+        np.minimum(footprint, _min_footprint(hits, part.width, part.height), out=footprint)
+        lookups.append(_rows(hits, part.width, part.height))
     if not lookups:
         raise Unsuitable(
             f"no pixel of the scene's {len(scene.sensors())} cameras sees {_name(texture)}; check "
             "where the cameras look, and what hides the texture"
         )
-    return Visibility(footprint.reshape(height, width), lookups)
+    return Visibility(footprint.reshape(part.height, part.width), lookups)
 
 
 # --- The texture in its scene --------------------------------------------------------------------
