@@ -65,7 +65,8 @@ def gaussian_texture() -> type:
         factor : tensor (N, 3)
             a, b, c in 1 / pixels.
         color : tensor (N, C)
-            C is 1 or 3, in the space of the set.
+            In the space of the set. C is 1 or 3; or 2 in the space ``data``: codes of x and y of
+            normals, whose z follows from the length 1.
         background : tensor (C,)
             Value without Gaussians; `texture_of` writes it as (1, C).
         width, height : integer
@@ -194,15 +195,19 @@ def gaussian_texture() -> type:
 
         @collector_off()
         def eval_3(self, si: Interaction, active: Mask = True) -> mi.Color3f:
-            if self.channels != 3:
+            if self.channels == 1:
                 raise ValueError(
                     f"{_name(self)}: a lookup of three channels, such as a normal map, needs a set "
-                    "of three channels; this set has one"
+                    "of two or three channels; this set has one"
                 )
             return mi.Color3f(*self._color(si, active))
 
         @collector_off()
         def eval_1_grad(self, si: Interaction, active: Mask = True) -> mi.Vector2f:
+            if self.channels == 2:
+                raise ValueError(
+                    f"{_name(self)}: a bump map needs heights; this set has x and y of normals"
+                )
             (x, sx), (y, sy), inside = self.point(si.uv)
             packed = replace(self.table.packed, arranged=None)  # the copies have no gradients
             cells, terms = self.table.lists.cells, gradient_terms(packed.radius)

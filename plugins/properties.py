@@ -40,8 +40,8 @@ def source_of(props: Properties) -> TextureParameters:
     Raises
     ------
     ValueError
-        If none or several of these properties are given, a file has other content, or a set does
-        not have one or three channels.
+        If none or several of these properties are given, a file has other content, or a set
+        has more than three channels.
     """
     given = [key for key in ("filename", "model", "mean") if key in props]
     if len(given) != 1:
@@ -66,9 +66,9 @@ def source_of(props: Properties) -> TextureParameters:
     else:
         gaussians = _from_arrays(props, backend)
         source = TextureParameters(gaussians, to_tensors(gaussians))
-    if source.start.channels not in (1, 3):
+    if source.start.channels > 3:
         raise ValueError(
-            f"gaussian_texture: the set has {source.start.channels} channels; use a set of 1 or 3"
+            f"gaussian_texture: the set has {source.start.channels} channels; use a set of 1 to 3"
         )
     return source
 
