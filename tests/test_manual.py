@@ -133,7 +133,8 @@ RUN_AS_A_WHOLE = ("how-to/own-loop.md", "getting-started.md")  # above
 
 
 def is_mitsuba(page):
-    return "mi." in page.read_text() or bool(TEXTURE.search(page.read_text()))
+    text = page.read_text()
+    return "mi." in text or "eg.convert_scene" in text or bool(TEXTURE.search(text))
 
 
 def cases():
