@@ -250,7 +250,7 @@ def test_without_mitsuba(scene, tmp_path):
 
 def test_convert(tmp_path):
     scene = sky(save_images(tmp_path))
-    settings = ("--psnr", 25, "--iterations", 5, "-D", "spp=2", *LLVM, "--report", tmp_path / "r")
+    settings = ("--psnr", 34, "--iterations", 5, "-D", "spp=2", *LLVM, "--report", tmp_path / "r")
     told = said("convert", scene, "-o", tmp_path / "new", "--replace-all", *settings)
     for words in ("32x32", "(the same set)", "memory: ", "left alone: leaf.png", "camera 1: "):
         assert words in told

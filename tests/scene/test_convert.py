@@ -63,7 +63,7 @@ def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     text = wall(folder).read_text()
     scene = folder / "mixed.xml"
     scene.write_text(text.replace("photo.png", "soft.png", 1))
-    settings = {**QUICK, "replace_all": False}
+    settings = {"target_psnr": 34, "iterations": 20}
     found = eg.convert_scene(scene, tmp_path / "new", **settings)
     by_name = {t.names[0]: t for t in found.textures}
     assert by_name["soft.png (paint.reflectance)"].bytes == 512 * 512 * 3
@@ -72,7 +72,7 @@ def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     assert found.left == []
     for texture in found.better:
         assert texture.file == "" and texture.gaussian_bytes >= texture.bytes
-        assert texture.psnr >= 30 and texture.gaussians > 0
+        assert texture.psnr >= 34 and texture.gaussians > 0
     files = {path.name for path in (tmp_path / "new").glob("*.npz")}
     assert files == {t.file for t in found.textures}
     assert bitmaps_in(found.scene) == len(found.better)
@@ -289,7 +289,7 @@ def test_files_are_found_as_mitsuba_finds_them(folder, tmp_path):
     scene = tmp_path / "scenes" / "wall.xml"
     scene.write_text(text)
     before = list(mi.file_resolver())
-    found = eg.convert_scene(scene, tmp_path / "new", spp=1, target_psnr=20, iterations=1)
+    found = eg.convert_scene(scene, tmp_path / "new", spp=1, **QUICK)
     assert list(mi.file_resolver()) == before
     [photo] = [t for t in found.textures if t.file == "photo.npz"]
     seen = eg.render(eg.Gaussians.load(tmp_path / "new" / photo.file)).numpy().mean(axis=(0, 1))
