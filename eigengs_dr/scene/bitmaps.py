@@ -51,6 +51,8 @@ class Use(NamedTuple):
         Whether the values are data.
     wrap : str
         Wrap mode.
+    is_height : bool
+        Whether a bump map uses it.
     name : str
         How a report calls it.
     """
@@ -61,6 +63,7 @@ class Use(NamedTuple):
     file: str
     raw: bool
     wrap: str
+    is_height: bool
     name: str
 
 
@@ -168,12 +171,13 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
         above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
         parent, slot = above[0] if above else (0, "")
         name = _label(props, nodes[parent].props, slot)
-        if reason := _reason(props, [(nodes[p].props.plugin_name(), s) for p, s in above]):
+        parents_of = [nodes[p].props.plugin_name() for p, _ in above]
+        if reason := _reason(props, parents_of):
             left.append((name, reason))
             continue
         file = os.path.realpath(props["filename"]) if "filename" in props else f"{slot}-{index}"
         raw, wrap = bool(props.get("raw", False)), str(props.get("wrap_mode", "repeat"))
-        uses.append(Use(index, parent, slot, file, raw, wrap, name))
+        uses.append(Use(index, parent, slot, file, raw, wrap, "bumpmap" in parents_of, name))
     return uses, left
 
 
@@ -190,12 +194,12 @@ def _label(props: Properties, parent: Properties | None, slot: str) -> str:
     return f"{file} ({parent.id() or parent.plugin_name()}.{slot})"
 
 
-def _reason(props: Properties, slots: list[tuple[str, str]]) -> str:
-    """Say why a bitmap stays a bitmap by its properties, or nothing."""
-    if not slots:
+def _reason(props: Properties, parents: list[str]) -> str:
+    """Say why a bitmap stays a bitmap by its properties and the plugins that use it, or nothing."""
+    if not parents:
         return "nothing uses it"
-    if any(plugin == "bumpmap" for plugin, _ in slots):
-        return "heights of a bump map: cameras see their slopes, and a PSNR of heights says little"
+    if "bumpmap" in parents and len(set(parents)) > 1:
+        return "heights of a bump map that are something else too"
     if str(props.get("filter_type", "bilinear")) != "bilinear":
         return "its filter shows single texels"
     return ""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,6 @@ from ..storage.atomic import atomic_folder, refuse_url, remove_stale
 from ..storage.locks import lock_output
 from .bitmaps import (
     GAUSSIANS,
-    KEPT,
     Parsed,
     Unsuitable,
     Use,
@@ -31,12 +31,11 @@ from .bitmaps import (
     is_bitmap,
     parse,
     read_pixels,
-    space_of,
     uses_of,
 )
 from .costs import costs_of
-from .fit_scene import fit_for_scene
-from .rendering import Progress, compare_renderings
+from .fit_uses import Original, fit_heights, fit_picture, replace_bitmap
+from .rendering import Progress, compare, pictures
 
 SCENE = "scene.xml"
 """Name of the new scene in its folder."""
@@ -64,7 +63,8 @@ class ConvertedTexture(NamedTuple):
     gaussian_lookup_ns : float
         Time of a lookup in the Gaussians.
     psnr : float
-        Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`.
+        Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`; of a bump
+        map, lowest PSNR between the renderings with and without this set alone.
     """
 
     names: tuple[str, ...]
@@ -121,8 +121,9 @@ def convert_scene(
 
     Uses of one image share a set. A bitmap that takes less memory than its Gaussians, or an eighth
     of their time, is better and stays. The function leaves alone what Gaussians would spoil or
-    cannot replace: environment maps, bump maps, images of two values such as masks, data beyond 0
-    and 1, and images of no shape or that no camera sees.
+    cannot replace: environment maps, bump maps with which the renderings would miss the PSNR,
+    images of two values such as masks, data beyond 0 and 1, and images of no shape or that no
+    camera sees.
 
     Parameters
     ----------
@@ -181,8 +182,8 @@ def convert_scene(
     with lock_output(output):
         remove_stale(target.parent)
         with atomic_folder(output) as work:
-            twice = parse(scene, parameters), parse(scene, parameters)
-            result = _convert_into(work, target, twice, settings, progress or _silent)
+            make = partial(parse, scene, parameters)
+            result = _convert_into(work, target, make, settings, progress or _silent)
     for camera, decibels in enumerate(result.psnr, 1):
         if decibels < target_psnr:
             warn(
@@ -214,31 +215,28 @@ def _silent(label: str, done: int, total: int) -> None:
 def _convert_into(
     work: Path,
     target: Path,
-    scenes: tuple[Parsed, Parsed],
+    make: Callable[[], Parsed],
     settings: Settings,
     progress: Progress,
 ) -> ConvertedScene:
-    """Write a scene and its files into a folder that becomes the target.
-
-    Of two equal `scenes` the first one is instantiated, and the second one written.
-    """
-    parsed, again = scenes
-    uses, left = uses_of(parsed)
+    """Write a scene and its files into a folder that becomes the target; `make` parses it."""
+    again = make()
+    uses, left = uses_of(again)
+    original = Original(make, settings.spp)
     result = ConvertedScene(work / SCENE, [], [], left, [])
-    before = mi.parser.instantiate(parsed.config, parsed.state)
     made = dict[int, str]()
-    groups: dict[tuple[str, bool], list[Use]] = {}
-    on_shapes = [mi.traverse(shape).hierarchy for shape in before.shapes()]
+    groups: dict[tuple[str, bool, bool], list[Use]] = {}
+    on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
-        if any(_texture(parsed, use) in found for found in on_shapes):
-            groups.setdefault((use.file, use.raw), []).append(use)
+        if any(original.textures([use])[0] in found for found in on_shapes):
+            groups.setdefault((use.file, use.raw, use.is_height), []).append(use)
         else:
             left.append((use.name, NO_SHAPE))
     for number, group in enumerate(groups.values()):
         progress("textures", number, len(groups))
         file = work / _file_name(group[0], {texture.file for texture in result.textures})
         pixels = read_pixels(again.state.nodes[group[0].node].props)
-        found = _convert(before, parsed, group, pixels, file, settings)
+        found = _convert(original, group, pixels, file, settings)
         if isinstance(found, str):
             left += [(use.name, found) for use in group]
         elif not found.file:
@@ -250,8 +248,11 @@ def _convert_into(
     _rewrite(again, made, work, target)
     result.scene.write_text(_to_xml(again), encoding="utf-8")
     if settings.spp != 0:
-        after = mi.load_file(str(result.scene))
-        result.psnr.extend(compare_renderings(before, after, work, settings.spp, progress))
+        progress("renderings", 0, 2)
+        after = pictures(mi.load_file(str(result.scene)), settings.spp)
+        progress("renderings", 1, 2)
+        result.psnr.extend(compare(original.pictures, after, work))
+        progress("renderings", 2, 2)
     return result
 
 
@@ -259,8 +260,7 @@ def _convert_into(
 
 
 def _convert(
-    scene: mi.Scene,
-    parsed: Parsed,
+    original: Original,
     group: list[Use],
     pixels: NDArray[np.float32],
     file: Path,
@@ -270,29 +270,19 @@ def _convert(
 
     Where the bitmap is better, there is no file.
     """
-    nodes, use = parsed.state.nodes, group[0]
-    # Raw colours are colours all the same; pixels in memory are raw as a rule.
-    is_data = pixels.shape[2] == 1 or nodes[use.parent].props.plugin_name() == "normalmap"
-    bitmaps = [_texture(parsed, use) for use in group]
+    use, asked = group[0], (settings.target_psnr, settings.iterations)
     try:
-        space = space_of(pixels, use.raw and is_data)
-        found = fit_for_scene(
-            scene,
-            bitmaps,
-            pixels,
-            settings.target_psnr,
-            space,
-            iterations=settings.iterations,
-            wrap_mode=[use.wrap for use in group],
-            encoding="linear",
-        )
+        if use.is_height:
+            g, seen = fit_heights(original, group, pixels, *asked, file)
+        else:
+            g, seen = fit_picture(original, group, pixels, *asked)
+            g.save(file)
     except (Unsuitable, ImageError) as error:
         return str(error)
-    g = found.gaussians
-    g.save(file)
     saved, wraps = {"type": GAUSSIANS, "filename": str(file)}, {use.wrap for use in group}
     sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted(wraps)]
-    bitmap, gaussians = costs_of((bitmaps, sets), use.raw, g.channels)
+    bitmaps = original.textures(group)
+    bitmap, gaussians = costs_of((bitmaps, sets), use.raw or use.is_height, g.channels)
     stays = bitmap.is_better_than(gaussians) and not settings.replace_all
     if stays:
         file.unlink()
@@ -307,13 +297,8 @@ def _convert(
         gaussians=len(g),
         gaussian_bytes=gaussians.bytes,
         gaussian_lookup_ns=gaussians.nanoseconds,
-        psnr=min(found.psnr),
+        psnr=seen,
     )
-
-
-def _texture(parsed: Parsed, use: Use) -> mi.Texture:
-    """Return the texture of a scene that was made from what was parsed."""
-    return parsed.state.nodes[use.parent].props[use.slot]
 
 
 def _file_name(use: Use, taken: set[str]) -> str:
@@ -335,11 +320,7 @@ def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> 
     for index, node in enumerate(parsed.state.nodes):
         props = node.props
         if index in made:
-            for key in list(props.keys()):
-                if key not in KEPT:
-                    del props[key]
-            props.set_plugin_name(GAUSSIANS)
-            props["filename"] = made[index]
+            replace_bitmap(props, made[index])
             continue
         if props.plugin_name() == GAUSSIANS and "to_uv" in props:
             props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML lacks

@@ -164,7 +164,7 @@ def fit_for_scene(
         fine_width, fine_height = FINER * width, FINER * height
         box = Box(*(FINER * side for side in box))
     else:
-        values = _shrunk(values, 2 ** int(np.log2(texels / ENOUGH)))
+        values = halved(values, found)
         fine_height, fine_width = values.shape[:2]
         box = Box(0, 0, fine_width, fine_height)
     fine = found
@@ -219,6 +219,12 @@ def _objective(
     shown = to_coded(target) if space == "linear" else target
     types = types_in(select(backend_of(mi.variant())))
     return Pixels.of(Data(target, shown, weight), space, types)
+
+
+def halved(values: Image, found: Visibility) -> Image:
+    """Halve an image while pixels are at least `ENOUGH` texels large."""
+    texels = max(float(found.footprint.min() / PIXEL), ENOUGH)
+    return _shrunk(values, 2 ** int(np.log2(texels / ENOUGH)))
 
 
 def _shrunk(values: Image, times: int) -> Image:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -117,41 +117,48 @@ LOUDER = 8.0
 """Factor of the differences in their pictures."""
 
 
-def compare_renderings(
-    before: mi.Scene, after: mi.Scene, folder: Path, spp: int | None, progress: Progress
+def compare(
+    before: Sequence[NDArray[np.float32]], after: Sequence[NDArray[np.float32]], folder: Path
 ) -> list[float]:
-    """Render two scenes by each camera, with the same random numbers, and write the pictures.
+    """Compare the pictures of each camera, from `pictures`, and write them.
 
     Parameters
     ----------
-    before, after : mitsuba.Scene
-        With the same cameras; without an integrator, "path" renders them.
+    before, after : sequence of ndarray of float32, shape (H, W, 3) or (H, W, 1)
     folder : Path
         Gets before-1.png, after-1.png and difference-1.png, 8 times louder, and so on.
-    spp : int or None
-        Samples per pixel, by default those of the camera.
-    progress : callable
-        ``progress(label, done, total)``.
 
     Returns
     -------
     list of float
         psnr_rgb in dB for each camera.
     """
-    found, cameras = [], len(before.sensors())
-    for number in range(cameras):
-        progress("renderings", number, cameras)
-        pair = [_picture(scene, number, spp) for scene in (before, after)]
+    for number, pair in enumerate(zip(before, after, strict=True), 1):
         loud = np.clip(LOUDER * np.abs(pair[0] - pair[1]), 0, 1)
-        for name, picture in zip(("before", "after", "difference"), [*pair, loud], strict=True):
-            save_image(folder / f"{name}-{number + 1}.png", picture)
-        found.append(psnr(pair[0], pair[1]))
-    progress("renderings", cameras, cameras)
-    return found
+        for name, picture in zip(("before", "after", "difference"), (*pair, loud), strict=True):
+            save_image(folder / f"{name}-{number}.png", picture)
+    return [psnr(*pair) for pair in zip(before, after, strict=True)]
+
+
+def pictures(scene: mi.Scene, spp: int | None) -> list[NDArray[np.float32]]:
+    """Render a scene by each camera in sRGB; equal scenes have the same random numbers.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+        Without an integrator, "path" renders it.
+    spp : int or None
+        Samples per pixel, by default those of the camera.
+
+    Returns
+    -------
+    list of ndarray of float32, shape (H, W, 3) or (H, W, 1)
+    """
+    return [_picture(scene, number, spp) for number in range(len(scene.sensors()))]
 
 
 def _picture(scene: mi.Scene, camera: int, spp: int | None) -> NDArray[np.float32]:
-    """Render a scene in sRGB, shape (H, W, 3) or (H, W, 1)."""
+    """Render a scene by a camera in sRGB."""
     renderer = scene.integrator() or mi.load_dict({"type": "path"})
     rendering = render_in_passes(scene, camera, spp, integrator=renderer)
     light = rendering.picture("RGB")

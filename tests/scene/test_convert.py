@@ -14,6 +14,7 @@ from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.io import load_image
 from eigengs_dr.plugins import texture_of
 from eigengs_dr.scene import costs
+from eigengs_dr.scene.rendering import pictures
 from eigengs_dr.storage.locks import lock_output
 
 pytestmark = pytest.mark.mitsuba
@@ -129,13 +130,47 @@ def test_renderings_that_miss_the_goal_are_named(folder, tmp_path):
 
 
 def test_a_dictionary_with_a_mesh_and_a_bump_map_that_stays(folder, tmp_path):
-    """Cameras see its slopes: Gaussians of 40 dB in heights left 26 dB between the renderings."""
+    """A cube shows the facets of 32 x 32 texels, which no Gaussians have."""
     found = eg.convert_scene(room(mi, folder), tmp_path / "new", spp=2, **QUICK)
     assert {t.file for t in found.textures} == {"photo.npz"}
-    assert any("slopes" in reason for _, reason in found.left)
+    assert dict(found.left)["rough.png (bsdf.arbitrary)"].startswith(
+        "heights of a bump map: the renderings keep "
+    )
     scene = mi.load_file(str(found.scene))
     assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
     assert "cube.ply" in found.scene.read_text()
+    assert not (tmp_path / "new" / "rough.npz").exists()
+
+
+def bumpy(folder, name, **settings):
+    """A wall with soft waves of 128 x 128 texels, which a camera sees at 24 x 24 pixels."""
+    y, x = np.mgrid[:128, :128] / 128
+    waves = 0.5 + 0.3 * np.sin(20 * x + 3 * np.sin(9 * y))
+    eg.save_image(folder / name, waves)
+    bump = {"type": "bitmap", "filename": str(folder / name), "wrap_mode": "clamp", **settings}
+    bump = {"type": "bumpmap", "arbitrary": bump, "bsdf": {"type": "diffuse"}}
+    light = {"type": "point", "position": [2, 2, 2], "intensity": 8.0}
+    wall = {"type": "rectangle", "bsdf": bump}
+    return {**room(mi, folder), "cube": wall, "lamp": light}
+
+
+@pytest.mark.parametrize("raw", [True, False])
+def test_a_bump_map_that_keeps_the_renderings_alike(folder, tmp_path, raw):
+    scene = bumpy(folder, "waves.png", raw=raw)
+    settings = {"target_psnr": 36, "iterations": 40, "spp": 64, "replace_all": True}
+    found = eg.convert_scene(scene, tmp_path / "new", **settings)
+    [waves] = found.textures
+    assert found.left == [] and waves.names == ("waves.png (bsdf.arbitrary)",)
+    assert 36 <= waves.psnr == pytest.approx(found.psnr[0], abs=0.5) and waves.gaussians < 1000
+    flat = {**scene, "cube": {"type": "rectangle", "bsdf": {"type": "diffuse"}}}
+    seen, smooth = (pictures(mi.load_dict(s), 64)[0] for s in (scene, flat))
+    assert eg.psnr(seen, smooth) < 26  # without its bumps
+
+
+def test_a_bump_map_without_renderings_stays(folder, tmp_path):
+    found = eg.convert_scene(bumpy(folder, "waves.png"), tmp_path / "new", spp=0, **QUICK)
+    [(_, reason)] = found.left
+    assert found.textures == [] and "renderings decide, and none is wanted" in reason
 
 
 def test_nothing_is_rendered_on_request(folder, tmp_path):
