@@ -18,6 +18,9 @@ SIDE = 512
 ROUNDS = 20
 """Timings of each texture, of which the fastest counts; the textures take turns."""
 
+NEGLIGIBLE = 1 << 14
+"""Bytes that nobody saves: the smallest images take less."""
+
 SLOWEST = 8.0
 """Time of a lookup, in lookups of the bitmap, from which on the bitmap is better. Lookups are a
 small part of a rendering: the picture of a coated ball takes 1.07 to 1.12 times as long where they
@@ -40,7 +43,8 @@ class Cost(NamedTuple):
 
     def is_better_than(self, other: Cost) -> bool:
         """Return whether bitmaps of this cost are better than Gaussians of the other one."""
-        return self.bytes <= other.bytes or SLOWEST * self.nanoseconds < other.nanoseconds
+        is_smaller = other.bytes - self.bytes > NEGLIGIBLE
+        return is_smaller or other.nanoseconds > SLOWEST * self.nanoseconds
 
 
 def costs_of(kinds: Sequence[Sequence[Texture]], raw: bool, channels: int) -> list[Cost]:
