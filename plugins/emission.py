@@ -154,6 +154,12 @@ class Emission:
     cells: mi.DiscreteDistribution2D
     densities: mi.TensorXf
 
+    @property
+    def bytes(self) -> int:
+        """Bytes of the arrays: two numbers for each cell, and the sum of each row."""
+        rows, columns = self.densities.shape
+        return (2 * rows * columns + rows) * dr.itemsize_v(mi.Float)
+
     def sample(self, sample: mi.Point2f, active: Mask) -> tuple[mi.Point2f, Float]:
         """Return positions (Point2f) and their densities for samples of the unit square."""
         cell, _, rest = self.cells.sample(sample, active)

@@ -9,6 +9,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import pytest
+from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.families import small_model
@@ -125,7 +126,8 @@ RUN_AS_A_WHOLE = ("how-to/own-loop.md", "getting-started.md")  # above
 
 
 def is_mitsuba(page):
-    return "mi." in page.read_text() or bool(TEXTURE.search(page.read_text()))
+    text = page.read_text()
+    return "mi." in text or "eg.convert_scene" in text or bool(TEXTURE.search(text))
 
 
 def cases():
@@ -153,6 +155,7 @@ def space(tmp_path, monkeypatch):
     for name in ("photo.jpg", "wood.jpg", "huge.tif"):
         eg.save_image(name, np.tile(image, (3, 3, 1)) if name == "huge.tif" else image)
     eg.save_image("roughness.png", image[..., :1])
+    Image.fromarray(np.uint8(255 * image[..., [0, 1, 2, 0]])).save("leaf.png")
     eg.save_image("sky.exr", 20 * image, encoding="linear")
     result = eg.fit(image, 50, iterations=2)
     light = eg.fit(image, 50, iterations=2, space="linear").gaussians

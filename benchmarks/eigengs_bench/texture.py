@@ -221,7 +221,7 @@ def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None)
 
 def _first_lookup(mi: Any, path: Path, angle: float) -> tuple[int, float]:
     """Load a texture and look it up once; return the bytes of its arrays, and the seconds."""
-    from eigengs_dr.plugins.gaussian_texture import resident_bytes
+    from eigengs_dr.plugins import resident_bytes
 
     started = time.perf_counter()
     file = {"type": "gaussian_texture", "filename": str(path), "prefilter": angle}

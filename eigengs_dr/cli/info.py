@@ -157,7 +157,7 @@ def _truncation(model: eg.EigenGS) -> list[Facts]:
 def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
     """Return the bytes that textures of a file hold, without and with a prefilter."""
     mi = load_mitsuba(None, quiet=True)
-    from ..plugins.gaussian_texture import resident_bytes
+    from ..plugins import resident_bytes
 
     source = {"type": "gaussian_texture", key: file} | ({"map": maps[0]["name"]} if maps else {})
     with explained(Path(file)):  # one at a time: textures of a file share what they hold
