@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -196,14 +197,14 @@ def coarse_picture(
     levels = levels_of(*objective.size, objective.channels)
 
     def advance(
-        values: list[Float],
+        values: list,
         moments: list,
         sums: Float,
         slopes: list[Float],
         rate: Float,
         time: Float,
-    ) -> tuple[list[Float], list, Float, list[Float]]:
-        slope = objective.pull_back(sums, slopes)
+    ) -> tuple[list, list, Float, list[Float]]:
+        slope: Any = objective.pull_back(sums, slopes)
         for k, value in enumerate(values):
             if k:
                 slope = shrink(slope, levels[k - 1], levels[k])
@@ -212,7 +213,7 @@ def coarse_picture(
         sums = _sum_levels(values, levels)
         return values, moments, sums, objective.seen(sums)
 
-    values = [dr.zeros(types.Float, level.values) for level in levels[:-1]]
+    values: list = [dr.zeros(types.Float, level.values) for level in levels[:-1]]
     values.append(types.Float(np.tile(start, levels[-1].values // len(start))))
     dr.make_opaque(values)
     moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)

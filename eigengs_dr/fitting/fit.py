@@ -250,7 +250,7 @@ def fit(
         seed=seed,
         backend=backend,
         encoding=encoding,
-        loss=loss,
+        loss=loss if loss is None or isinstance(loss, Loss) else Loss(loss),
     )
     factors = check_weight(weight)
     if image is None:

@@ -171,7 +171,7 @@ def _start(
 
     loss, pixels = objective.loss, width * height
     if options.gaussians is not None or (loss.judge is None and loss.target is None):
-        return fitted(options.gaussians or max(1, pixels // PIXELS_PER_GAUSSIAN)), []
+        return fitted(options.count or max(1, pixels // PIXELS_PER_GAUSSIAN)), []
     most, count = max_gaussians_for(pixels, objective.channels), pixels // FIRST_PIXELS
     best, rows = None, []
     while count <= most and not (best and interrupted()):

@@ -357,7 +357,8 @@ class LossObjective(Pixels):
         the squared error it is exact, for an absolute error it is one over its mean. Tiles with
         little error take the ratio of all tiles. The mean of h over all errors is 1.
         """
-        grid, model = self.grid, self.model
+        grid, target = self.grid, self.model.target
+        assert target is not None
         lists = bin_gaussians(gaussians, adjoint=False)
         packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
@@ -365,7 +366,7 @@ class LossObjective(Pixels):
         slope = self.pull_back(sums, self.derivative(shown)[1], in_tiles=True)
         block, inside = grid.pixels * self.channels, pixels_inside(self.types, grid)
         each = dr.arange(self.types.UInt, dr.width(sums)) // self.channels
-        error = (sums - model.target) * dr.gather(self.types.Float, inside, each)
+        error = (sums - target) * dr.gather(self.types.Float, inside, each)
         along = dr.block_sum(slope * error, block)
         squares = dr.block_sum(dr.square(error), block)
         ratio, mean = dr.sum(along) / dr.sum(squares), dr.mean(squares)
@@ -375,4 +376,4 @@ class LossObjective(Pixels):
         curvature = dr.gather(self.types.Float, secant, tile) * inside
         dr.eval(curvature)
         fields = {name: getattr(self, name) for name in Pixels.__dataclass_fields__}
-        return Pixels(**fields | {"model": Quadratic(model.target, curvature)})
+        return Pixels(**fields | {"model": Quadratic(target, curvature)})

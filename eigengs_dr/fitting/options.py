@@ -147,8 +147,6 @@ class FitOptions:
         check_encoding(self.encoding)
         if self.space is not None and self.space not in SPACES:
             raise ValueError(f"space {self.space!r} is unknown; use one of {', '.join(SPACES)}")
-        if self.loss is not None and not isinstance(self.loss, Loss):
-            object.__setattr__(self, "loss", Loss(self.loss))
         if not isinstance(self.method, Method):
             raise TypeError(f"method is {self.method!r}; pass a Method, such as eigengs_dr.DEFAULT")
         if self.method.needs_model and not isinstance(self.start, Model):
@@ -198,19 +196,20 @@ class FitOptions:
         check_sides((width, height))
         check_index_range(width, height, channels)
         limit = self.goal.max_gaussians if self.goal else None
-        for name, count in (("gaussians", self._count), ("max_gaussians", limit)):
+        for name, count in (("gaussians", self.count), ("max_gaussians", limit)):
             if count is not None and not 1 <= count <= width * height:
                 raise ValueError(
                     f"{name} is {count}; an image of {width}x{height} takes 1 to {width * height}"
                 )
 
     @property
-    def _count(self) -> int | None:
+    def count(self) -> int | None:
+        """Number of Gaussians, if the user gives one; of all levels."""
         return self.levels[-1] if self.levels else self.gaussians  # type: ignore[return-value]
 
     def count_for(self, pixels: int) -> int:
         """Return the number of Gaussians for so many pixels, if the fit does not search it."""
-        return self._count or default_count(pixels)
+        return self.count or default_count(pixels)
 
     def most_for(self, pixels: int, channels: int) -> int:
         """Return the largest number of Gaussians that a search tries."""
