@@ -56,6 +56,9 @@ class Fit:
         A descent may have more Gaussians than requested until two thirds of its steps are taken,
         see `eigengs_dr.fitting.control.Surplus`; those sets have no rows. With a weight, the
         squared errors of all PSNRs are weighted, by the mean over the channels.
+        With a loss the key is loss, see `eigengs_dr.Loss.judge`; there are PSNRs too where there is
+        an image. Without an image the first row shows the picture of the texels, and rows with the
+        key gaussians the numbers that were tried.
         With space "data", psnr_ycbcr is the PSNR of the data, with their range as the peak, or 1
         for codes between 0 and 1; psnr_rgb is that of codes after rounding to 8 bits, and NaN for
         other data, which have none. With space "normal" both have the peak 1. With space "radiance"
@@ -74,7 +77,10 @@ class Fit:
         RGB image to add to renderings of the set. The method of the paper EigenGS keeps the mean
         image of the model as pixels. The attribute `image` includes the mean image.
     psnr_ycbcr, psnr_rgb : float
-        PSNR of the set in dB, from its row of the trace; for maps, the means over the maps.
+        PSNR of the set in dB, from its row of the trace; for maps, the means over the maps; NaN
+        without an image.
+    loss : float
+        The loss of the set, from the same row; NaN without a loss.
     source : str
         Name of the image, if it was a file or a URL.
     maps : dict of str to dict
@@ -97,11 +103,15 @@ class Fit:
 
     def __repr__(self) -> str:
         g, space = self.gaussians, "ycbcr" if self.maps else float_space(self.gaussians.space)
-        maps = f"maps {', '.join(self.maps)}, " if self.maps else ""
+        maps = f"maps {', '.join(m.name for m in g.maps)}, " if g.maps else ""
+        figures = f"psnr_{space}={self.psnr_ycbcr:.2f}, psnr_rgb={self.psnr_rgb:.2f}, "
+        if math.isnan(self.psnr_ycbcr):
+            figures = ""
+        if not math.isnan(self.loss):
+            figures = f"loss={self.loss:.4g}, {figures}"
         return (
             f"Fit({len(g)} Gaussians, "
-            f"{g.width}x{g.height} pixels, {maps}{self.iterations} iterations, "
-            f"psnr_{space}={self.psnr_ycbcr:.2f}, psnr_rgb={self.psnr_rgb:.2f}, "
+            f"{g.width}x{g.height} pixels, {maps}{self.iterations} iterations, {figures}"
             f"seconds={self.seconds:.2f}, stopped={self.stopped!r})"
         )
 
@@ -146,7 +156,7 @@ def fit(
     loss: Loss | LossFunction | None = None,
     size: tuple[int, int] | None = None,
 ) -> Fit:
-    """Fit an image by a given number of Gaussians, or by as few as a target PSNR needs.
+    """Fit an image, or a loss of your own, by a number of Gaussians or as few as a target needs.
 
     Several maps of one size, such as those of a material, share the means and shapes of one set:
     ``result.gaussians["albedo"]`` is the set of one map.
@@ -157,10 +167,11 @@ def fit(
         A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`. A
         mapping holds the images of maps by name, with at most 16 channels together; a `Map` says
         the space, the weight and the goal of one. Data whose three channels are equal count as one
-        channel.
+        channel. Without an image, give a loss and the size of its picture.
     gaussians : int or sequence of int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
-        images; with a start, the number of its Gaussians. Several rising numbers such as
+        images; with a start, the number of its Gaussians; without an image, one for 16 pixels, or
+        as many as the judge of the loss says, see `eigengs_dr.Loss`. Several rising numbers such as
         ``[5000, 7000, 9000]`` are levels of detail, see `level_counts`: the first Gaussians form
         the image too, and ``result.gaussians[:n]`` is a level. Inside a level, Gaussians with a
         larger removal cost come first, so that every prefix forms an image.
@@ -176,7 +187,7 @@ def fit(
         the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
         that it makes of the image, which suits many images. The set gets the cutoff of the method.
         A start that turns out to be useless in the first steps is placed anew.
-    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
+    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
         weigh more in the dark. "data" uses one or three channels unchanged (roughness, heights).
@@ -184,13 +195,15 @@ def fit(
         1. "radiance" is "linear" without an upper bound. "log" suits light above 1 best: the
         Gaussians sum to logarithms of light, see `eigengs_dr.image.color.to_log`. For an image of
         light above 1, "linear" becomes "radiance", and "ycbcr" and "rgb" become "log": a texture
-        would clamp their sums.
+        would clamp their sums. For a loss without an image, a mapping such as ``{"albedo":
+        "linear", "roughness": "data"}`` makes maps; data then have one channel.
     weight : array_like, shape (H, W) or (H, W, C), optional
         Factors of the squared errors of pixels, or of their channels in the space of the colours,
         for maps of pixels alone; finite and at least 0. A pixel of weight 0 does not count; it may
         be NaN.
     method : Method, optional
-        How to fit, by default `DEFAULT`; `eigengs_dr.paper` has those of the papers.
+        How to fit, by default `DEFAULT`, or `COARSE_TO_FINE` without an image; `eigengs_dr.paper`
+        has those of the papers.
     seed : int, optional
         Seed of all random numbers: of the noise by which means and shapes are perturbed, and of
         the placements that draw some.
@@ -204,6 +217,12 @@ def fit(
         What the pixels of the image are: sRGB codes, or light as in renderings. By default what the
         image says (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
         Data are used as they are.
+    loss : callable or Loss, optional
+        What to make small instead of the squared error: ``loss(picture, step) -> number``, any
+        function of the rendered picture (or the dict of maps) that Dr.Jit differentiates. With an
+        image, the image places the Gaussians and gives PSNRs.
+    size : (int, int), optional
+        Width and height of the picture of a loss without an image, in pixels.
 
     Returns
     -------

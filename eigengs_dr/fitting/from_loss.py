@@ -9,8 +9,10 @@ from typing import TypeAlias
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes
+from ..backend.types import Float
 from ..gaussian.channels import TextureMap, check_maps, slices
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import LIGHT, SPACES, to_coded, to_log
@@ -81,42 +83,38 @@ def refine_loss(
     A pyramid of texels takes the first steps, see `Coarse`. Gaussians are fitted to its picture: a
     given number, or numbers that double while the loss gains from it. They take the other steps.
     """
-    channels = sum(len(view.channels) for view in views)
-    space = "data" if views[0].name else views[0].space
+    stopped = False
 
-    def near(values: np.ndarray) -> LossObjective:
-        values = np.asarray(values, np.float32).reshape(size[1], size[0], channels)
-        if space in LIGHT:
-            values = np.maximum(values, 0)
-        shown = to_coded(values) if space in LIGHT else values
-        return LossObjective.of_loss(loss, views, Pixels.of(Data(values, shown), space, types))
+    def show(step: int, row: Row) -> None:
+        """Call `progress`, which may end the fit by a `KeyboardInterrupt`."""
+        nonlocal stopped
+        if progress and not stopped:
+            try:
+                progress(step, options.iterations, row)
+            except KeyboardInterrupt:
+                stopped = True
 
     def timed(row: Row) -> Row:
         return {"seconds": time.perf_counter() - started, **row}
+
+    def ended(step: int = 1) -> bool:
+        if step % 10 == 0:
+            dr.sync_thread()
+            show(step, timed({}))
+        return stopped or interrupted()
 
     taken, trace = 0, []
     if start is None:
         place = options.method.place
         coarse = place if isinstance(place, Coarse) else Coarse()
-        objective = near(np.zeros(size[0] * size[1] * channels))
-
-        def ended(step: int) -> bool:
-            nonlocal taken
-            taken = step
-            if progress and step % 10 == 0:
-                dr.sync_thread()
-                progress(step, options.iterations, timed({}))
-            return interrupted()
-
-        bounds, steps = loss.bounds or (0.0, 1.0), round(coarse.share * options.iterations)
-        first = [value for view in views for value in _grey(view.space, len(view.channels), bounds)]
-        sums = coarse_picture(objective, coarse, steps, first, bounds[1] - bounds[0], ended)
-        objective = replace(near(sums.numpy()), calls=objective.calls)
-        trace = [timed({"iteration": taken, "loss": objective.judge(objective.seen(sums))})]
-        start, numbers = _start(objective, options, coarse, interrupted)
-        trace += [timed({"iteration": taken, **row}) for row in numbers]
+        steps = round(coarse.share * options.iterations)
+        objective = _descend_texels(loss, size, views, types, coarse, steps, ended)
+        taken = objective.calls.step
+        trace = [{"loss": objective.judge(objective.seen(_rows(objective)))}]
+        start, numbers = _start(objective, options, coarse, ended)
+        trace = [timed({"iteration": taken, **row}) for row in trace + numbers]
     else:
-        objective = near(_sums(start, channels))
+        objective = _near(loss, size, views, types, _sums(start))
     seconds_init = time.perf_counter() - started
     refined = refine(
         objective,
@@ -125,39 +123,78 @@ def refine_loss(
         options.iterations - taken,
         lambda gaussians: [timed(objective.judged(gaussians))],
         options.seed,
-        progress and (lambda step, steps, r: progress(step + taken, options.iterations, r)),
-        interrupted,
+        progress and (lambda step, steps, row: show(step + taken, row)),
+        ended,
     )[0]
-    rows = [{**r, "iteration": r["iteration"] + taken} for r in refined.trace]
+    rows = [{**row, "iteration": row["iteration"] + taken} for row in refined.trace]
     found = replace(refined, trace=trace + rows, iterations=refined.iterations + taken)
     return found, seconds_init
 
 
-def _grey(space: str, channels: int, bounds: tuple[float, float]) -> list[float]:
+def _near(
+    loss: Loss,
+    size: tuple[int, int],
+    views: Sequence[View],
+    types: ArrayTypes,
+    values: NDArray[np.floating],
+) -> LossObjective:
+    """Return the objective of a loss whose best picture is near these sums, (H * W * C,)."""
+    channels = sum(len(view.channels) for view in views)
+    space = "data" if views[0].name else views[0].space
+    values = np.asarray(values, np.float32).reshape(size[1], size[0], channels)
+    values = np.maximum(values, 0) if space in LIGHT else values
+    shown = to_coded(values) if space in LIGHT else values
+    return LossObjective.of_loss(loss, views, Pixels.of(Data(values, shown), space, types))
+
+
+def _rows(objective: LossObjective) -> Float:
+    """Return the picture near which a loss is least, as rows of pixels."""
+    assert objective.model.target is not None
+    return objective.picture(objective.model.target).array
+
+
+def _descend_texels(
+    loss: Loss,
+    size: tuple[int, int],
+    views: Sequence[View],
+    types: ArrayTypes,
+    coarse: Coarse,
+    steps: int,
+    ended: Callable[[int], bool],
+) -> LossObjective:
+    """Return the objective of a loss near the picture of a pyramid of texels."""
+    low, high = loss.bounds or (0.0, 1.0)
+    grey = np.concatenate([_grey(view.space, len(view.channels), low, high) for view in views])
+    first = np.tile(grey, size[0] * size[1])
+    objective = _near(loss, size, views, types, first)
+    sums = coarse_picture(objective, coarse, steps, grey.tolist(), high - low, ended)
+    return replace(_near(loss, size, views, types, sums.numpy()), calls=objective.calls)
+
+
+def _grey(space: str, channels: int, low: float, high: float) -> NDArray[np.floating]:
     """Return the sums of a picture of which nothing is known."""
     if space == "normal":
-        return [0.5, 0.5, 1.0]
+        return np.array([0.5, 0.5, 1.0])
     if space in LIGHT:
-        return [GREY] * channels
-    middle = float(to_log(np.float32(GREY))) if space == "log" else sum(bounds) / 2
-    return [middle] * channels
+        return np.full(channels, GREY)
+    return np.full(channels, to_log(np.float32(GREY)) if space == "log" else (low + high) / 2)
 
 
-def _sums(gaussians: Gaussians, channels: int) -> np.ndarray:
+def _sums(gaussians: Gaussians) -> NDArray[np.floating]:
     """Return the sums of a set as rows of pixels."""
     lists = bin_gaussians(gaussians, adjoint=False)
     packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
     radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
     with dr.suspend_grad():
         drawn = forward(packed, background, lists, radius)
-        return to_tensor(drawn, lists.grid, channels).numpy()
+        return np.ravel(to_tensor(drawn, lists.grid, gaussians.channels).numpy())
 
 
 def _start(
     objective: LossObjective,
     options: FitOptions,
     coarse: Coarse,
-    interrupted: Callable[[], bool],
+    ended: Callable[[], bool],
 ) -> tuple[Gaussians, list[Row]]:
     """Fit Gaussians to the image of an objective; return rows of the numbers that were tried."""
     width, height = objective.size
@@ -174,7 +211,7 @@ def _start(
         return fitted(options.count or max(1, pixels // PIXELS_PER_GAUSSIAN)), []
     most, count = max_gaussians_for(pixels, objective.channels), pixels // FIRST_PIXELS
     best, rows = None, []
-    while count <= most and not (best and interrupted()):
+    while count <= most and not (best is not None and ended()):
         gaussians = fitted(max(1, count))
         rows.append({"gaussians": len(gaussians), **objective.judged(gaussians)})
         if best is not None and rows[-1]["loss"] >= rows[-2]["loss"]:
