@@ -9,7 +9,7 @@ from sphinx_gallery.scrapers import figure_rst
 ORDER = (
     "fit_an_image.py",
     "texture.py",
-    "texture_gradients.py",
+    "photos_of_a_ball.py",
     "numpy_and_torch.py",
     "render_and_differentiate.py",
     "fit_for_scene.py",

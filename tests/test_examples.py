@@ -94,16 +94,14 @@ def test_texture(run, tmp_path):
     check_pictures(tmp_path, "floor_points", "floor_filtered", "floor_truth")
 
 
-def test_texture_gradients(run, tmp_path):
+def test_photos_of_a_ball(run, tmp_path):
     pytest.importorskip("mitsuba")
-    out = run("texture_gradients.py", tmp_path)
-    first, last, _ = numbers(out, "from NUM to NUM in NUM steps")
-    assert last < 0.03 * first
-    [psnr] = numbers(out, "found: NUM dB")
-    assert psnr > 26
-    pictures = ("poster", "poster_target", "poster_found", "poster_rendered")
-    check_pictures(tmp_path, *pictures)
-    assert eg.Gaussians.load(tmp_path / "poster_found.npz").space == "linear"
+    out = run("photos_of_a_ball.py", tmp_path)
+    by_texels, by_gaussians = map(float, re.findall(r"(\d+\.\d) dB in another view", out))
+    assert by_gaussians > max(by_texels, 36)
+    check_pictures(tmp_path, "photos", "paint", "errors")
+    found = eg.Gaussians.load(tmp_path / "paint.npz")
+    assert found.space == "linear" and len(found) == 1024
 
 
 def test_fit_for_scene(run, tmp_path):

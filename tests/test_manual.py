@@ -4,6 +4,7 @@ import re
 import runpy
 import shlex
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
 
 import drjit as dr
@@ -14,6 +15,7 @@ from PIL import Image
 import eigengs_dr as eg
 from _helpers.families import small_model
 from eigengs_dr.cli.main import main
+from eigengs_dr.image.color import to_linear
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs"
@@ -22,9 +24,14 @@ BLOCK = re.compile(r"^ *```python\n(.*?)^ *```", re.M | re.S)
 
 
 def run_blocks(page, space, shrink=str):
-    """Run the blocks of a page as one program, perhaps made smaller; returns its variables."""
+    """Run the blocks of a page as one program, perhaps made smaller; returns its variables.
+
+    A block of PyTorch is left out where PyTorch is not installed.
+    """
     text = page.read_text()
     for found in BLOCK.finditer(text):
+        if "import torch" in found[1] and not find_spec("torch"):
+            continue
         line = text.count("\n", 0, found.start(1))
         exec(compile("\n" * line + shrink(found[1]), str(page), "exec"), space)
     return space
@@ -34,47 +41,76 @@ def run_blocks(page, space, shrink=str):
 
 
 @pytest.fixture(scope="module")
-def own_loop():
-    return run_blocks(FOLDER / "how-to/own-loop.md", {"__name__": "page"})
+def own_loss():
+    return run_blocks(FOLDER / "how-to/own-loss.md", {"__name__": "page"})
 
 
 def numbers(tensor):
     return np.array(dr.detach(tensor).numpy(), np.float64)
 
 
-def test_the_loops_of_the_page_fit(own_loop):
-    """The frozen loop takes the steps of the plain one, but for the lists of five steps."""
-    image = own_loop["image"]
-    before, plain, frozen = (
-        eg.psnr(numbers(eg.render(own_loop[name])), image) for name in ("start", "found", "frozen")
+def test_losses_of_the_page_are_of_use(own_loss):
+    """Each fit has less of its loss than a fit of the image, or finds what it looks for."""
+    photo, loss_of = own_loss["photo"], own_loss["l1_ssim"]
+    plain = eg.fit(photo, 300, iterations=200, space="rgb")
+
+    def psnr(found, *part):
+        return eg.psnr(found.image[part].clip(0, 1), photo[part])
+
+    assert own_loss["free"].loss < numbers(loss_of(eg.render(plain.gaussians), 0))
+    assert psnr(own_loss["left"], ..., slice(32), slice(None)) > 1 + psnr(
+        plain, ..., slice(32), slice(None)
     )
-    assert plain > before + 2
-    assert abs(plain - frozen) < 0.1
-    assert own_loop["take_step"].n_recordings <= 3
-    a, _, c = own_loop["found"].factor.numpy()
+    middle = slice(24, 40), slice(24, 40)
+    coarse = eg.fit(photo, 100, iterations=200, space="rgb")
+    assert psnr(own_loss["sharp"], *middle) > psnr(coarse, *middle)
+    assert own_loss["gain"]["second"][0] == pytest.approx(0.6, abs=0.005)
+    alpha = own_loss["found"].image["alpha"]
+    assert ((alpha > 0.5) == (own_loss["alpha"].numpy() > 0.5)).mean() > 0.99
+    assert own_loss["few"].stopped == "met" and own_loss["few"].loss <= 0.04
+
+
+def test_the_network_of_the_page_fits():
+    pytest.importorskip("torch")
+    made = run_blocks(FOLDER / "how-to/own-loss.md", {"__name__": "page"})
+    rows = made["seen"].trace
+    assert rows[-1]["loss"] < 0.5 * rows[0]["loss"]
+
+
+def test_the_loops_of_the_page_fit(own_loss):
+    """The loop of descents ends where `fit` does; the frozen one gains."""
+    photo, start = own_loss["photo"], own_loss["start"]
+    as_fit = eg.fit(photo, 300, iterations=100, space="rgb", loss=own_loss["l1_ssim"])
+    assert own_loss["losses"][-1] == pytest.approx(as_fit.loss, rel=0.01)
+    assert sorted(own_loss["losses"], reverse=True) == own_loss["losses"]
+    before, after = (eg.psnr(numbers(eg.render(g)), photo) for g in (start, own_loss["frozen"]))
+    assert after > before + 2
+    assert own_loss["take_step"].n_recordings <= 3
+    a, _, c = own_loss["frozen"].factor.numpy()
     assert (a > 0).all() and (c > 0).all()
 
 
-def test_the_loss_of_the_page_has_the_derivative_of_finite_differences(own_loop):
-    found, image, step = np.random.default_rng(3).uniform(0.2, 0.8, (3, 24, 24, 3))
-    Tensor = type(own_loop["exact"])  # in double precision
-    picture = Tensor(found)
+@pytest.mark.parametrize("name", ["l1_ssim", "masked", "foveated"])
+def test_a_loss_of_the_page_has_the_derivative_of_finite_differences(own_loss, name):
+    values, step = np.random.default_rng(3).uniform(0.2, 0.8, (2, 64, 64, 3))
+    Tensor = type(own_loss["exact"])  # in double precision
+    for known in ("wanted", "weight", "fovea"):
+        own_loss[known] = Tensor(own_loss[known])
+    picture = Tensor(values)
     dr.enable_grad(picture)
-    dr.backward(own_loop["loss_of"](picture, Tensor(image)))
-    up, down = (
-        own_loop["loss_of"](Tensor(found + s * step), Tensor(image)).array[0] for s in (1e-6, -1e-6)
-    )
+    dr.backward(own_loss[name](picture, 0))
+    up, down = (numbers(own_loss[name](Tensor(values + s * step), 0)).item() for s in (1e-6, -1e-6))
     wanted = (up - down) / 2e-6
     assert (dr.grad(picture).numpy() * step).sum() == pytest.approx(wanted, rel=1e-5)
 
 
-def test_the_traced_loop_of_the_page_is_a_sum_with_derivatives(own_loop):
-    g = dr.detach(own_loop["double"])
+def test_the_traced_loop_of_the_page_is_a_sum_with_derivatives(own_loss):
+    g = dr.detach(own_loss["double"])
     Float = dr.leaf_t(g.mean)
     at = [np.array([10.5, 30.5]), np.array([20.5, 40.5])]
     x, y = map(Float, at)
     dr.enable_grad(g.mean)
-    found = own_loop["brightness"](g, x, y, len(g))
+    found = own_loss["brightness"](g, x, y, len(g))
     dr.backward(dr.sum(found))
 
     def total(mean):
@@ -101,6 +137,83 @@ def test_getting_started_runs_without_a_warning(tmp_path, monkeypatch):
     assert eg.load_image("large.png").shape == (2048, 2048, 3)
 
 
+# --- A page about photos of a ball ---
+
+GREY = """<texture name="{0}" type="bitmap"><boolean name="raw" value="true"/>
+  <string name="filename" value="{1}.exr"/></texture>"""
+FAMILY = """<texture name="base_color" type="gaussian_texture">
+  <string name="model" value="cats.npz"/></texture>"""
+CAMERA = """<sensor type="perspective"><float name="fov" value="36"/>
+  <transform name="to_world">
+    <lookat origin="{}, {}, {}" target="0, 0, 0" up="0, 1, 0"/></transform>
+  <film type="hdrfilm"><string name="pixel_format" value="rgb"/>
+    <integer name="width" value="32"/><integer name="height" value="32"/></film></sensor>"""
+BALL = """<scene version="3.0.0">
+  <integrator type="prb"><integer name="max_depth" value="2"/></integrator>
+  <emitter type="constant"><float name="radiance" value="0.3"/></emitter>
+  <shape type="rectangle" id="lamp">
+    <transform name="to_world">
+      <lookat origin="2, 4, 3" target="0, 0, 0" up="0, 1, 0"/></transform>
+    <emitter type="area"><rgb name="radiance" value="{light}"/></emitter></shape>
+  <shape type="sphere" id="ball">
+    <transform name="to_world"><rotate x="1" angle="90"/></transform>
+    <bsdf type="principled">{color}{roughness}</bsdf></shape>{cameras}</scene>"""
+
+
+def write_balls(mi, paint):
+    """Write scenes of a ball, and photos of one with paint (32, 32, 3) under a brighter lamp."""
+    angles = np.arange(8) * np.pi / 4
+    places = np.stack([3.6 * np.sin(angles), 1.2 * np.cos(3 * angles), 3.6 * np.cos(angles)], 1)
+    cameras = "".join(CAMERA.format(*place) for place in places)
+    rough = np.full((32, 32, 1), 0.3, np.float32)
+    for name, pixels in (
+        ("paint", paint),
+        ("rough", rough),
+        ("grey", np.full((8, 8, 3), 0.2, np.float32)),
+        ("half", np.full((8, 8, 1), 0.5, np.float32)),
+    ):
+        mi.Bitmap(pixels).write(f"{name}.exr")
+    unknown, half = GREY.format("base_color", "grey"), GREY.format("roughness", "half")
+    known = GREY.format("base_color", "paint"), GREY.format("roughness", "rough")
+    for name, textures, light in (
+        ("known", known, 12),
+        ("ball", (unknown, half), 9),
+        ("family", (FAMILY, half), 12),
+    ):
+        color, roughness = textures
+        text = BALL.format(light=light, color=color, roughness=roughness, cameras=cameras)
+        Path(f"{name}.xml").write_text(text)
+    scene = mi.load_file("known.xml")
+    Path("photos").mkdir()
+    for k in range(8):
+        mi.Bitmap(mi.render(scene, sensor=k, spp=64, seed=100 + k)).write(f"photos/{k}.exr")
+
+
+@pytest.mark.mitsuba
+def test_textures_are_recovered_from_photos(tmp_path, monkeypatch):
+    mi = pytest.importorskip("mitsuba")
+    monkeypatch.chdir(tmp_path)
+    mi.set_variant("llvm_ad_rgb")
+    eg.register_plugins()
+    small_model("llvm").save("cats.npz")
+    paint = eg.sample("coffee")[100:132, 200:232]
+    write_balls(mi, to_linear(paint).astype(np.float32))
+
+    def smaller(code):
+        return code.replace("256", "32").replace("240", "80").replace("160", "40")
+
+    made = run_blocks(FOLDER / "how-to/recover.md", {"__name__": "page"}, smaller)
+    assert made["lamp"][made["light"]].numpy() == pytest.approx(12, rel=0.05)
+    assert list(made["material"].image) == ["albedo", "roughness"]
+    counts, losses = zip(*made["curve"], strict=True)
+    assert list(counts) == sorted(counts) and len(counts) > 1
+    assert losses[0] > min(losses)
+    seen = slice(8, 24)  # rows that cameras see from the front
+    middle = np.broadcast_to(paint.mean(axis=(0, 1)), paint.shape)
+    found = eg.picture_of(eg.Gaussians.load("paint.npz")).clip(0, 1)
+    assert eg.psnr(found[seen], paint[seen]) > 3 + eg.psnr(middle[seen], paint[seen])
+
+
 # --- Other pages, on tiny images ---
 
 
@@ -122,7 +235,7 @@ ROOM = """<scene version="3.0.0">
   </bsdf></shape>
 </scene>"""
 
-RUN_AS_A_WHOLE = ("how-to/own-loop.md", "getting-started.md")  # above
+RUN_AS_A_WHOLE = ("how-to/own-loss.md", "how-to/recover.md", "getting-started.md")  # above
 
 
 def is_mitsuba(page):
