@@ -110,8 +110,8 @@ print(f"{3 * TEXELS**2:,} numbers as texels: {eg.psnr(view, by_texels):.1f} dB i
 # Gaussians
 # ---------
 #
-# ``photo_loss`` says which bitmap of the scene is looked for, and which photos there are; ``eg.fit``
-# does the rest. There is one Gaussian for 16 pixels if nothing else is asked for.
+# ``photo_loss`` says which bitmap of the scene is looked for, and which photos there are. Then
+# ``eg.fit`` does the rest, by one Gaussian for 16 pixels if nothing else is asked for.
 
 loss = photo_loss(room(GREY), "ball.bsdf.reflectance", photos)
 result = eg.fit(loss=loss, size=(TEXELS, TEXELS), iterations=STEPS, space="linear")
@@ -133,9 +133,9 @@ eg.save_image(folder / "paint.png", np.concatenate([photo, texels, found, outlin
 # ------
 #
 # Four times the errors of texels and of Gaussians: in the paint, and in the view by the seventh
-# camera. Texels keep the noise. Gaussians lose edges that are finer than a pixel of a photo. Both miss
-# the last rows of the paint, a pole of the ball, which all cameras see at a slant; no view misses it.
-# With photos of 16 samples, texels are ahead: then there is little noise to keep out.
+# camera. Texels keep the noise. Gaussians lose edges that are finer than a pixel of a photo. Both
+# miss the last rows of the paint, a pole of the ball, which all cameras see at a slant. With photos
+# of 16 samples, texels are ahead: then there is little noise to keep out.
 
 errors = [np.abs(photo - paint) for paint in (texels, found)]
 errors += [np.abs(view - shown) for shown in (by_texels, by_gaussians)]
