@@ -16,7 +16,7 @@ from eigengs_dr.fitting.loss import Loss
 JUDGED = 4
 """Photos with held-out pixels, spread over all."""
 
-MANY_PHOTOS = 8
+MANY_PHOTOS = 12
 """Photos from which on some pixels are held out by default. With three, a held-out pixel leaves a
 hole in the texture that no other photo sees, and the number that suits holes is far too small."""
 
@@ -66,7 +66,7 @@ def photo_loss(
         Samples a pixel of a step.
     held_out : float, optional
         Share of the pixels of four photos that no step sees, in [0, 1). With 0, the trace has the
-        error of the first photo, and the number of Gaussians is not chosen. By default 0.2 with 8
+        error of the first photo, and the number of Gaussians is not chosen. By default 0.2 with 12
         photos or more, and 0 with fewer.
     bounds : (float, float), optional
         See `eigengs_dr.Loss`.

@@ -173,6 +173,16 @@ CHECK_EVERY = 10
 TINY = 1e-30
 """Smallest loss whose logarithm counts."""
 
+NO_ERROR = 1e-20
+"""Squared error of a tile that counts as none."""
+
+FLAT = 0.02
+"""Secant of a tile, relative to that of all tiles, below which the loss does not depend on it."""
+
+LITTLE = 0.01
+"""Squared error of a tile, relative to the mean, that says as much as the secants of all tiles. For
+L1 + 0.2 (1 - SSIM), 400 steps and 4 training photos, 0.1 ends with a loss 2 % higher."""
+
 PULL = 10.0
 """How strongly sums outside the bounds are pulled back: a tenth of the range outside weighs as much
 as the root mean square of the derivative."""
@@ -354,8 +364,9 @@ class LossObjective(Pixels):
 
         The loss L has the derivative g at the picture p, and next to none at the image t: the
         secant ``h = sum g (p - t) / sum (p - t)^2`` of each tile is its curvature in between. For
-        the squared error it is exact, for an absolute error it is one over its mean. Tiles with
-        little error take the ratio of all tiles. The mean of h over all errors is 1.
+        the squared error it is exact, for an absolute error it is one over its mean. It is in units
+        of the usual secant: the mean, weighed by ``g (p - t)``. Tiles with little error take that,
+        and tiles on which the loss does not depend take 0: their Gaussians go where they count.
         """
         grid, target = self.grid, self.model.target
         assert target is not None
@@ -367,11 +378,14 @@ class LossObjective(Pixels):
         block, inside = grid.pixels * self.channels, pixels_inside(self.types, grid)
         each = dr.arange(self.types.UInt, dr.width(sums)) // self.channels
         error = (sums - target) * dr.gather(self.types.Float, inside, each)
-        along = dr.block_sum(slope * error, block)
+        along = dr.maximum(dr.block_sum(slope * error, block), 0)
         squares = dr.block_sum(dr.square(error), block)
-        ratio, mean = dr.sum(along) / dr.sum(squares), dr.mean(squares)
-        secant = dr.maximum((along / ratio + mean) / (squares + mean), 0)
-        secant = dr.select(ratio > 0, secant, 1)
+        total = dr.sum(along)
+        usual = dr.sum(dr.square(along) / (squares + NO_ERROR)) / total
+        little = LITTLE * dr.sum(along * squares) / total
+        secant = (along / usual + little) / (squares + little)
+        secant = dr.select(along > FLAT * usual * squares, secant, 0)
+        secant = dr.select(total > 0, secant, 1)
         tile = dr.arange(self.types.UInt, dr.width(inside)) // grid.pixels
         curvature = dr.gather(self.types.Float, secant, tile) * inside
         dr.eval(curvature)

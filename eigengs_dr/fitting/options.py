@@ -19,6 +19,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
+from .coarse import Coarse
 from .control import Redistribute
 from .loss import Loss
 from .method import DEFAULT, Method, Model
@@ -165,14 +166,17 @@ class FitOptions:
             raise ValueError("levels are for the squared error; leave them or the loss out")
         if not self.searches:
             return
+        target = "target_psnr" if self.goal else "the target of a loss"
         if self.gaussians is not None:
             raise ValueError(
-                "gaussians and a target exclude each other; give one of them, or "
+                f"gaussians and {target} exclude each other; give one of them, or "
                 "target_psnr=Goal(psnr, max_gaussians=...)"
             )
+        if isinstance(self.method.place, Coarse):
+            return
         if not places or self.method.control(Redistribute) is None:
             raise ValueError(
-                "a target needs a method that places Gaussians by the image and redistributes "
+                f"{target} needs a method that places Gaussians by the image and redistributes "
                 "them, such as DEFAULT, and no start"
             )
 
