@@ -115,31 +115,34 @@ def gaussian_texture() -> type:
                 self.transform = mi.Transform3f(self.to_uv)
                 dr.make_opaque(self.transform)  # another transform compiles no other programs
             if set(keys) != {"to_uv"}:
-                self._take_over(not keys or any(key in SHAPES for key in keys))
+                self._take_over(not keys or any(key in SHAPES for key in keys), not keys)
             sampled = getattr(self, "emission", None) is not None
             self.survey: Survey | None = None
             self.emission: Emission | None = None
             if sampled:  # a frozen rendering cannot make it
                 self._emission()
 
-        def _take_over(self, moved: bool) -> None:
+        def _take_over(self, moved: bool, start: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
             source, settings = self.source, (self.cutoff, self.wrap, self.filtered())
             if source.file and source.is_that_of_file():
                 self.table, self.part = table_of_file(source.file, *settings), source.part
                 return
 
-            def decode(inputs: Arrays) -> KernelParameters:
-                return decode_parameters(source.gaussians(inputs))
-
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved:
-                shape = decode(dr.detach(source.tensors)).shape
+                shape = self.decode(dr.detach(source.tensors)).shape
                 lists = list_gaussians(shape, (self.width, self.height), *settings)
             else:
                 lists = self.table.lists
-            self.table = make_table(lists, self.cutoff, source.tensors, decode)
+            table = make_table(lists, self.cutoff, source.tensors, self.decode)
+            # Who has changed parameters once may change colours next, and needs all lists again.
+            self.table = replace(table, lists=lists) if start else table
             self.part = slice(None)
+
+        def decode(self, inputs: Arrays) -> KernelParameters:
+            """Return the Gaussians of this texture for some parameters; differentiable."""
+            return decode_parameters(self.source.gaussians(inputs))
 
         # --- Lookups -----------------------------------------------------------------------------
 
@@ -176,9 +179,12 @@ def gaussian_texture() -> type:
         @collector_off()
         def eval_1_grad(self, si: Interaction, active: Mask = True) -> mi.Vector2f:
             (x, sx), (y, sy), inside = self.point(si.uv)
-            packed = replace(self.table.packed, arranged=None)  # the copies have no gradients
-            cells, terms = self.table.lists.cells, gradient_terms(packed.radius)
-            count = 3 * packed.channels
+            packed = self.table.packed
+            cells, terms, count = (
+                self.table.lists.cells,
+                gradient_terms(packed),
+                3 * packed.channels,
+            )
             sums = sum_at_points(cells, packed, x, y, inside & active, terms, count)
             values, along, down = (sums[k::3][self.part] for k in range(3))
             background = self.table.background[self.part]
@@ -287,7 +293,7 @@ def gaussian_texture() -> type:
             transform = str(self.to_uv).replace("\n", "\n  ")
             return (
                 f'GaussianTexture[\n  name = "{self.file}",\n'
-                f"  gaussians = {len(self.source.start)},\n"
+                f"  gaussians = {self.source.count},\n"
                 f"  resolution = [{self.width}, {self.height}],\n"
                 f"  space = {self.space},\n  raw = {int(self.raw)},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {angle},\n"

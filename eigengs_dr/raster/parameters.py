@@ -88,15 +88,19 @@ def pack_parameters(values: list) -> Float:
     Returns
     -------
     Float, shape (N * stride,)
-        The stride is the number of parameters, padded to a multiple of 4.
+        The stride is the number of parameters, padded to 2 or a multiple of 4.
     """
-    types = types_of(values[0])
-    stride = -(-len(values) // 4) * 4
+    types, stride = types_of(values[0]), _stride(len(values))
     count = max(dr.width(v) for v in values)
     rows = [*values, *[types.Float(0)] * (stride - len(values))]
     packed = dr.empty(types.Float, stride * count)
     dr.scatter(packed, types.FloatX(rows), dr.arange(types.UInt, count))
     return packed
+
+
+def _stride(number: int) -> int:
+    """Return the number of values from one Gaussian to the next, which gathers in packets allow."""
+    return 2 if number <= 2 else -(-number // 4) * 4
 
 
 def gather_run(
@@ -106,13 +110,15 @@ def gather_run(
 
     Return a list of `length` Float.
     """
-    shape = (length, dr.width(index))
-    return list(dr.gather(types.FloatX, source, index, active, shape=shape))
+    shape, kind = (length, dr.width(index)), types.FloatX
+    if dr.type_v(source) == dr.VarType.Float16:
+        kind = dr.float16_array_t(kind)
+    return list(dr.gather(kind, source, index, active, shape=shape))
 
 
 def unpack_parameters(packed: Float, index: UInt, number: int, active: Mask = True) -> list:
     """Gather the first `number` parameters of the Gaussians `index`; undo `pack_parameters`."""
-    return gather_run(types_of(packed), packed, index, -(-number // 4) * 4, active)[:number]
+    return gather_run(types_of(packed), packed, index, _stride(number), active)[:number]
 
 
 def gather_index(types: ArrayTypes, splat: UInt, i: UInt, active: Bool) -> UInt:
