@@ -69,7 +69,7 @@ def make_survey(texture: Texture) -> Survey:
     """
     with dr.suspend_grad():
         table, size = dr.detach(texture.table), (texture.width, texture.height)
-        parameters = texture.decode(texture.source.tensors)
+        parameters = texture.source.decode(texture.source.tensors)
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
         dr.eval(shape, color)
         smallest = _smallest_deviation(shape, color)

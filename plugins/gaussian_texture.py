@@ -18,8 +18,6 @@ from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, sum_at_points
-from eigengs_dr.raster.parameters import KernelParameters
-from eigengs_dr.raster.render import decode_parameters
 
 from . import properties
 from .color import STEP, luminance, show_all, slope_of, upload_table, upsample
@@ -34,7 +32,7 @@ from .lookup import (
     table_of_file,
 )
 from .memory import resident_bytes
-from .parameters import SHAPES, Arrays
+from .parameters import SHAPES
 from .versions import Interaction, Properties, Texture, register_texture, texture_class
 
 
@@ -131,18 +129,14 @@ def gaussian_texture() -> type:
 
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved:
-                shape = self.decode(dr.detach(source.tensors)).shape
+                shape = source.decode(dr.detach(source.tensors)).shape
                 lists = list_gaussians(shape, (self.width, self.height), *settings)
             else:
                 lists = self.table.lists
-            table = make_table(lists, self.cutoff, source.tensors, self.decode)
+            table = make_table(lists, self.cutoff, source.tensors, source.decode)
             # Who has changed parameters once may change colours next, and needs all lists again.
             self.table = replace(table, lists=lists) if start else table
             self.part = slice(None)
-
-        def decode(self, inputs: Arrays) -> KernelParameters:
-            """Return the Gaussians of this texture for some parameters; differentiable."""
-            return decode_parameters(self.source.gaussians(inputs))
 
         # --- Lookups -----------------------------------------------------------------------------
 

@@ -260,6 +260,10 @@ class TextureParameters:
         unchanged = (t.array.index == self.read[k].array.index for k, t in self.tensors.items())
         return not dr.grad_enabled(self.tensors) and all(unchanged)
 
+    def decode(self, inputs: Arrays) -> KernelParameters:
+        """Return the Gaussians of some `tensors` as kernels take them; differentiable."""
+        return decode_parameters(self.gaussians(inputs))
+
     def gaussians(self, inputs: Arrays) -> Gaussians:
         """Return the set of some `tensors`; gradients flow back to them.
 

@@ -81,15 +81,16 @@ class CellLists:
 
     def pack(self, shape: list, color: list) -> Float:
         """Store parameters (N,) in rows, as sums read them; differentiable."""
-        UInt = type(self.runs)
+        values, blank = [*shape, *color], (*BLANK, *[0.0] * len(color))
         gaussian = self.gaussian
         if gaussian is None:
-            gaussian = dr.arange(UInt, self.count + 1) - 1  # of the blank row, the largest number
-        real = gaussian < self.count
-        blank = (*BLANK, *[0.0] * len(color))
+            return pack_parameters(values, blank)
+        real, one = gaussian < self.count, dr.opaque(types_of(shape[0]).Float, 1.0)
+        # A derivative that is both added to at indices and used elsewhere has lost parts in Dr.Jit
+        # 1.5: the product makes a variable that is only gathered.
         rows = [
-            dr.select(real, dr.gather(type(v), v, gaussian, real), b)
-            for v, b in zip([*shape, *color], blank, strict=True)
+            dr.select(real, dr.gather(type(v), v * one, gaussian, real), b)
+            for v, b in zip(values, blank, strict=True)
         ]
         return pack_parameters(rows)
 
