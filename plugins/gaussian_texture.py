@@ -17,6 +17,7 @@ import numpy as np
 from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.image.color import rendered_as
+from eigengs_dr.raster.lookup.cells import NARROW, SIDE
 from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, sum_at_points
 
 from . import properties
@@ -130,7 +131,8 @@ def gaussian_texture() -> type:
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved:
                 shape = source.decode(dr.detach(source.tensors)).shape
-                lists = list_gaussians(shape, (self.width, self.height), *settings)
+                size, side = (self.width, self.height), SIDE if start else NARROW
+                lists = list_gaussians(shape, size, *settings, side)
             else:
                 lists = self.table.lists
             table = make_table(lists, self.cutoff, source.tensors, source.decode)

@@ -18,7 +18,7 @@ import mitsuba as mi
 from eigengs_dr.backend.detail import indices_of, scope
 from eigengs_dr.backend.types import Bool, Float
 from eigengs_dr.raster.binning.lists import TileLists
-from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
+from eigengs_dr.raster.lookup.cells import SIDE, CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.footprint import bound_covariance
 from eigengs_dr.raster.lookup.points import Packed, invert, sum_at_points, value_terms
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered, where_any
@@ -64,6 +64,7 @@ def list_gaussians(
     cutoff: float,
     wrap: str,
     filtered: bool,
+    side: float = SIDE,
 ) -> Lists:
     """List Gaussians for lookups at points or, if `filtered`, over footprints.
 
@@ -74,11 +75,13 @@ def list_gaussians(
     size : (int, int)
     cutoff, wrap, filtered
         See the properties of the texture.
+    side : float, optional
+        Side of cells in mean distances of Gaussians.
     """
     if filtered:
-        sizes = classify_by_size(shape, *size, cutoff, wrap)
+        sizes = classify_by_size(shape, *size, cutoff, wrap, side)
         return Lists(sizes.cells, sizes)  # slopes and the survey look at points
-    level = shape, cell_side(*size, dr.width(shape))
+    level = shape, cell_side(*size, dr.width(shape), side)
     return Lists(list_cells([level], *size, kernel_radius(cutoff)), None)
 
 

@@ -29,8 +29,11 @@ BLANK = (0.0, 0.0, 1.0, 0.0, 1.0)
 """Shape of a blank row, whose colours are 0."""
 
 SIDE = 1.05
-"""Side of cells in mean distances of Gaussians. With 0.75, a point has 15 % fewer Gaussians to look
-at, but lists take twice the memory."""
+"""Side of cells in mean distances of Gaussians."""
+
+NARROW = 0.75
+"""Side of the cells of Gaussians that change: a point has 15 % fewer Gaussians to look at, in sums
+and in their derivatives, but lists take twice the memory."""
 
 RUN = 4
 """Numbers that a step of a sum reads at once, in one gather: two words of 32 bits."""
@@ -40,15 +43,22 @@ RUN = 4
 class Cells:
     """Square cells of an image, and where their lists begin.
 
+    Numbers are in arrays: lists of Gaussians that have moved may have other cells, and a frozen
+    program would not notice other numbers.
+
     Attributes
     ----------
-    grid : Grid
     starts : UInt32, shape (cells + 1,)
         Index in `CellLists.runs` of the first run of each cell.
+    density : Float, shape (1,)
+        Cells in a pixel, along x or y.
+    columns, rows : UInt32, shape (1,)
     """
 
-    grid: Grid
     starts: UInt
+    density: Float
+    columns: UInt
+    rows: UInt
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,10 @@ class CellLists:
         Gaussians follow the blank row in their order.
     first : UInt32, shape (bands,)
         First row of each band.
-    band : int
-        Height of a band, in pixels.
+    density : Float, shape (1,)
+        Bands in a pixel, along y.
+    last : UInt32, shape (1,)
+        Index of the last band.
     """
 
     count: int
@@ -77,7 +89,8 @@ class CellLists:
     runs: UInt
     gaussian: UInt | None
     first: UInt
-    band: int
+    density: Float
+    last: UInt
 
     def pack(self, shape: list, color: list) -> Float:
         """Store parameters (N,) in rows, as sums read them; differentiable."""
@@ -105,11 +118,11 @@ class CellLists:
 
     def range_at(self, cells: Cells, x: Float, y: Float, active: Bool) -> tuple[UInt, UInt]:
         """Return begin and end of the runs at a point of the image; else both are 0."""
-        types, grid = types_of(x), cells.grid
+        types = types_of(x)
         # The last cells include the right and the lower border.
-        column = dr.minimum(types.UInt(x * (1 / grid.tile[0])), grid.nx - 1)
-        row = dr.minimum(types.UInt(y * (1 / grid.tile[1])), grid.ny - 1)
-        cell = row * grid.nx + column
+        column = dr.minimum(types.UInt(x * cells.density), cells.columns - 1)
+        row = dr.minimum(types.UInt(y * cells.density), cells.rows - 1)
+        cell = row * cells.columns + column
         begin = dr.gather(types.UInt, cells.starts, cell, active)
         return begin, dr.gather(types.UInt, cells.starts, cell + 1, active)
 
@@ -120,17 +133,16 @@ class CellLists:
 
     def first_at(self, y: Float) -> UInt | int:
         """Return the first row of the band at a height in the image."""
-        bands = dr.width(self.first)
-        if bands == 1:
+        if self.gaussian is None:
             return 0
         types = types_of(y)
-        band = dr.minimum(types.UInt(dr.maximum(y, 0) * (1 / self.band)), bands - 1)
+        band = dr.minimum(types.UInt(dr.maximum(y, 0) * self.density), self.last)
         return dr.gather(types.UInt, self.first, band)
 
 
-def cell_side(width: int, height: int, count: int) -> int:
-    """Return the side of cells, in pixels: `SIDE` times the mean distance of Gaussians."""
-    return max(1, round(SIDE * math.sqrt(width * height / count)))
+def cell_side(width: int, height: int, count: int, side: float = SIDE) -> int:
+    """Return the side of cells in pixels, for a side in mean distances of Gaussians."""
+    return max(1, round(side * math.sqrt(width * height / count)))
 
 
 def list_cells(
@@ -169,13 +181,19 @@ def list_cells(
         total += int(begin[-1])
     gaussian = numbered.gaussian
     joint = np.concatenate(found) if total else np.zeros(RUN, np.uint16)
+    cells = []
+    for grid, start in zip(grids, starts, strict=True):
+        density = dr.opaque(types.Float, 1 / grid.tile[0])
+        columns, rows = (dr.opaque(types.UInt, n) for n in (grid.nx, grid.ny))
+        cells.append(Cells(start, density, columns, rows))
     return CellLists(
         count,
-        [Cells(grid, start) for grid, start in zip(grids, starts, strict=True)],
+        cells,
         upload(types.UInt, joint.view(np.uint32)),
         None if gaussian is None else upload(types.UInt, gaussian.astype(np.uint32)),
         upload(types.UInt, numbered.first.astype(np.uint32)),
-        numbered.band,
+        dr.opaque(types.Float, 1 / numbered.band),
+        dr.opaque(types.UInt, len(numbered.first) - 1),
     )
 
 

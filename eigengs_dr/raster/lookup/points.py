@@ -54,19 +54,6 @@ class Packed:
         values = unpack_parameters(self.values, row, number, active)
         return values[:NUM_SHAPE_PARAMS], values[NUM_SHAPE_PARAMS:]
 
-    def follow(self, row: UInt, active: Mask, shape: list, color: list) -> tuple[list, list]:
-        """Return values from rows with their derivatives, which only the `active` ones get.
-
-        To add to rows costs most of a derivative, and half of the Gaussians in the list of a cell
-        weigh nothing at a point of it.
-        """
-        traced = self.gather(row, active)
-        shape, color = (
-            [dr.replace_grad(v, t) for v, t in zip(*rows, strict=True)]
-            for rows in zip((shape, color), traced, strict=True)
-        )
-        return shape, color
-
     def decode(self, shape: list, color: list) -> tuple[list, list]:
         """Return the shape and the channels of Gaussians from rows."""
         if not self.inverted:
@@ -190,20 +177,11 @@ def sum_range(
     """Sum the Gaussians in the runs from begin to end, with another range at each point."""
     types = types_of(packed.values)
     first = lists.first_at(dr.detach(y))
-    followed = dr.grad_enabled(packed.values)
 
     def add(i: UInt, end: UInt, x: Float, y: Float, sums: list) -> tuple:
         here = i < end
         for number in lists.numbers_at(types, i, here):
-            row = number + first
-            shape, color = dr.detach(packed).gather(row, here)
-            if followed:
-                one = [types.Float(1)] * len(color)
-                weight = terms(shape, one, dr.detach(x), dr.detach(y))[0]
-                shape, color = packed.follow(
-                    row, here & (number != 0) & (weight != 0), shape, color
-                )
-            parts = terms(shape, color, x, y)
+            parts = terms(*packed.gather(number + first, here), x, y)
             sums = [s + t for s, t in zip(sums, parts, strict=True)]
         return i + 1, end, x, y, sums
 

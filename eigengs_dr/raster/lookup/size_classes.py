@@ -13,7 +13,7 @@ from ...backend.types import Float, UInt
 from ...gaussian.covariance import max_deviation
 from ..evaluate import widen
 from ..parameters import EXP2_SCALE, kernel_radius
-from .cells import CellLists, cell_side, list_cells
+from .cells import SIDE, CellLists, cell_side, list_cells
 
 MIN_CLASS_SIZE = 1.0
 """Largest standard deviation in the smallest size class, in pixels."""
@@ -71,7 +71,9 @@ class SizeClasses:
     cells: CellLists
 
 
-def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str) -> SizeClasses:
+def classify_by_size(
+    shape: list, width: int, height: int, cutoff: float, wrap: str, side: float = SIDE
+) -> SizeClasses:
     """Sort Gaussians for `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
 
     Parameters
@@ -83,6 +85,8 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
     cutoff : float
         Standard deviations.
     wrap : {"repeat", "mirror", "clamp"}
+    side : float, optional
+        Side of the smallest cells that list Gaussians, in mean distances of Gaussians.
 
     Returns
     -------
@@ -104,17 +108,17 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
         # Means beyond this margin are farther from the image than the cutoff.
         origin = -cutoff * largest
         area = (width - 2 * origin) * (height - 2 * origin)
-        side = max(largest, math.sqrt(area / (2 * len(own))))  # at most two cells a Gaussian
-        columns, rows = (math.ceil((s - 2 * origin) / side) for s in (width, height))
-        column, row = ((v[own] - origin) // side for v in (x, y))
+        length = max(largest, math.sqrt(area / (2 * len(own))))  # at most two cells a Gaussian
+        columns, rows = (math.ceil((s - 2 * origin) / length) for s in (width, height))
+        column, row = ((v[own] - origin) // length for v in (x, y))
         near = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         cell = (row * columns + column)[near].astype(np.int64)
         order.append(own[near][np.argsort(cell, kind="stable")])
         counts.append(np.bincount(cell, minlength=columns * rows))
-        table.append([largest**2, first, columns, rows, 1 / side, origin, 0, 0])
+        table.append([largest**2, first, columns, rows, 1 / length, origin, 0, 0])
         first += columns * rows
     starts = np.cumsum(np.concatenate([[0], *counts] if counts else [[0, 0]]))
-    spreads, cells = _list_widened(shape, width, height, kernel_radius(cutoff))
+    spreads, cells = _list_widened(shape, width, height, kernel_radius(cutoff), side)
     # gather_index reads pairs: the array must have an even length and must not be empty.
     found = np.concatenate([*order, [0]]).astype(np.int64)
     found = np.pad(found, (0, len(found) % 2))
@@ -131,14 +135,14 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
 
 
 def _list_widened(
-    shape: list, width: int, height: int, radius: float
+    shape: list, width: int, height: int, radius: float, side: float
 ) -> tuple[tuple[float, ...], CellLists]:
     """List the Gaussians widened by each of `LISTED_FOOTPRINTS`, all in one array."""
     Float, count = types_of(shape[0]).Float, dr.width(shape)
-    spacing, side = math.sqrt(width * height / count), cell_side(width, height, count)
+    spacing, smallest = math.sqrt(width * height / count), cell_side(width, height, count, side)
     spreads, levels = tuple(k * spacing for k in LISTED_FOOTPRINTS), []
     for number, spread in enumerate(spreads):
         variance = dr.opaque(Float, (spread / EXP2_SCALE) ** 2)
         widened, _ = widen(shape, [variance, Float(0), variance])
-        levels.append((widened, side * COARSER**number))
+        levels.append((widened, smallest * COARSER**number))
     return spreads, list_cells(levels, width, height, radius)
