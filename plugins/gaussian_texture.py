@@ -129,7 +129,7 @@ def gaussian_texture() -> type:
                 return
 
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
-            if moved:
+            if moved or not self.table.lists.cells.packs:
                 shape = source.decode(dr.detach(source.tensors)).shape
                 size, side = (self.width, self.height), SIDE if start else NARROW
                 lists = list_gaussians(shape, size, *settings, side)

@@ -156,7 +156,9 @@ def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) ->
         parameters, size = file.parameters(), (file.like.width, file.like.height)
         lists = list_gaussians(parameters.shape, size, *key)
         table = make_table(lists, cutoff, {}, lambda _: parameters)
-        file.tables.setdefault(key, replace(table, lists=lists))
+        cells = lists.cells.once_packed()
+        sizes = replace(lists.sizes, cells=cells) if lists.sizes else None
+        file.tables.setdefault(key, replace(table, lists=Lists(cells, sizes)))
     return file.tables[key]
 
 

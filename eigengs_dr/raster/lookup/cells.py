@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import drjit as dr
@@ -74,8 +74,8 @@ class CellLists:
         Numbers of 16 bits, in runs of `RUN`: rows of parameters, counted from the first row of the
         band. 0 is the blank row, which fills the last run of a list.
     gaussian : UInt32, shape (rows,), or None
-        Gaussian of each row of parameters; `count` for a blank row. None for one band: the
-        Gaussians follow the blank row in their order.
+        Gaussian of each row of parameters; `count` for a blank row. None for one band, where the
+        Gaussians follow the blank row in their order, and where nobody will pack parameters.
     first : UInt32, shape (bands,)
         First row of each band.
     density : Float, shape (1,)
@@ -92,11 +92,21 @@ class CellLists:
     density: Float
     last: UInt
 
+    @property
+    def packs(self) -> bool:
+        """Whether `pack` knows the rows: it does not after `once_packed`, with several bands."""
+        return self.gaussian is not None or dr.width(self.first) == 1
+
+    def once_packed(self) -> CellLists:
+        """Return the lists without what only `pack` needs."""
+        return replace(self, gaussian=None)
+
     def pack(self, shape: list, color: list) -> Float:
         """Store parameters (N,) in rows, as sums read them; differentiable."""
         values, blank = [*shape, *color], (*BLANK, *[0.0] * len(color))
         gaussian = self.gaussian
         if gaussian is None:
+            assert self.packs
             return pack_parameters(values, blank)
         real, one = gaussian < self.count, dr.opaque(types_of(shape[0]).Float, 1.0)
         # A derivative that is both added to at indices and used elsewhere has lost parts in Dr.Jit
@@ -133,7 +143,7 @@ class CellLists:
 
     def first_at(self, y: Float) -> UInt | int:
         """Return the first row of the band at a height in the image."""
-        if self.gaussian is None:
+        if dr.width(self.first) == 1:
             return 0
         types = types_of(y)
         band = dr.minimum(types.UInt(dr.maximum(y, 0) * self.density), self.last)
