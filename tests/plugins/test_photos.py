@@ -17,7 +17,7 @@ def variant():
 
 
 def wall(texture, light=1.0):
-    """A flat wall whose light is that of its texture: diffuse, with the same light from all sides."""
+    """A diffuse wall under the same light from all sides: it looks like its texture."""
     at, cameras = mi.ScalarTransform4f(), {}
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "pixel_format": "rgb"}
     film["rfilter"] = {"type": "box"}
