@@ -21,19 +21,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from eigengs_dr.backend.recording import guest
 from eigengs_dr.backend.types import Float, Mask, UInt
 from eigengs_dr.gaussian.covariance import max_deviation
 from eigengs_dr.raster.evaluate import widen
-from eigengs_dr.raster.lookup.points import (
-    Packed,
-    cell_side,
-    list_cells,
-    sum_at_points,
-    value_terms,
-)
-from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_covariance, pack_parameters
+from eigengs_dr.raster.lookup.cells import cell_side, list_cells
+from eigengs_dr.raster.lookup.points import Packed, sum_at_points, value_terms
+from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_covariance
 
-from .color import brightness, show_all
+from .color import brightness, keep_finite, show_all
 from .versions import Texture
 
 RESOLVED = 0.65
@@ -72,25 +68,26 @@ def make_survey(texture: Texture) -> Survey:
     texture : mitsuba.Texture
     """
     with dr.suspend_grad():
-        table, size = texture.table, (texture.width, texture.height)
-        shape, color = dr.detach(table.packed).gather_all()
-        color = color[texture.part]
+        table, size = dr.detach(texture.table), (texture.width, texture.height)
+        parameters = texture.source.decode(texture.source.tensors)
+        shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
         dr.eval(shape, color)
         smallest = _smallest_deviation(shape, color)
         columns, lines, spacing = _grid(texture, smallest)
-        cells, deviation = table.lists.cells, RESOLVED * spacing
+        cells, packed, deviation = table.lists.cells, table.packed, RESOLVED * spacing
         if deviation > 1.001 * smallest:
             variance, zero = dr.opaque(mi.Float, deviation**2), mi.Float(0)
             shape, amplitude = widen(shape, kernel_covariance([variance, zero, variance]))
             dr.eval(shape)
             color = [amplitude * c for c in color]
-            side = max(cell_side(*size, dr.width(shape)), round(deviation))
-            cells = list_cells(shape, *size, table.packed.radius, side)
-        packed = Packed(pack_parameters([*shape, *color]), len(color), texture.cutoff)
+            side = max(cell_side(*size, cells.count), round(deviation))
+            cells = list_cells([(shape, side)], *size, packed.radius)
+            packed = Packed(cells.pack(shape, color), len(color), texture.cutoff)
         index = dr.arange(mi.UInt32, columns * lines)
         uv = mi.Point2f(index % columns, index // columns) + 0.5
         (x, _), (y, _), _ = texture.point(uv * mi.Point2f(1 / columns, 1 / lines))
-        sums = sum_at_points(cells, packed, x, y, mi.Bool(True), value_terms(packed.radius))
+        sums = sum_at_points(cells, packed, x, y, mi.Bool(True), value_terms(packed))
+        sums = sums[texture.part] if packed is table.packed else sums
         background = table.background[texture.part]
         seen = show_all(texture, [s + b for s, b in zip(sums, background, strict=True)])
         light = brightness(texture, seen) + dr.zeros(mi.Float, columns * lines)
@@ -127,12 +124,12 @@ def outside_of_recordings(compute: Callable[[], Result]) -> Result:
     """Call a function that launches programs, even while Dr.Jit records one.
 
     Renderers call textures while they record a program, in which nothing can be evaluated. Another
-    thread records nothing.
+    thread records nothing; this one, which waits for it, may hold the lock.
     """
     if not dr.flag(dr.JitFlag.SymbolicScope):
         return compute()
     with ThreadPoolExecutor(1) as another:
-        return another.submit(compute).result()
+        return another.submit(guest()(compute)).result()
 
 
 DARKEST = 0.005

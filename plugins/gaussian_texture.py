@@ -17,9 +17,8 @@ import numpy as np
 from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.image.color import rendered_as
+from eigengs_dr.raster.lookup.cells import NARROW, SIDE
 from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, sum_at_points
-from eigengs_dr.raster.parameters import KernelParameters
-from eigengs_dr.raster.render import decode_parameters
 
 from . import properties
 from .color import STEP, luminance, show_all, slope_of, upload_table, upsample
@@ -34,7 +33,7 @@ from .lookup import (
     table_of_file,
 )
 from .memory import resident_bytes
-from .parameters import SHAPES, Arrays
+from .parameters import SHAPES
 from .versions import Interaction, Properties, Texture, register_texture, texture_class
 
 
@@ -124,30 +123,30 @@ def gaussian_texture() -> type:
             if "prefilter" in keys:
                 self._set_prefilter()
             if not keys or set(keys) - {"to_uv", "prefilter"}:
-                self._take_over(not keys or any(key in SHAPES for key in keys))
+                self._take_over(not keys or any(key in SHAPES for key in keys), not keys)
             sampled = getattr(self, "emission", None) is not None
             self.survey: Survey | None = None
             self.emission: Emission | None = None
             if sampled:  # a frozen rendering cannot make it
                 self._emission()
 
-        def _take_over(self, moved: bool) -> None:
+        def _take_over(self, moved: bool, start: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
             source, settings = self.source, (self.cutoff, self.wrap, self.filtered())
             if source.file and source.is_that_of_file():
                 self.table, self.part = table_of_file(source.file, *settings), source.part
                 return
 
-            def decode(inputs: Arrays) -> KernelParameters:
-                return decode_parameters(source.gaussians(inputs))
-
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
-            if moved:
-                shape = decode(dr.detach(source.tensors)).shape
-                lists = list_gaussians(shape, (self.width, self.height), *settings)
+            if moved or not self.table.lists.cells.packs:
+                shape = source.decode(dr.detach(source.tensors)).shape
+                size, side = (self.width, self.height), SIDE if start else NARROW
+                lists = list_gaussians(shape, size, *settings, side)
             else:
                 lists = self.table.lists
-            self.table = make_table(lists, self.cutoff, source.tensors, decode)
+            table = make_table(lists, self.cutoff, source.tensors, source.decode)
+            # Who has changed parameters once may change colours next, and needs all lists again.
+            self.table = replace(table, lists=lists) if start else table
             self.part = slice(None)
 
         def follow(self, sensor: mi.Sensor) -> None:
@@ -155,14 +154,14 @@ def gaussian_texture() -> type:
             current_angle(sensor)  # it raises where there is none
             filtered, self.sensor = self.filtered(), sensor
             if not filtered:
-                self._take_over(True)
+                self._take_over(True, True)
 
         def _set_prefilter(self) -> None:
             """Take over the parameter ``prefilter``, which may switch footprints on or off."""
             angle = properties.check_angle(float(dr.slice(self.prefilter)))
             filtered, self.angle, self.sensor, self.follows = self.filtered(), angle, None, False
             if filtered != self.filtered():
-                self._take_over(True)
+                self._take_over(True, True)
 
         def _pixel(self) -> Float | None:
             """Return the angle of a pixel; None if rays alone know it."""
@@ -209,9 +208,12 @@ def gaussian_texture() -> type:
                     f"{_name(self)}: a bump map needs heights; this set has x and y of normals"
                 )
             (x, sx), (y, sy), inside = self.point(si.uv)
-            packed = replace(self.table.packed, arranged=None)  # the copies have no gradients
-            cells, terms = self.table.lists.cells, gradient_terms(packed.radius)
-            count = 3 * packed.channels
+            packed = self.table.packed
+            cells, terms, count = (
+                self.table.lists.cells,
+                gradient_terms(packed),
+                3 * packed.channels,
+            )
             sums = sum_at_points(cells, packed, x, y, inside & active, terms, count)
             values, along, down = (sums[k::3][self.part] for k in range(3))
             background = self.table.background[self.part]
@@ -322,7 +324,7 @@ def gaussian_texture() -> type:
             transform = str(self.to_uv).replace("\n", "\n  ")
             return (
                 f'GaussianTexture[\n  name = "{self.file}",\n'
-                f"  gaussians = {len(self.source.start)},\n"
+                f"  gaussians = {self.source.count},\n"
                 f"  resolution = [{self.width}, {self.height}],\n"
                 f"  space = {self.space},\n  raw = {int(self.raw)},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {angle},\n"

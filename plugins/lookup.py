@@ -1,9 +1,5 @@
 """What lookups of ``gaussian_texture`` read, and the lookups: at a point, or over a footprint.
 
-Values come from parameters in the order of the lists, and derivatives from the parameters
-themselves: reading copies is faster, but adding to copies is slower. Dr.Jit leaves the values of
-the second sum out, because nobody needs them.
-
 A material that asks twice about a point pays once. A BSDF looks its textures up in its evaluation
 and again in its sampling, often in one recorded program. Dr.Jit merges equal gathers of a bitmap,
 but not equal loops. Textures of the maps of one file share a table, so they share lookups too:
@@ -22,16 +18,9 @@ import mitsuba as mi
 from eigengs_dr.backend.detail import indices_of, scope
 from eigengs_dr.backend.types import Bool, Float
 from eigengs_dr.raster.binning.lists import TileLists
-from eigengs_dr.raster.lookup.footprint import arrange, bound_covariance
-from eigengs_dr.raster.lookup.points import (
-    Cells,
-    Packed,
-    cell_side,
-    in_list_order,
-    list_cells,
-    sum_at_points,
-    value_terms,
-)
+from eigengs_dr.raster.lookup.cells import SIDE, CellLists, cell_side, list_cells
+from eigengs_dr.raster.lookup.footprint import bound_covariance
+from eigengs_dr.raster.lookup.points import Packed, invert, sum_at_points, value_terms
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered, where_any
 from eigengs_dr.raster.lookup.pyramid import (
     GaussianPyramid,
@@ -43,7 +32,7 @@ from eigengs_dr.raster.lookup.pyramid import (
     sum_pyramid,
 )
 from eigengs_dr.raster.lookup.size_classes import SizeClasses, classify_by_size
-from eigengs_dr.raster.parameters import KernelParameters, kernel_radius, pack_parameters
+from eigengs_dr.raster.parameters import KernelParameters, kernel_radius
 
 from .color import keep_finite
 from .parameters import Arrays, SharedFile, derived
@@ -56,21 +45,26 @@ class Lists:
 
     Attributes
     ----------
-    cells : Cells
+    cells : CellLists
         The Gaussians near every point of an image.
     sizes : SizeClasses or None
         The Gaussians near every footprint; None without a prefilter.
     finest : TileLists or None
-        Those of the finest level of the pyramid; None where nobody will change colours.
+        Those of the finest level of the pyramid; None where nobody has changed parameters.
     """
 
-    cells: Cells
+    cells: CellLists
     sizes: SizeClasses | None
     finest: TileLists | None = None
 
 
 def list_gaussians(
-    shape: list, size: tuple[int, int], cutoff: float, wrap: str, filtered: bool
+    shape: list,
+    size: tuple[int, int],
+    cutoff: float,
+    wrap: str,
+    filtered: bool,
+    side: float = SIDE,
 ) -> Lists:
     """List Gaussians for lookups at points or, if `filtered`, over footprints.
 
@@ -81,12 +75,14 @@ def list_gaussians(
     size : (int, int)
     cutoff, wrap, filtered
         See the properties of the texture.
+    side : float, optional
+        Side of cells in mean distances of Gaussians.
     """
     if filtered:
-        sizes = classify_by_size(shape, *size, cutoff, wrap)
-        return Lists(sizes.listed[0][1], sizes)  # slopes and the survey look at points
-    side = cell_side(*size, dr.width(shape))
-    return Lists(list_cells(shape, *size, kernel_radius(cutoff), side), None)
+        sizes = classify_by_size(shape, *size, cutoff, wrap, side)
+        return Lists(sizes.cells, sizes)  # slopes and the survey look at points
+    level = shape, cell_side(*size, dr.width(shape), side)
+    return Lists(list_cells([level], *size, kernel_radius(cutoff)), None)
 
 
 @dataclass(frozen=True)
@@ -124,30 +120,30 @@ def make_table(
     def compute(inputs: Arrays) -> Arrays:
         parameters = decode(inputs)
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
+        rows = invert(shape, color) if sizes else (shape, color)
         found: Arrays = {
-            "packed": pack_parameters([*shape, *color]),
+            "packed": cells.pack(*rows),
             "background": [keep_finite(b) for b in parameters.background],
         }
-        if sizes is None or finest is None:
-            found["arranged"] = in_list_order(cells.splat, [*shape, *color])
-            dr.eval(found)
-            return found
-        found["arranged"] = arrange(cells.splat, shape, color)
         dr.eval(found)
-        pyramid = build_pyramid(sizes, Packed(found["packed"], len(color), cutoff), finest)
-        found |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
-        dr.eval(found["average"])
+        if sizes is not None and finest is not None:
+            packed = Packed(found["packed"], len(color), cutoff, inverted=True)
+            pyramid = build_pyramid(sizes, packed, finest, shape, color)
+            found |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
+            dr.eval(found["average"])
         return found
 
     found = derived(inputs, compute)
     background, pyramid = found["background"], None
     channels = len(background)
     if sizes is not None:
-        levels = levels_of(sizes.width, sizes.height, sizes.wrap)
-        pyramid = GaussianPyramid(sizes.wrap, channels, levels, found["values"])
-    packed = Packed(found["packed"], channels, cutoff, found["arranged"])
-    kept = replace(lists, finest=finest)
-    return Table(kept, packed, background, pyramid, found.get("average", []))
+        levels = levels_of(sizes.width, sizes.height, cells.count, sizes.wrap)
+        pyramid = GaussianPyramid(sizes.wrap, channels, levels, found["values"], mi.Float(1))
+        pyramid = pyramid if derivatives else pyramid.halved()
+    packed = Packed(found["packed"], channels, cutoff, inverted=sizes is not None)
+    return Table(
+        replace(lists, finest=finest), packed, background, pyramid, found.get("average", [])
+    )
 
 
 def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) -> Table:
@@ -157,10 +153,12 @@ def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) ->
     """
     key = (cutoff, wrap, filtered)
     if key not in file.tables:
-        parameters, size = file.parameters(), (file.gaussians.width, file.gaussians.height)
+        parameters, size = file.parameters(), (file.like.width, file.like.height)
         lists = list_gaussians(parameters.shape, size, *key)
         table = make_table(lists, cutoff, {}, lambda _: parameters)
-        file.tables.setdefault(key, replace(table, lists=lists))
+        cells = lists.cells.once_packed()
+        sizes = replace(lists.sizes, cells=cells) if lists.sizes else None
+        file.tables.setdefault(key, replace(table, lists=Lists(cells, sizes)))
     return file.tables[key]
 
 
@@ -239,12 +237,8 @@ def sum_here(table: Table, x: Float, y: Float, active: Bool) -> list:
     list of Float
         One sum for each channel, without the background.
     """
-
-    def look_up(table: Table, x: Float, y: Float) -> list:
-        terms = value_terms(table.packed.radius)
-        return sum_at_points(table.lists.cells, table.packed, x, y, active, terms)
-
-    return _with_gradient(look_up, table, x, y)
+    packed = table.packed
+    return sum_at_points(table.lists.cells, packed, x, y, active, value_terms(packed))
 
 
 def sum_over_footprint(
@@ -282,22 +276,7 @@ def sum_over_footprint(
     distant = is_minified(pyramid, footprint)
     near, wide = active & ~distant, active & distant & ~blind
 
-    def look_up(table: Table, x: Float, y: Float) -> list:
-        pyramid = table.pyramid
-        assert pyramid
-        sharp = sum_prefiltered(sizes, table.packed, x, y, footprint, near)
-        far = where_any(wide, lambda: sum_pyramid(pyramid, x, y, footprint, wide), table.packed)
-        seen = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
-        return [dr.select(blind, m, s) for m, s in zip(table.average, seen, strict=True)]
-
-    return _with_gradient(look_up, table, x, y)
-
-
-def _with_gradient(look_up: Callable[..., list], table: Table, x: Float, y: Float) -> list:
-    """Return the values of fast lookups with the derivatives of lookups that have some."""
-    if not dr.grad_enabled(table.packed.values):
-        return look_up(table, x, y)
-    values = look_up(*dr.detach((table, x, y)))
-    slow = replace(table, packed=replace(table.packed, arranged=None))
-    carriers = look_up(slow, x, y)
-    return [dr.replace_grad(v, c) for v, c in zip(values, carriers, strict=True)]
+    sharp = sum_prefiltered(sizes, table.packed, x, y, footprint, near)
+    far = where_any(wide, lambda: sum_pyramid(pyramid, x, y, footprint, wide), table.packed)
+    sums = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
+    return [dr.select(blind, m, s) for m, s in zip(table.average, sums, strict=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -29,8 +30,9 @@ def resident_bytes(texture: Texture) -> int:
         Of a ``gaussian_texture``: its parameters and their derivatives, the lists of Gaussians and
         what else lookups read; where its light has been sampled, the distribution of that. Textures
         of one file share arrays, and each counts them. Of another texture: its parameters, as
-        `mitsuba.traverse` shows them. Dr.Jit's allocator takes up to twice as much: it rounds the
-        size of every array up to a power of two.
+        `mitsuba.traverse` shows them, but texels have 1, 2 or 4 channels, as in Dr.Jit's textures:
+        three become four in the first rendering. Dr.Jit's allocator takes up to twice as much: it
+        rounds the size of every array up to a power of two.
 
     Examples
     --------
@@ -39,16 +41,25 @@ def resident_bytes(texture: Texture) -> int:
     >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
     >>> used = resident_bytes(mi.load_dict(texture_of(g)))
     """
-    held = vars(texture) if hasattr(texture, "__dict__") else dict(mi.traverse(texture))
+    if not hasattr(texture, "__dict__"):
+        return sum(_texel_bytes(value) for _, value in mi.traverse(texture))
     arrays: dict[tuple, int] = {}
     sampled = 0
-    for found in _walk(held, {}):
+    for found in _walk(vars(texture), {}):
         if isinstance(found, Emission):
             sampled += found.bytes
             continue
         for array in (found, dr.grad(found)) if dr.grad_enabled(found) else (found,):
             arrays[indices_of([dr.detach(array)])] = dr.width(array) * dr.itemsize_v(array)
     return sum(arrays.values()) + sampled
+
+
+def _texel_bytes(value: Any) -> int:
+    """Return the bytes of a parameter that is an array; of a tensor (..., C) with its padding."""
+    if dr.is_tensor_v(value):
+        *size, channels = value.shape
+        return math.prod(size) * (1 << (channels - 1).bit_length()) * dr.itemsize_v(value.array)
+    return dr.width(value) * dr.itemsize_v(value) if dr.is_jit_v(value) else 0
 
 
 def _walk(tree: Any, seen: dict[int, Any]) -> Iterator[DrJitArray | Emission]:

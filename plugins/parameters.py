@@ -129,8 +129,11 @@ class SharedFile:
 
     Attributes
     ----------
-    gaussians : Gaussians
-        The set, perhaps with maps.
+    like : Gaussians
+        The set without its Gaussians, see `without_arrays`; perhaps with maps.
+    maps : dict
+        For each map by its name, or for the whole set by None: a set like that of the map, and its
+        tensors.
     tables : dict
         What lookups of all channels read, by the properties that it depends on.
     """
@@ -142,9 +145,16 @@ class SharedFile:
             raise ValueError(
                 f"gaussian_texture: {path}: first is {first}; the file has {len(whole)} Gaussians"
             )
-        self.gaussians = whole if first is None else whole[:first]
+        whole = whole if first is None else whole[:first]
+        self.like = without_arrays(whole)
         self.tables: dict[tuple, Any] = {}
-        self.shared = to_tensors(self.gaussians)
+        parts: dict[str | None, Gaussians] = {m.name: whole[m.name] for m in whole.maps}
+        parts = parts or {None: whole}
+        tensors = {name: to_tensors(part) for name, part in parts.items()}
+        shared = {key: next(iter(tensors.values()))[key] for key in SHAPES}
+        self.maps = {
+            name: (without_arrays(part), tensors[name] | shared) for name, part in parts.items()
+        }
 
     def source(self, name: str | None) -> TextureParameters:
         """Return a map, or the whole file, as the source of a texture.
@@ -154,35 +164,36 @@ class SharedFile:
         ValueError
             If the file holds maps and no name is given, has no such map, or holds no maps.
         """
-        maps = self.gaussians.maps
-        names = [m.name for m in maps]
-        if not names and name is not None:
+        if name not in self.maps and None in self.maps:
             raise ValueError(
                 f"gaussian_texture: {self.path} holds one image and no map {name!r}; leave map out"
             )
-        if names and name not in names:
+        if name not in self.maps:
             missing = "holds maps; say which by" if name is None else f"has no map {name!r};"
-            raise ValueError(
-                f"gaussian_texture: {self.path} {missing} map = one of {', '.join(names)}"
-            )
-        if name is None:
-            return TextureParameters(self.gaussians, self.shared, file=self)
-        gaussians = self.gaussians[name]
-        tensors = to_tensors(gaussians) | {key: self.shared[key] for key in SHAPES}
-        return TextureParameters(
-            gaussians, tensors, file=self, part=slices(maps)[names.index(name)]
-        )
+            options = ", ".join(map(str, self.maps))
+            raise ValueError(f"gaussian_texture: {self.path} {missing} map = one of {options}")
+        names = list(self.maps)
+        part = slice(None) if name is None else slices(self.like.maps)[names.index(name)]
+        return TextureParameters(*self.maps[name], file=self, part=part)
 
     def parameters(self) -> KernelParameters:
         """Return the parameters of all channels, decoded map by map."""
-        names = [m.name for m in self.gaussians.maps]
-        parts = [decode_parameters(self.gaussians[n]) for n in names]
-        if not parts:
-            return decode_parameters(self.gaussians)
-        color = [c for part in parts for c in part.color]
+        parts = [decode_parameters(from_tensors(t, like)) for like, t in self.maps.values()]
         return KernelParameters(
-            parts[0].shape, color, [b for part in parts for b in part.background]
+            parts[0].shape,
+            [c for part in parts for c in part.color],
+            [b for part in parts for b in part.background],
         )
+
+
+def without_arrays(gaussians: Gaussians) -> Gaussians:
+    """Return a set of one Gaussian that gives the size, the space and the channels of a set.
+
+    Tensors hold the Gaussians of a texture: a second copy would take as much memory.
+    """
+    one = gaussians[:1]
+    dr.eval(one.mean, one.factor, one.color, one.background)
+    return one
 
 
 _files: WeakValueDictionary[tuple, SharedFile] = WeakValueDictionary()
@@ -217,6 +228,7 @@ class TextureParameters:
     Attributes
     ----------
     start : Gaussians
+        Those of a model at its mean, or a set like that of the texture, from `without_arrays`.
     read : dict of str to TensorXf
         The parameters at the start.
     tensors : dict of str to TensorXf
@@ -238,10 +250,19 @@ class TextureParameters:
         # Own objects, so that each texture has its own gradient, of one memory.
         self.tensors = {name: type(t)(t) for name, t in self.read.items()}
 
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return int(self.tensors["mean"].shape[0]) if "mean" in self.tensors else len(self.start)
+
     def is_that_of_file(self) -> bool:
         """Return whether the parameters have the memory of the file: nobody has changed them."""
         unchanged = (t.array.index == self.read[k].array.index for k, t in self.tensors.items())
         return not dr.grad_enabled(self.tensors) and all(unchanged)
+
+    def decode(self, inputs: Arrays) -> KernelParameters:
+        """Return the Gaussians of some `tensors` as kernels take them; differentiable."""
+        return decode_parameters(self.gaussians(inputs))
 
     def gaussians(self, inputs: Arrays) -> Gaussians:
         """Return the set of some `tensors`; gradients flow back to them.

@@ -175,7 +175,7 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
     name = key if key.endswith(".data") else f"{key}.data"
     if name in known:
         return name
-    bitmaps = [k.removesuffix(".data") for k in known if k.endswith(".data")]
+    bitmaps = [k.removesuffix(".data") for k, _ in known if k.endswith(".data")]
     close = get_close_matches(key, bitmaps, 1) or bitmaps
     raise ValueError(
         f"photo_loss: the scene has no bitmap {key!r}; "

@@ -14,7 +14,7 @@ from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.color import SPACES
 
-from .parameters import TextureParameters, model_source, shared_file
+from .parameters import TextureParameters, model_source, shared_file, without_arrays
 from .versions import Properties
 
 WRAPS = ("repeat", "mirror", "clamp")
@@ -65,7 +65,7 @@ def source_of(props: Properties) -> TextureParameters:
         source = shared_file(_path(props, "filename"), backend, first or None).source(name or None)
     else:
         gaussians = _from_arrays(props, backend)
-        source = TextureParameters(gaussians, to_tensors(gaussians))
+        source = TextureParameters(without_arrays(gaussians), to_tensors(gaussians))
     if source.start.channels > 3:
         raise ValueError(
             f"gaussian_texture: the set has {source.start.channels} channels; use a set of 1 to 3"

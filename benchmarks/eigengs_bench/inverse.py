@@ -53,6 +53,7 @@ class Scene(NamedTuple):
     count: int
     maps: Maps
     photos: Sequence[Image]  # of the cameras, and of the judges
+    seen: Image  # how much the photos depend on each texel
     spp: int
 
 
@@ -177,7 +178,7 @@ def _jobs(task: Task) -> Iterator[Job]:
     for kind in PHOTOS:
         maps = maps_of(kind)
         for count in MATERIAL_CAMERAS if kind == "material" else CAMERAS:
-            photos = photos_of(mi, kind, maps, count)
+            photos, seen = photos_of(mi, kind, maps, count), seen_in(mi, kind, maps, count)
             settings = [(steps, SPP) for steps in STEPS]
             settings += [(NOISY_STEPS, spp) for spp in NOISES]
             for steps, spp in settings:
@@ -185,7 +186,7 @@ def _jobs(task: Task) -> Iterator[Job]:
                     if method in SINGLE and (len(maps) > 1 or spp != SPP):
                         continue
                     job = {"scene": kind, "cameras": count, "method": method, "steps": steps}
-                    scene = Scene(kind, count, maps, photos, spp)
+                    scene = Scene(kind, count, maps, photos, seen, spp)
                     yield {**job, "spp": spp}, partial(recover, mi, scene, method, steps)
 
 
@@ -236,16 +237,17 @@ def judge(mi: Any, scene: Scene, found: Maps) -> Row:
 
 
 def _judge_maps(scene: Scene, found: Maps) -> Row:
-    """Return the PSNRs of maps, and of the best constant in place of each."""
+    """Return the PSNRs of maps where they are seen, and of the best constant in place of each."""
     row = {}
     for name, true in scene.maps.items():
-        constant = np.broadcast_to(true.mean(axis=(0, 1)), true.shape)
+        mean = np.average(true.reshape(-1, true.shape[2]), axis=0, weights=scene.seen.ravel())
+        constant = np.broadcast_to(mean, true.shape)
         for key, picture in ((name, found[name]), (f"{name}_constant", constant)):
-            pair = np.clip(picture, 0, 1), true
+            pair = [np.clip(values, 0, 1) for values in (picture, true)]
             if SPACES[name] == "linear":
-                row[key] = eg.psnr(*(to_coded(p) for p in pair))
-            else:
-                row[key] = float(-10 * np.log10(np.mean(np.square(pair[0] - pair[1]))))
+                pair = [to_coded(values) for values in pair]
+            error = np.mean(np.square(pair[0] - pair[1]), axis=2)
+            row[key] = float(-10 * np.log10(np.average(error, weights=scene.seen)))
     return row
 
 
@@ -259,7 +261,7 @@ def maps_of(kind: str) -> Maps:
     maps = {}
     for name, photo in PHOTOS[kind].items():
         codes = np.clip(center_crop(eg.sample(photo), TEXELS, TEXELS), 0, 1)
-        rough = 0.2 + 0.6 * codes.mean(axis=2, keepdims=True)
+        rough = 0.1 + 0.8 * codes.mean(axis=2, keepdims=True)
         maps[name] = to_linear(codes) if SPACES[name] == "linear" else rough.astype(np.float32)
     return maps
 
@@ -267,6 +269,17 @@ def maps_of(kind: str) -> Maps:
 def photos_of(mi: Any, kind: str, maps: Maps, count: int) -> list[Image]:
     """Render the photos of the cameras and of the judges."""
     return _photos(mi, scene_of(mi, kind, _bitmaps(mi, maps), count), 0)
+
+
+def seen_in(mi: Any, kind: str, maps: Maps, count: int) -> Image:
+    """Return the derivative of the mean of the photos by the colour of each texel."""
+    scene = scene_of(mi, kind, _bitmaps(mi, maps), count)
+    parameters, key = mi.traverse(scene), f"{next(iter(NAMES[kind].values()))}.data"
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    for camera in range(count):
+        dr.backward(dr.mean(mi.render(scene, parameters, sensor=camera, spp=SPP), axis=None))
+    return np.maximum(dr.grad(parameters[key]).numpy().sum(axis=2), 0)
 
 
 def grey(name: str) -> Image:
@@ -391,7 +404,8 @@ def _materials(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table
                 cells = [number(value) for value in [*figures, row["roughness_constant"]]]
                 lines.append((name, method, f"{steps}", *cells))
     columns = ("photos", "method", "steps", "seconds", "albedo", "roughness", "best constant")
-    return table("PSNRs of the maps of a material in dB", columns, lines, name="materials")
+    caption = "PSNRs of the maps of a material in dB, weighed by what photos see"
+    return table(caption, columns, lines, name="materials")
 
 
 def _chart(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Figure:

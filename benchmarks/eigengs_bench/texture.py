@@ -32,8 +32,9 @@ PIXELS = 32  # of the picture of a file, for each of its Gaussians
 def run(task: Task, variant: str) -> list[Row]:
     """Time a material ball with each texture in turn, in one run; every figure is a median.
 
-    `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_prefiltered` with
-    5,000 and the prefilter, `ratio_step` picture and gradient of all parameters by `prb`.
+    `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_filtered_N` with
+    the prefilter, `ratio_prefiltered` that of 5,000, and `ratio_step` picture and gradient of all
+    parameters by `prb`.
     `ratio_maps` is what colour, roughness and normal of one file add over what its colour adds.
     `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
     `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
@@ -107,14 +108,14 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
     coded = np.clip(eg.picture_of(sets[SETTLED], TEXELS, TEXELS), 0, 1)
     data = mi.TensorXf(to_linear(coded).astype(np.float32))
     plain = ball(mi, {"type": "bitmap", "data": data, "raw": True})
-    scenes = {f"gaussians_{n}": ball(mi, texture_of(sets[n])) for n in COUNTS}
+    scenes = {f"gaussians_{n}": ball(mi, texture_of(sets[n])) for n in counts}
     angle = pixel_angle(plain.sensors()[0])
-    filtered = ball(mi, texture_of(sets[SETTLED], prefilter=angle))
+    for n in CHANGED:
+        scenes[f"filtered_{n}"] = ball(mi, texture_of(sets[n], prefilter=angle))
     settled = scenes[f"gaussians_{SETTLED}"]
     programs: dict[str, Callable[[], Any]] = {
         "bitmap": partial(mi.render, plain),
         **{name: partial(mi.render, scene) for name, scene in scenes.items()},
-        "prefiltered": partial(mi.render, filtered),
         "step_bitmap": _step(mi, plain),
         "step_gaussians": _step(mi, settled),
     }
@@ -136,8 +137,9 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
     return {
         **hold(mi, angle, progress),
         **{f"{name}_ms": ms for name, ms in timed.items()},
-        **{f"ratio_{n}": timed[f"gaussians_{n}"] / timed["bitmap"] for n in COUNTS},
-        "ratio_prefiltered": timed["prefiltered"] / timed["bitmap"],
+        **{f"ratio_{n}": timed[f"gaussians_{n}"] / timed["bitmap"] for n in counts},
+        **{f"ratio_filtered_{n}": timed[f"filtered_{n}"] / timed["bitmap"] for n in CHANGED},
+        "ratio_prefiltered": timed[f"filtered_{SETTLED}"] / timed["bitmap"],
         "ratio_step": timed["step_gaussians"] / timed["step_bitmap"],
         "ratio_maps": (timed["maps_3"] - timed["maps_0"]) / (timed["maps_1"] - timed["maps_0"]),
     }

@@ -172,8 +172,10 @@ def gather_run(
 
     Return a list of `length` Float.
     """
-    shape = (length, dr.width(index))
-    return list(dr.gather(types.FloatX, source, index, active, shape=shape))
+    shape, kind = (length, dr.width(index)), types.FloatX
+    if dr.type_v(source) == dr.VarType.Float16:
+        kind = dr.float16_array_t(kind)
+    return list(dr.gather(kind, source, index, active, shape=shape))
 
 
 TANH_NUMERATOR = (-9.64399179425052238628e-1, -9.92877231001918586564e1, -1.61468768441708447952e3)

@@ -271,18 +271,30 @@ def widen(shape: list, footprint: list) -> tuple[list, Float]:
     amplitude : Float
         In (0, 1].
     """
+    mean_x, mean_y, p, t, r = inverted(shape)
+    widened, scale = widen_inverted([mean_x, mean_y, p, t, r], footprint)
+    return widened, p * r * scale
+
+
+def inverted(shape: list) -> list:
+    """Return the mean, and p, t, r of the inverse ``[[p, t], [0, r]]`` of the factor."""
     mean_x, mean_y, a, b, c = shape
+    p, r = rcp(a), rcp(c)
+    return [mean_x, mean_y, p, -b * p * r, r]
+
+
+def widen_inverted(shape: list, footprint: list) -> tuple[list, Float]:
+    """Convolve as `widen`; the shape is from `inverted`, and the amplitude lacks a factor p r."""
+    mean_x, mean_y, p, t, r = shape
     fxx, fxy, fyy = footprint
-    ia, ic = rcp(a), rcp(c)
-    t = -b * ia * ic  # F^-1 = [[1/a, t], [0, 1/c]]
-    xy = dr.fma(t, ic, fxy)
-    yy = dr.fma(ic, ic, fyy)
+    xy = dr.fma(t, r, fxy)
+    yy = dr.fma(r, r, fyy)
     # det(S + F) = det S + tr(adj(S) F) + det F is a sum of squares. The plain formula xx yy - xy^2
     # loses all digits for very elongated Gaussians.
-    across = dr.fma(ic * ic, fxx, t * dr.fma(t, fyy, -2 * ic * fxy))
-    whole = ia * ic
+    across = dr.fma(r * r, fxx, t * dr.fma(t, fyy, -2 * r * fxy))
+    whole = p * r
     added = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0) + dr.maximum(across, 0)
-    scale = rsqrt(dr.fma(whole, whole, dr.fma(ia * ia, fyy, added)))
+    scale = rsqrt(dr.fma(whole, whole, dr.fma(p * p, fyy, added)))
     new_c = rsqrt(yy)
     scaled = new_c * scale
-    return [mean_x, mean_y, yy * scaled, -xy * scaled, new_c], whole * scale
+    return [mean_x, mean_y, yy * scaled, -xy * scaled, new_c], scale

@@ -310,12 +310,25 @@ def test_inverse(monkeypatch, tmp_path):
     pytest.importorskip("mitsuba")
     from eigengs_bench import inverse
 
-    small = {"SIDE": 16, "TEXELS": 64, "MANY": 4, "STEPS": (4, 16), "CAMERAS": (2,)}
-    for name, value in (small | {"LATTICES": (4, 8), "PHOTOS": {"ball": "coffee"}}).items():
+    small = {"SIDE": 16, "TEXELS": 64, "MANY": 4, "STEPS": (4, 16), "CAMERAS": (2,), "NOISES": ()}
+    small |= {"SIDES": (4, 8), "MATERIAL_CAMERAS": (2,)}
+    photos = {"ball": {"color": "coffee"}, "material": {"albedo": "coffee", "roughness": "coffee"}}
+    for name, value in (small | {"PHOTOS": photos}).items():
         monkeypatch.setattr(inverse, name, value)
     rows, text = answered(tmp_path / "out", "inverse", "--backend", "llvm")
-    short, long = rows[:4], rows[4:]
-    assert [found["job"]["method"] for found in long] == [m.__name__ for m in inverse.METHODS]
-    for first, then in zip(short, long, strict=True):
-        assert 0 < first["seconds"] < then["seconds"] and 5 < first["psnr_rgb"] < then["psnr_rgb"]
-    assert "ball, 2 cameras" in text and "16" in text
+    ball, material = rows[:10], rows[10:]
+    for first, then in zip(ball[:5], ball[5:], strict=True):
+        assert first["job"]["method"] == then["job"]["method"] in inverse.METHODS
+        assert first["seconds"] > 0 and 5 < first["psnr_rgb"] < then["psnr_rgb"]
+    assert [row["job"]["method"] for row in material] == ["texels", "pyramid", "fit"] * 2
+    assert all(row["albedo"] > 5 and row["roughness_constant"] > 5 for row in material)
+    assert "ball, 2 cameras" in text and "dB at equal seconds" in text
+
+
+def test_gain_at_equal_seconds():
+    """Half-way in the logarithm of the seconds lies half the gain of the pyramid."""
+    from eigengs_bench import inverse
+
+    pyramid = {k: {"seconds": s, "psnr_rgb": p} for k, s, p in ((1, 1, 30), (2, 4, 40))}
+    fits = {k: {"seconds": s, "psnr_rgb": 36} for k, s in ((1, 2), (2, 8), (3, 0.5))}
+    assert inverse.gain({"pyramid": pyramid, "fit": fits}) == pytest.approx([1, -4, 6])

@@ -8,6 +8,7 @@ import eigengs_dr as eg
 from _helpers.sets import SIZE
 from _helpers.texture import backend, gaussians, mi, texel_centres, texture
 from eigengs_dr.plugins import texture_of
+from eigengs_dr.raster.lookup import cells
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -70,11 +71,36 @@ def test_colours_alone_keep_the_lists(prefilter, of_file, tmp_path):
     for seed in range(3):
         moved(parameters, COLORS, seed)
         lists.append(tex.table.lists)
-        assert lists[-1].cells is start.cells and lists[-1].sizes is start.sizes
+        assert lists[-1].cells.runs is start.cells.runs
+        assert (lists[-1].sizes and lists[-1].sizes.row) is (start.sizes and start.sizes.row)
         assert lists[-1].finest is lists[0].finest
     assert (lists[0].finest is not None) == (prefilter > 0)
     moved(parameters, ("mean",), 3)
-    assert tex.table.lists.cells is not start.cells
+    assert tex.table.lists.cells.runs is not start.cells.runs
+
+
+@pytest.mark.parametrize("prefilter", PREFILTERS)
+def test_a_file_of_more_gaussians_than_16_bits_number(prefilter, tmp_path, monkeypatch):
+    """It keeps no rows by Gaussian, and the first change of colours finds them again."""
+    size, random = (64, 256), np.random.default_rng(0)
+    arrays = random.uniform(0, 1, (60, 2)) * size, np.tile([0.4, 0.1, 0.5], (60, 1))
+    color, last = random.uniform(-0.1, 0.1, (60, 3)), [0.5] * 3
+
+    def set_of(scale):
+        options = {"size": size, "space": "linear", "backend": backend()}
+        return eg.Gaussians.from_arrays(*arrays, scale * color, last, **options)
+
+    expected = [seen(texture(set_of(scale), prefilter=prefilter)) for scale in (1, 0.5)]
+    monkeypatch.setattr(cells, "MOST", 50)
+    set_of(1).save(tmp_path / "x.npz")
+    path = str(tmp_path / "x.npz")
+    tex = mi.load_dict({"type": "gaussian_texture", "filename": path, "prefilter": prefilter})
+    assert not tex.table.lists.cells.packs
+    np.testing.assert_allclose(seen(tex), expected[0], atol=2e-5)
+    parameters = mi.traverse(tex)
+    parameters["color"] = 0.5 * parameters["color"]
+    parameters.update()
+    np.testing.assert_allclose(seen(tex), expected[1], atol=2e-5)
 
 
 def derivatives(tex, names, mode):

@@ -1,5 +1,8 @@
 """Derivatives through Mitsuba's integrators, parameters from a model, what optimisers leave."""
 
+import gc
+import weakref
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -142,6 +145,20 @@ class TestIntegrators:
         """In another process: after an error in a walk, Dr.Jit 1.5 may end it when it exits."""
         told = run_python(FORWARD_WITH_PREFILTER).stdout
         assert told.startswith("gaussian_texture: no forward mode with a prefilter")
+
+
+@pytest.mark.parametrize("prefilter", [0.0, 0.05])
+def test_derivatives_that_nobody_walks_keep_nothing_alive(prefilter):
+    """Operations that hold their texture would be left when the process ends, and end it badly."""
+    tex = texture(gaussians(), prefilter=prefilter)
+    parameters = mi.traverse(tex)
+    dr.enable_grad(parameters["color"])
+    parameters.update()
+    dr.eval(tex.eval_3(in_front(at(0.3, 0.4))))
+    table = weakref.ref(tex.table)
+    del tex, parameters
+    gc.collect()
+    assert table() is None
 
 
 class TestBroken:

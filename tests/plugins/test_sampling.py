@@ -6,7 +6,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.sets import SIZE
-from _helpers.texture import at, backend, gaussians, mi, texel_centres, texture
+from _helpers.texture import at, backend, gaussians, mi, small_scene, texel_centres, texture
 from _helpers.variants import in_variants, on_both
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.image.color import to_linear
@@ -141,3 +141,12 @@ class TestSampling:
                 frozen(tex, sample), tex.sample_position(sample), strict=True
             ):
                 np.testing.assert_allclose(np.array(found), np.array(expected), atol=1e-6)
+
+
+def test_a_lamp_renders_inside_of_the_lock():
+    """The survey is made in another thread, for which the thread that holds the lock waits."""
+    scene = small_scene(None, emitter={"type": "area", "radiance": texture(gaussians())})
+    with eg.exclusive():
+        image = mi.render(scene, spp=1)
+        dr.eval(image)
+    assert np.isfinite(np.array(image)).all()

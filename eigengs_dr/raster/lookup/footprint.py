@@ -7,10 +7,10 @@ import math
 import drjit as dr
 
 from ...backend.arrays import rcp, rsqrt
-from ...backend.types import Bool, Float, UInt
-from ..evaluate import falloff, weights, widen
+from ...backend.types import Bool, Float
+from ..evaluate import falloff
 from ..parameters import EXP2_SCALE, kernel_covariance
-from .points import Packed, Terms, in_list_order
+from .points import Packed, Terms
 
 MAX_FOOTPRINT = 0.4
 """Largest standard deviation of a footprint, in widths and heights of the texture. A footprint that
@@ -49,6 +49,14 @@ def bound_covariance(metric: list) -> tuple[list, Bool]:
     round_one = (MAX_FOOTPRINT**2, 0.0, MAX_FOOTPRINT**2)
     covariance = [dr.select(blind, r, c) for r, c in zip(round_one, covariance, strict=True)]
     return covariance, blind
+
+
+def extreme_variances(footprint: list) -> tuple[Float, Float]:
+    """Return the smallest and the largest variance of a footprint in any direction."""
+    xx, xy, yy = footprint
+    middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    root = dr.sqrt(dr.fma(half, half, xy * xy))
+    return middle - root, middle + root
 
 
 def inside_share(
@@ -113,43 +121,7 @@ def quick_erf(x: Float) -> Float:
 
 
 def filtered_terms(packed: Packed, footprint: list) -> Terms:
-    """Return the `Terms` of the filtered sum, without borders; `packed` may come from `arrange`."""
-    if packed.arranged is not None:
-        return _arranged_terms(footprint, packed.radius)
-    scaled = kernel_covariance(footprint)
-
-    def terms(shape: list, color: list, x: Float, y: Float) -> list:
-        shape, amplitude = widen(shape, scaled)
-        (w,) = weights(shape, x, y, (1, 1), packed.radius)
-        w = w * amplitude
-        return [w * c for c in color]
-
-    return terms
-
-
-def arrange(splat: UInt, shape: list, color: list) -> Float | None:
-    """Copy the parameters of a set to the order of lists, for `filtered_terms`.
-
-    Parameters
-    ----------
-    splat : UInt32
-        Entries of the lists.
-    shape, color : list of Float, shape (N,)
-
-    Returns
-    -------
-    Float, or None
-        From `eigengs_dr.raster.lookup.points.in_list_order`: the mean, the inverse
-        ``[[p, t], [0, r]]`` of the factor, and the colours times its determinant.
-    """
-    mean_x, mean_y, a, b, c = shape
-    p, r = rcp(a), rcp(c)
-    rows = [mean_x, mean_y, p, -b * p * r, r, *[k * p * r for k in color]]
-    return in_list_order(splat, rows)
-
-
-def _arranged_terms(footprint: list, radius: float) -> Terms:
-    """Return the same terms for the parameters of `arrange`, in fewer operations.
+    """Return the `Terms` of the filtered sum, without borders, from inverted rows.
 
     With ``Sigma' = [[xx, xy], [xy, yy]]`` and its determinant D, the exponent
     ``d^T Sigma'^-1 d`` is ``((yy dx - xy dy)^2 / D + dy^2) / yy``; see
@@ -157,6 +129,7 @@ def _arranged_terms(footprint: list, radius: float) -> Terms:
     """
     fxx, fxy, fyy = kernel_covariance(footprint)
     own = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
+    limit = packed.radius * packed.radius
 
     def terms(shape: list, color: list, x: Float, y: Float) -> list:
         mean_x, mean_y, p, t, r = shape
@@ -166,7 +139,7 @@ def _arranged_terms(footprint: list, radius: float) -> Terms:
         pp = p * p
         scale = rsqrt(dr.fma(pp, yy, own + dr.maximum(across, 0)))
         along = dr.fma(yy, dx, -xy * dy) * scale
-        w = falloff(dr.fma(along, along, dy * dy) * rcp(yy), radius * radius) * scale
+        w = falloff(dr.fma(along, along, dy * dy) * rcp(yy), limit) * scale
         return [w * c for c in color]
 
     return terms

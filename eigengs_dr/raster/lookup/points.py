@@ -1,6 +1,5 @@
 """The sum of Gaussians at scattered points, for the lookups of textures.
 
-The image is divided into cells, and each cell lists the Gaussians whose cutoff ellipse touches it.
 The cost of a point depends on the Gaussians near it, not on the size of the set. Virtual function
 calls of Dr.Jit do not support custom derivatives, so Dr.Jit's own autodiff gives the gradients with
 respect to the packed parameters.
@@ -8,24 +7,16 @@ respect to the packed parameters.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 
-from ...backend.arrays import types_of
+from ...backend.arrays import rcp, types_of
 from ...backend.types import Bool, Float, Mask, UInt
-from ..binning.lists import build_lists
-from ..binning.tiles import Grid
-from ..evaluate import LN2, weights
-from ..parameters import (
-    NUM_SHAPE_PARAMS,
-    gather_index,
-    kernel_radius,
-    pack_parameters,
-    unpack_parameters,
-)
+from ..evaluate import LN2, inverted, weights
+from ..parameters import NUM_SHAPE_PARAMS, kernel_radius, unpack_parameters
+from .cells import CellLists
 
 Terms = Callable[[list, list, Float, Float], list]
 """``terms(shape, color, x, y)`` returns what a Gaussian contributes to each sum at a point."""
@@ -38,117 +29,57 @@ class Packed:
     Attributes
     ----------
     values : Float
-        From `eigengs_dr.raster.parameters.pack_parameters`: 5 of the shape, then the channels; may
+        From `eigengs_dr.raster.lookup.cells.CellLists.pack`: 5 of the shape, then the channels; may
         carry gradients.
     channels : int
     cutoff : float
         Standard deviations.
-    arranged : Float or None
-        Copies in the order of lists, from `in_list_order`, which take the place of `values`.
+    inverted : bool
+        Whether the rows are those of `invert`, for sums over footprints.
     """
 
     values: Float
     channels: int
     cutoff: float
-    arranged: Float | None = None
+    inverted: bool = False
 
     @property
     def radius(self) -> float:
         """The cutoff in the units of the kernels."""
         return kernel_radius(self.cutoff)
 
-    def gather(self, index: UInt, active: Mask = True) -> tuple[list, list]:
-        """Return the shape and the channels of the Gaussians `index`."""
+    def gather(self, row: UInt, active: Mask = True) -> tuple[list, list]:
+        """Return the shape and the channels in rows, as they are stored."""
         number = NUM_SHAPE_PARAMS + self.channels
-        rows = unpack_parameters(self.values, index, number, active)
-        return rows[:NUM_SHAPE_PARAMS], rows[NUM_SHAPE_PARAMS:]
+        values = unpack_parameters(self.values, row, number, active)
+        return values[:NUM_SHAPE_PARAMS], values[NUM_SHAPE_PARAMS:]
 
-    def gather_all(self) -> tuple[list, list]:
-        """Return the shape and the channels of all Gaussians."""
-        stride = -(-(NUM_SHAPE_PARAMS + self.channels) // 4) * 4
-        return self.gather(dr.arange(types_of(self.values).UInt, dr.width(self.values) // stride))
-
-
-@dataclass(frozen=True)
-class Cells:
-    """Indices of the Gaussians that may touch each cell.
-
-    Attributes
-    ----------
-    grid : Grid
-    splat : UInt32, shape (capacity,)
-        Indices of Gaussians, cell after cell.
-    ends : UInt32, shape (2 * cells,)
-        Begin and end in `splat` of the list of each cell.
-    """
-
-    grid: Grid
-    splat: UInt
-    ends: UInt
+    def decode(self, shape: list, color: list) -> tuple[list, list]:
+        """Return the shape and the channels of Gaussians from rows."""
+        if not self.inverted:
+            return shape, color
+        mean_x, mean_y, p, t, r = shape
+        a, c = rcp(p), rcp(r)
+        return [mean_x, mean_y, a, -t * a * c, c], [k * a * c for k in color]
 
 
-def cell_side(width: int, height: int, count: int) -> int:
-    """Return the side of cells, in pixels: 0.8 times the spacing of Gaussians, as a power of two.
-
-    Cells of half this side save 3 % of the time of a rendering, because their lists hold fewer
-    Gaussians that miss the point, but the lists take three times as long to build.
-    """
-    spacing = math.sqrt(width * height / count)
-    return 1 << max(0, round(math.log2(0.8 * spacing)))
-
-
-def list_cells(shape: list, width: int, height: int, radius: float, side: int) -> Cells:
-    """List the Gaussians of every cell of an image.
+def invert(shape: list, color: list) -> tuple[list, list]:
+    """Return the parameters of Gaussians from which sums over footprints take fewer operations.
 
     Parameters
     ----------
-    shape : list of 5 Float, shape (N,)
-        Mean x, mean y, a, b, c, as for `eigengs_dr.raster.evaluate.weights`.
-    width, height : int
-        Size of the image, in pixels.
-    radius : float
-        Cutoff in the units of the factor.
-    side : int
-        Side of a cell, in pixels.
-    """
-    grid = Grid(width, height, (side, side))
-    # Lists are built for pixel centres; half a pixel of padding makes them valid for all points.
-    lists = build_lists(shape, radius, grid, pad=0.5, adjoint=False, ordered=False)
-    types = types_of(shape[0])
-    ends = dr.empty(types.UInt, 2 * grid.tiles)
-    dr.scatter(ends, types.UInt2(lists.begin, lists.end), lists.order)
-    dr.eval(lists.splat, ends)
-    return Cells(grid, lists.splat, ends)
-
-
-MAX_ARRANGED = 1 << 20
-"""Largest number of entries of lists whose parameters are copied; the copies take 32 MiB, or with
-16 channels 96."""
-
-
-def in_list_order(splat: UInt, rows: list) -> Float | None:
-    """Copy parameters to the order of the lists, for lookups without gradients.
-
-    A lookup then reads neighbours in memory and needs no index. The adjoint would be slower, since
-    it would add to the copies first.
-
-    Parameters
-    ----------
-    splat : UInt32
-        Entries of `Cells.splat`.
-    rows : list of Float, shape (N,)
-        One array for each parameter.
+    shape, color : list of Float, shape (N,)
 
     Returns
     -------
-    Float, or None
-        As from `eigengs_dr.raster.parameters.pack_parameters`, an entry for each of the lists.
-        None if there are more than `MAX_ARRANGED`.
+    shape : list of 5 Float
+        See `eigengs_dr.raster.evaluate.inverted`.
+    color : list of Float
+        The colours times the determinant of the inverse.
     """
-    if dr.width(splat) > MAX_ARRANGED:
-        return None
-    packed = pack_parameters([dr.detach(row) for row in rows])
-    return pack_parameters(unpack_parameters(packed, splat, len(rows)))
+    shape = inverted(shape)
+    determinant = shape[2] * shape[4]
+    return shape, [k * determinant for k in color]
 
 
 def fold(x: Float, side: int, wrap: str) -> tuple[Float, Float]:
@@ -200,18 +131,8 @@ def near_image(x: Float, side: int) -> Float:
     return dr.clip(dr.select(dr.isfinite(x), x, 0), -1.5 * side, 2.5 * side)
 
 
-def cell_range(cells: Cells, x: Float, y: Float, active: Bool) -> tuple[UInt, UInt]:
-    """Return begin and end of the list of the cell at a point of the image; else both are 0."""
-    types, grid = types_of(x), cells.grid
-    # The last cells include the right and the lower border.
-    column = dr.minimum(types.UInt(x * (1 / grid.tile[0])), grid.nx - 1)
-    row = dr.minimum(types.UInt(y * (1 / grid.tile[1])), grid.ny - 1)
-    ends = dr.gather(types.UInt2, cells.ends, row * grid.nx + column, active)
-    return ends[0], ends[1]
-
-
 def sum_at_points(
-    cells: Cells,
+    lists: CellLists,
     packed: Packed,
     x: Float,
     y: Float,
@@ -222,11 +143,11 @@ def sum_at_points(
     """Sum the contributions of the Gaussians near a point.
 
     Cost: one gather of parameters and one call of `terms` for each Gaussian in the list of the
-    cell.
+    cell, on the first level.
 
     Parameters
     ----------
-    cells : Cells
+    lists : CellLists
     packed : Packed
     x, y : Float
         In pixels, x to the right and y down; inside the image.
@@ -240,11 +161,12 @@ def sum_at_points(
     -------
     list of `count` Float
     """
-    return sum_range(cells.splat, cell_range(cells, x, y, active), packed, x, y, terms, count)
+    ends = lists.range_at(lists.levels[0], dr.detach(x), dr.detach(y), active)
+    return sum_range(lists, ends, packed, x, y, terms, count)
 
 
 def sum_range(
-    index: UInt,
+    lists: CellLists,
     ends: tuple[UInt, UInt],
     packed: Packed,
     x: Float,
@@ -252,16 +174,16 @@ def sum_range(
     terms: Terms,
     count: int | None = None,
 ) -> list:
-    """Sum the Gaussians ``index[begin:end]`` with another range at each point."""
+    """Sum the Gaussians in the runs from begin to end, with another range at each point."""
     types = types_of(packed.values)
-    ordered = packed.arranged is not None
-    source = packed if packed.arranged is None else replace(packed, values=packed.arranged)
+    first = lists.first_at(dr.detach(y))
 
     def add(i: UInt, end: UInt, x: Float, y: Float, sums: list) -> tuple:
         here = i < end
-        n = i if ordered else gather_index(types, index, i, here)
-        parts = terms(*source.gather(n, here), x, y)
-        return i + 1, end, x, y, [s + t for s, t in zip(sums, parts, strict=True)]
+        for number in lists.numbers_at(types, i, here):
+            parts = terms(*packed.gather(number + first, here), x, y)
+            sums = [s + t for s, t in zip(sums, parts, strict=True)]
+        return i + 1, end, x, y, sums
 
     # max_iterations=-1 tells Dr.Jit that the loop is a pure sum: its gradient needs no storage.
     return dr.while_loop(
@@ -274,17 +196,18 @@ def sum_range(
     )[-1]
 
 
-def value_terms(radius: float) -> Terms:
+def value_terms(packed: Packed) -> Terms:
     """Return the `Terms` of the values ``c_n w_n(x)``."""
 
     def terms(shape: list, color: list, x: Float, y: Float) -> list:
-        (w,) = weights(shape, x, y, (1, 1), radius)
+        shape, color = packed.decode(shape, color)
+        (w,) = weights(shape, x, y, (1, 1), packed.radius)
         return [w * c for c in color]
 
     return terms
 
 
-def gradient_terms(radius: float) -> Terms:
+def gradient_terms(packed: Packed) -> Terms:
     """Return the `Terms` of values and derivatives along x and y: three for each channel.
 
     ``grad w = -2 ln(2) w F^T F (x - mu)`` with F in the units of the kernels, see
@@ -292,8 +215,9 @@ def gradient_terms(radius: float) -> Terms:
     """
 
     def terms(shape: list, color: list, x: Float, y: Float) -> list:
+        shape, color = packed.decode(shape, color)
         mean_x, mean_y, a, b, c = shape
-        (w,) = weights(shape, x, y, (1, 1), radius)
+        (w,) = weights(shape, x, y, (1, 1), packed.radius)
         dx, dy = x - mean_x, y - mean_y
         u, v = dr.fma(a, dx, b * dy), c * dy
         steep = -2 * LN2 * w

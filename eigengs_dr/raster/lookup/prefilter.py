@@ -21,10 +21,10 @@ import drjit as dr
 
 from ...backend.arrays import rcp, rsqrt, types_of
 from ...backend.types import Bool, Float, UInt
-from ..evaluate import weights, widen
+from ..evaluate import weights, widen_inverted
 from ..parameters import gather_index, kernel_covariance, unpack_parameters
-from .footprint import filtered_terms, inside_share
-from .points import Packed, cell_range, sum_range
+from .footprint import extreme_variances, filtered_terms, inside_share
+from .points import Packed, sum_range
 from .size_classes import FOOTPRINT_REACH, SizeClasses
 
 FAR = 1e9
@@ -43,7 +43,7 @@ def sum_prefiltered(
     ----------
     sizes : SizeClasses
     packed : Packed
-        Its copies in the order of lists are from `eigengs_dr.raster.lookup.footprint.arrange`.
+        Rows from `eigengs_dr.raster.lookup.points.invert`.
     x, y : Float
         Centre of the footprint in pixels, moved into the image by
         `eigengs_dr.raster.lookup.points.fold`, or near it by `near_image` if that is clamped.
@@ -66,14 +66,14 @@ def sum_prefiltered(
     if sizes.wrap == "clamp":
         near, seen = _at_borders(sizes, (x, y), footprint)
         reach = _reach(seen)
-    widest = dr.maximum(*reach) * (1 / FOOTPRINT_REACH)
-    listed = active & (widest <= sizes.listed[-1][0])
+    widest = dr.safe_sqrt(extreme_variances(seen)[1])
+    listed = active & (widest <= sizes.spreads[-1])
     for v, r, side in zip(near, reach, sides, strict=True):
         first, last = _ends(sizes, side)
         listed &= (v >= first + r) & (v + r <= last)
     ends = _shortest_list(sizes, *near, widest, listed)
     terms = filtered_terms(packed, seen)
-    total = sum_range(sizes.listed[0][1].splat, ends, packed, *near, terms)
+    total = sum_range(sizes.cells, ends, packed, *near, terms)
     rest = active & ~listed
     part = where_any(
         rest, lambda: _sum_copies(sizes, packed, x, y, footprint, bounds, rest), packed
@@ -87,9 +87,9 @@ def _shortest_list(
     """Return begin and end of the shortest list that serves a footprint."""
     types = types_of(x)
     begin, end = types.UInt(0), types.UInt(0)
-    for spread, cells in sizes.listed:
+    for spread, cells in zip(sizes.spreads, sizes.cells.levels, strict=True):
         small = active & (widest <= spread)
-        found = cell_range(cells, x, y, small)
+        found = sizes.cells.range_at(cells, dr.detach(x), dr.detach(y), small)
         begin, end = dr.select(small, found[0], begin), dr.select(small, found[1], end)
         active = active & ~small
     return begin, end
@@ -213,7 +213,7 @@ def _sum_copies(
     classes = dr.width(sizes.table) // 8
 
     def next_run(fresh: Bool, row: UInt, stop: UInt, place: tuple, valid: Bool) -> tuple:
-        """Return the range [begin, end) in `splat` of a row of cells, the row and the last one.
+        """Return the range [begin, end) in `sizes.row` of a row of cells, the row and the last one.
 
         Where `fresh`, the row is the first one of the size class under the footprint.
         """
@@ -269,12 +269,12 @@ def _sum_copies(
     ) -> tuple:
         (_, i, j), (x, y) = place, point
         here = (n < end) & (j <= bottom)
-        shape, color = packed.gather(gather_index(types, sizes.splat, n, here), here)
+        shape, color = packed.gather(gather_index(types, sizes.row, n, here), here)
         px, py, factors = _local(sizes, i, j, x, y)
         seen = [f * k for f, k in zip(scaled, factors, strict=True)]
         # Of a clamped image, the whole footprint decides how much of it lies in each part.
         own, center = (scaled, (x, y)) if sizes.wrap == "clamp" else (seen, (px, py))
-        shape, amplitude = widen(shape, seen)
+        shape, amplitude = widen_inverted(shape, seen)
         (w,) = weights(shape, px, py, (1, 1), packed.radius)
         (part,) = where_any(
             crosses,

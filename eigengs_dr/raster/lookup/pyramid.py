@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 
 from ...backend.arrays import ArrayTypes, rcp, rsqrt, types_of
-from ...backend.types import Bool, DrJitArray, Float, UInt
+from ...backend.types import Bool, DrJitArray, Float, Mask, UInt
 from ..binning.lists import TileLists, build_lists
 from ..binning.tiles import Grid
 from ..evaluate import falloff, widen
@@ -32,12 +32,16 @@ from ..parameters import (
     unpack_parameters,
 )
 from ..render import rasterize, to_tensor
+from .footprint import extreme_variances
 from .points import Packed
 from .prefilter import sum_prefiltered
 from .size_classes import FOOTPRINT_REACH, SizeClasses
 
 SAMPLE_DEVIATION = 0.65
 """Standard deviation of the Gaussians of a level, in spacings of its points."""
+
+HALF = 16384.0
+"""Largest value of a pyramid in half precision."""
 
 SAMPLE_REACH = 3.0
 """Standard deviations at which the Gaussians of a level end."""
@@ -88,24 +92,48 @@ class GaussianPyramid:
     channels : int
     levels : tuple of Level
         From fine to coarse.
-    values : Float, shape (points * stride,)
+    values : Float or Float16, shape (points * stride,)
         B at the points of all levels, row after row, as from
-        `eigengs_dr.raster.parameters.pack_parameters`; carries gradients.
+        `eigengs_dr.raster.parameters.pack_parameters`; may carry gradients.
+    scale : Float, shape (1,)
+        Factor of the values.
     """
 
     wrap: str
     channels: int
     levels: tuple[Level, ...]
     values: Float
+    scale: Float
+
+    def gather(self, point: UInt, active: Mask = True) -> list:
+        """Return the channels at points of the levels, but for the factor `scale`."""
+        types = types_of(self.scale)
+        rows = unpack_parameters(self.values, point, self.channels, active)
+        return [types.Float(row) for row in rows]
+
+    def halved(self) -> GaussianPyramid:
+        """Return the pyramid in half precision; that of double precision stays as it is.
+
+        A value has 11 bits, and a footprint averages 30 or more: what is lost is less than what 8
+        bits show. Values are scaled into the range of half precision.
+        """
+        types = types_of(self.scale)
+        if types.bits == 64:
+            return self
+        largest = dr.max(dr.abs(self.values))
+        scale = dr.select((largest > 0) & dr.isfinite(largest), largest * (1 / HALF), 1)
+        values = dr.float16_array_t(types.Float)(self.values * rcp(scale))
+        dr.eval(values, scale)
+        return replace(self, values=values, scale=scale)
 
 
 def pyramid_mean(lattice: GaussianPyramid) -> list:
     """Return the mean of every channel over the image: a list of Float, shape (1,)."""
-    level, UInt = lattice.levels[-1], types_of(lattice.values).UInt
+    level, UInt = lattice.levels[-1], types_of(lattice.scale).UInt
     point = dr.arange(UInt, level.nx * level.ny)
     index = (point // level.nx + level.pad) * level.columns + point % level.nx + level.pad
     index += level.first
-    return [dr.mean(row) for row in unpack_parameters(lattice.values, index, lattice.channels)]
+    return [lattice.scale * dr.mean(row) for row in lattice.gather(index)]
 
 
 def is_minified(lattice: GaussianPyramid, footprint: list) -> Bool:
@@ -120,12 +148,7 @@ def is_minified(lattice: GaussianPyramid, footprint: list) -> Bool:
     -------
     Bool
     """
-    return _smallest_variance(footprint) >= _min_variance(lattice.levels[0])
-
-
-def _smallest_variance(footprint: list) -> Float:
-    xx, xy, yy = footprint
-    return 0.5 * (xx + yy) - dr.sqrt(dr.fma(0.25 * (xx - yy), xx - yy, xy * xy))
+    return extreme_variances(footprint)[0] >= _min_variance(lattice.levels[0])
 
 
 def _min_variance(level: Level) -> float:
@@ -156,9 +179,9 @@ def sum_pyramid(
     list of Float
         One sum for each channel.
     """
-    types = types_of(lattice.values)
+    types = types_of(lattice.scale)
     xx, xy, yy = footprint = dr.detach(footprint)
-    first, nx, ny, dx, dy = _pick(types, lattice.levels, _smallest_variance(footprint))
+    first, nx, ny, dx, dy = _pick(types, lattice.levels, extreme_variances(footprint)[0])
     pad = lattice.levels[0].pad
     # In spacings of the level; the values are already blurred by SAMPLE_DEVIATION^2.
     u, v = x * rcp(dx) - 0.5, y * rcp(dy) - 0.5
@@ -185,7 +208,7 @@ def sum_pyramid(
         w = falloff(dr.maximum(q, 0), 2 * kernel_radius(SAMPLE_REACH) ** 2) * scale
         column, row = (_fold(types, k, n, lattice.wrap) for k, n in ((i, nx), (j, ny)))
         point = first + row * types.UInt(nx + 2 * pad) + column
-        seen = unpack_parameters(lattice.values, point, lattice.channels, here)
+        seen = lattice.gather(point, here)
         sums = [dr.fma(w, c, s) for c, s in zip(seen, sums, strict=True)]
         i = i + 1
         ran = i > stop
@@ -196,7 +219,7 @@ def sum_pyramid(
     last = types.Int(dr.select(active, dr.floor(dr.detach(v) + reach), -(2.0**30)))
     j = types.Int(dr.ceil(dr.detach(v) - reach))
     i, stop = row_of(j)
-    return dr.while_loop(
+    sums = dr.while_loop(
         (i, stop, j, u, v, [types.Float(0) for _ in range(lattice.channels)]),
         lambda i, stop, j, *rest: j <= last,
         add,
@@ -204,6 +227,7 @@ def sum_pyramid(
         mode="symbolic",
         max_iterations=-1,
     )[-1]
+    return [lattice.scale * s for s in sums]
 
 
 def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Float) -> list:
@@ -232,9 +256,13 @@ def _fold(types: ArrayTypes, index: UInt, count: Float, wrap: str) -> UInt:
     return types.UInt(dr.minimum(k, 2 * count - 1 - k))
 
 
-FINEST, FEWEST = 1, 8
-"""Spacing of the points of the finest level, in pixels (the points are the pixels), and smallest
-number of points along the shorter side of the coarsest level."""
+FINEST, FEWEST = 1.0, 8
+"""Smallest spacing of the points of the finest level, in pixels, and smallest number of points
+along the shorter side of the coarsest level."""
+
+POINTS = 3
+"""Points of the finest level for each Gaussian. In half precision all levels then take 32 bytes for
+each, as its parameters do."""
 
 
 PADDING = 3
@@ -242,10 +270,11 @@ PADDING = 3
 `SAMPLE_DEVIATION`, sees 0.01 % of what lies inside: further out, values are constant."""
 
 
-def levels_of(width: int, height: int, wrap: str) -> tuple[Level, ...]:
-    """Return the levels of the pyramid of an image."""
+def levels_of(width: int, height: int, count: int, wrap: str) -> tuple[Level, ...]:
+    """Return the levels of the pyramid of an image of `count` Gaussians."""
     levels: list[Level] = []
-    spacing, first = FINEST, 0
+    spacing, first = math.sqrt(width * height / (POINTS * count)), 0
+    spacing = max(FINEST, min(spacing, min(width, height) / FEWEST))
     pad = PADDING if wrap == "clamp" else 0
     while not levels or min(width, height) >= FEWEST * spacing:
         nx, ny = math.ceil(width / spacing), math.ceil(height / spacing)
@@ -262,13 +291,21 @@ def list_finest(shape: list, width: int, height: int, radius: float, adjoint: bo
     ----------
     shape : list of 5 Float, shape (N,)
     width, height, radius
-        As for `eigengs_dr.raster.lookup.points.list_cells`.
+        As for `eigengs_dr.raster.lookup.cells.list_cells`.
     adjoint : bool
         Whether the colours or shapes of the pyramid have derivatives.
     """
-    blur = _blur(types_of(shape[0]), levels_of(width, height, "repeat")[0])
-    widened, _ = widen(dr.detach(shape), kernel_covariance(blur))
-    return build_lists(widened, radius, Grid(width, height), adjoint=adjoint)
+    level = levels_of(width, height, dr.width(shape), "repeat")[0]
+    blurred, _ = _blurred(dr.detach(shape), level)
+    return build_lists(blurred, radius, Grid(level.nx, level.ny), adjoint=adjoint)
+
+
+def _blurred(shape: list, level: Level) -> tuple[list, Float]:
+    """Blur Gaussians for a level, whose points become pixels; return their amplitudes too."""
+    blur = kernel_covariance(_blur(types_of(shape[0]), level))
+    (x, y, a, b, c), amplitude = widen(shape, blur)
+    dx, dy = (dr.opaque(type(x), d) for d in (level.dx, level.dy))
+    return [x * rcp(dx), y * rcp(dy), a * dx, b * dy, c * dy], amplitude
 
 
 def _blur(types: ArrayTypes, level: Level) -> list:
@@ -276,7 +313,9 @@ def _blur(types: ArrayTypes, level: Level) -> list:
     return [types.Float((SAMPLE_DEVIATION * d) ** 2) for d in (level.dx, 0, level.dy)]
 
 
-def build_pyramid(sizes: SizeClasses, packed: Packed, finest: TileLists) -> GaussianPyramid:
+def build_pyramid(
+    sizes: SizeClasses, packed: Packed, finest: TileLists, shape: list, color: list
+) -> GaussianPyramid:
     """Evaluate a sum of Gaussians at the points of all levels; differentiable.
 
     Cost: a rendering of the blurred Gaussians for the finest level, and one
@@ -289,53 +328,54 @@ def build_pyramid(sizes: SizeClasses, packed: Packed, finest: TileLists) -> Gaus
     packed : Packed
     finest : TileLists
         From `list_finest`.
+    shape, color : list of Float, shape (N,)
+        The Gaussians, in the order of the set.
     """
-    types = types_of(packed.values)
-    levels, parts = levels_of(sizes.width, sizes.height, sizes.wrap), list[Float]()
+    types, one = types_of(packed.values), types_of(packed.values).Float(1)
+    levels = levels_of(sizes.width, sizes.height, dr.width(shape), sizes.wrap)
+    parts = list[Float]()
     for number, level in enumerate(levels):
         index = dr.arange(types.UInt, level.columns * level.rows)
-        x = (types.Float(index % level.columns) + (0.5 - level.pad)) * level.dx
-        y = (types.Float(index // level.columns) + (0.5 - level.pad)) * level.dy
+        column, row = (
+            types.Int(k) - level.pad for k in (index % level.columns, index // level.columns)
+        )
+        x, y = (types.Float(column) + 0.5) * level.dx, (types.Float(row) + 0.5) * level.dy
         blur = _blur(types, level)
         if parts:
             finer = (replace(levels[number - 1], first=0),)
-            pyramid = GaussianPyramid(sizes.wrap, packed.channels, finer, parts[-1])
+            pyramid = GaussianPyramid(sizes.wrap, packed.channels, finer, parts[-1], one)
             seen = sum_pyramid(pyramid, x, y, blur, types.Bool(True))
         else:
-            seen = _finest(sizes, packed, finest, x, y, blur)
+            inner = _render(packed, finest, level, shape, color)
+            edge = (column < EDGE) | (column >= level.nx - EDGE)
+            edge |= (row < EDGE) | (row >= level.ny - EDGE)
+            ring = dr.compress(edge)
+            near_x, near_y = (dr.gather(types.Float, v, ring) for v in (x, y))
+            borders = sum_prefiltered(sizes, packed, near_x, near_y, blur, types.Bool(True))
+            dr.eval(borders)  # once for all channels
+            pixel = types.UInt(row) * level.nx + types.UInt(column)
+            seen = []
+            for k, border in enumerate(borders):
+                whole = dr.zeros(types.Float, dr.width(x))
+                dr.scatter(whole, border, ring)
+                inside = dr.gather(types.Float, inner, pixel * len(color) + k, ~edge)
+                seen.append(dr.select(edge, whole, inside))
         parts.append(pack_parameters(seen))
         dr.eval(parts[-1])
     values = dr.concat(parts)
     dr.eval(values)
-    return GaussianPyramid(sizes.wrap, packed.channels, levels, values)
+    return GaussianPyramid(sizes.wrap, packed.channels, levels, values, one)
 
 
-def _finest(
-    sizes: SizeClasses, packed: Packed, lists: TileLists, x: Float, y: Float, blur: list
-) -> list:
-    """Return the blurred sum at all pixels: widen all Gaussians once, and render them.
+EDGE = math.ceil(FOOTPRINT_REACH * SAMPLE_DEVIATION)
+"""Points of the finest level at a border. There, copies of the image and the part of a Gaussian
+inside the image count too: each of these points is looked up."""
 
-    At the border, copies of the image and the part of a Gaussian inside the image count too. There
-    and beyond, each point is looked up.
-    """
-    types = types_of(packed.values)
-    width, height = sizes.width, sizes.height
-    shape, color = packed.gather_all()
-    shape, amplitude = widen(shape, kernel_covariance(blur))
+
+def _render(packed: Packed, lists: TileLists, level: Level, shape: list, color: list) -> Float:
+    """Return the blurred sum at the points of the image: widen all Gaussians, and render them."""
+    Float = types_of(packed.values).Float
+    shape, amplitude = _blurred(shape, level)
     color = [amplitude * c for c in color]
-    parameters = KernelParameters(shape, color, [types.Float(0) for _ in color])
-    image = to_tensor(rasterize(parameters, lists, packed.cutoff), lists.grid, len(color)).array
-    border = math.ceil(FOOTPRINT_REACH * SAMPLE_DEVIATION * FINEST)
-    edge = (x < border) | (x > width - border) | (y < border) | (y > height - border)
-    ring = dr.compress(edge)
-    near_x, near_y = (dr.gather(types.Float, v, ring) for v in (x, y))
-    seen = sum_prefiltered(sizes, packed, near_x, near_y, blur, types.Bool(True))
-    dr.eval(seen)  # once for all channels
-    pixel = types.UInt(types.Int(y)) * width + types.UInt(types.Int(x))
-    result = []
-    for k, part in enumerate(seen):
-        whole = dr.zeros(types.Float, dr.width(x))
-        dr.scatter(whole, part, ring)
-        inner = dr.gather(types.Float, image, pixel * len(color) + k, ~edge)
-        result.append(dr.select(edge, whole, inner))
-    return result
+    parameters = KernelParameters(shape, color, [Float(0) for _ in color])
+    return to_tensor(rasterize(parameters, lists, packed.cutoff), lists.grid, len(color)).array

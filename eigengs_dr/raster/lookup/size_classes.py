@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
@@ -13,7 +13,7 @@ from ...backend.types import Float, UInt
 from ...gaussian.covariance import max_deviation
 from ..evaluate import widen
 from ..parameters import EXP2_SCALE, kernel_radius
-from .points import Cells, cell_side, list_cells
+from .cells import SIDE, CellLists, cell_side, list_cells
 
 MIN_CLASS_SIZE = 1.0
 """Largest standard deviation in the smallest size class, in pixels."""
@@ -25,11 +25,12 @@ a larger ratio it visits more Gaussians that miss the footprint."""
 FOOTPRINT_REACH = 3.0
 """Half-width of a footprint, in standard deviations, in the search for copies of the image."""
 
-LISTED_FOOTPRINTS = (0.7, 4.0)
-"""Standard deviations of the footprints for which cells list their Gaussians, in pixels; most
-lookups have such footprints. Cells of the second lists are twice as wide: lists of equal cells took
-1.7 to 2.1 times the memory in all, at 20,000 Gaussians too much for copies in their order (9 % more
-time of a rendering), and at 5,000 saved 2 %."""
+LISTED_FOOTPRINTS = (0.25, 0.5, 1.0)
+"""Standard deviations of the footprints for which cells list their Gaussians, in mean distances of
+Gaussians. Two lists, without 0.5, take as much memory and 2 to 5 % more time of a rendering."""
+
+COARSER = 2
+"""Ratio of the sides of the cells of two lists: those for wider footprints may be larger."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class SizeClasses:
 
     A class of the size s holds Gaussians whose largest standard deviation is at most s. A footprint
     can only see such a Gaussian if the mean lies in the ellipse of ``footprint + s^2``. This
-    ellipse covers some rows of cells, and in each row the Gaussians are one range of `splat`.
+    ellipse covers some rows of cells, and in each row the Gaussians are one range of `row`.
 
     Attributes
     ----------
@@ -46,29 +47,33 @@ class SizeClasses:
         Size of the image, in pixels.
     wrap : {"repeat", "mirror", "clamp"}
         Continuation of the image outside its borders.
-    splat : UInt32, shape (entries,)
-        Indices of Gaussians: class after class, row after row, cell after cell.
+    row : UInt32, shape (entries,)
+        Rows of parameters: class after class, row after row, cell after cell.
     starts : UInt32, shape (cells + 1,)
-        Index in `splat` of the first Gaussian of each cell.
+        Index in `row` of the first Gaussian of each cell.
     table : Float, shape (8 * classes,)
         For each class: s^2, first cell, columns, rows, 1 / side of a cell, origin of the cells, and
         two zeros.
-    listed : list of (float, Cells)
-        Lists for footprints of up to this standard deviation. They hold the
-        Gaussians widened by it, whose ellipses contain the ellipses for smaller footprints. All
-        have one array `splat`: lanes with footprints of several sizes then share a loop.
+    spreads : tuple of float
+        Largest standard deviations of footprints, in pixels, for which `cells` list Gaussians.
+    cells : CellLists
+        A level for each of the `spreads`. It holds the Gaussians widened by it, whose ellipses
+        contain those for smaller footprints. Lanes with footprints of several sizes share a loop.
     """
 
     width: int
     height: int
     wrap: str
-    splat: UInt
+    row: UInt
     starts: UInt
     table: Float
-    listed: list[tuple[float, Cells]]
+    spreads: tuple[float, ...]
+    cells: CellLists
 
 
-def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str) -> SizeClasses:
+def classify_by_size(
+    shape: list, width: int, height: int, cutoff: float, wrap: str, side: float = SIDE
+) -> SizeClasses:
     """Sort Gaussians for `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
 
     Parameters
@@ -80,6 +85,8 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
     cutoff : float
         Standard deviations.
     wrap : {"repeat", "mirror", "clamp"}
+    side : float, optional
+        Side of the smallest cells that list Gaussians, in mean distances of Gaussians.
 
     Returns
     -------
@@ -99,46 +106,43 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
         own = np.flatnonzero(drawn & (rank == k))
         largest = min(float(size[own].max()), 1e12)  # its square must be finite in float32
         # Means beyond this margin are farther from the image than the cutoff.
-        side = max(largest, max(width, height) / 1024)
         origin = -cutoff * largest
-        columns, rows = (math.ceil((s - 2 * origin) / side) for s in (width, height))
-        column, row = ((v[own] - origin) // side for v in (x, y))
+        area = (width - 2 * origin) * (height - 2 * origin)
+        length = max(largest, math.sqrt(area / (2 * len(own))))  # at most two cells a Gaussian
+        columns, rows = (math.ceil((s - 2 * origin) / length) for s in (width, height))
+        column, row = ((v[own] - origin) // length for v in (x, y))
         near = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         cell = (row * columns + column)[near].astype(np.int64)
         order.append(own[near][np.argsort(cell, kind="stable")])
         counts.append(np.bincount(cell, minlength=columns * rows))
-        table.append([largest**2, first, columns, rows, 1 / side, origin, 0, 0])
+        table.append([largest**2, first, columns, rows, 1 / length, origin, 0, 0])
         first += columns * rows
     starts = np.cumsum(np.concatenate([[0], *counts] if counts else [[0, 0]]))
+    spreads, cells = _list_widened(shape, width, height, kernel_radius(cutoff), side)
     # gather_index reads pairs: the array must have an even length and must not be empty.
-    found = np.concatenate([*order, [0]])
-    splat = np.pad(found, (0, len(found) % 2))
+    found = np.concatenate([*order, [0]]).astype(np.int64)
+    found = np.pad(found, (0, len(found) % 2))
     return SizeClasses(
         width,
         height,
         wrap,
-        upload(types.UInt, splat.astype(np.uint32)),
+        upload(types.UInt, cells.rows_of(found)),
         upload(types.UInt, np.asarray(starts, np.uint32)),
         upload(types.Float, np.asarray(table or np.zeros((1, 8)), np.float32).ravel()),
-        _list_widened(shape, width, height, kernel_radius(cutoff)),
+        spreads,
+        cells,
     )
 
 
-def _list_widened(shape: list, width: int, height: int, radius: float) -> list[tuple[float, Cells]]:
+def _list_widened(
+    shape: list, width: int, height: int, radius: float, side: float
+) -> tuple[tuple[float, ...], CellLists]:
     """List the Gaussians widened by each of `LISTED_FOOTPRINTS`, all in one array."""
-    Float = types_of(shape[0]).Float
-    side = max(4, cell_side(width, height, dr.width(shape)))
-    levels = []
-    for coarseness, spread in enumerate(LISTED_FOOTPRINTS, 1):
+    Float, count = types_of(shape[0]).Float, dr.width(shape)
+    spacing, smallest = math.sqrt(width * height / count), cell_side(width, height, count, side)
+    spreads, levels = tuple(k * spacing for k in LISTED_FOOTPRINTS), []
+    for number, spread in enumerate(spreads):
         variance = dr.opaque(Float, (spread / EXP2_SCALE) ** 2)
         widened, _ = widen(shape, [variance, Float(0), variance])
-        levels.append(list_cells(widened, width, height, radius, coarseness * side))
-    splat = dr.concat([cells.splat for cells in levels])
-    dr.eval(splat)
-    listed, first = [], 0
-    for spread, cells in zip(LISTED_FOOTPRINTS, levels, strict=True):
-        ends = cells.ends + dr.opaque(type(splat), first)
-        listed.append((spread, replace(cells, splat=splat, ends=ends)))
-        first += dr.width(cells.splat)
-    dr.eval(listed)
-    return listed
+        levels.append((widened, smallest * COARSER**number))
+    return spreads, list_cells(levels, width, height, radius)

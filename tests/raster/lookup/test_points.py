@@ -10,15 +10,15 @@ from _helpers.footprints import check_gradient, exact_at, some_points, stacked
 from _helpers.sets import SIZE, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
+from eigengs_dr.raster.lookup.cells import list_cells
 from eigengs_dr.raster.lookup.points import (
     Packed,
     fold,
     gradient_terms,
-    list_cells,
     sum_at_points,
     value_terms,
 )
-from eigengs_dr.raster.parameters import pack_parameters
+from eigengs_dr.raster.parameters import kernel_radius
 from eigengs_dr.raster.render import decode_parameters
 
 POINTS = np.concatenate([np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * SIZE, some_points(396)])
@@ -28,21 +28,21 @@ WIDE = 9.0
 """A cutoff at which a splat's edge is nothing: finite differences may cross it."""
 
 
-def arrays_of(gaussians, points, cutoff):
-    """Packed parameters, shape, and x and y of points, as lookups take them."""
+def arrays_of(gaussians, points, cutoff, side=4):
+    """Lists, packed parameters, and x and y of points, as lookups take them."""
     p = decode_parameters(gaussians)
     types = types_of(gaussians.mean)
     x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
-    packed = Packed(pack_parameters([*p.shape, *p.color]), gaussians.channels, cutoff)
-    return packed, [dr.detach(r) for r in p.shape], x, y
+    level, size = (dr.detach(p.shape), side), (gaussians.width, gaussians.height)
+    cells = list_cells([level], *size, kernel_radius(cutoff))
+    return cells, Packed(cells.pack(p.shape, p.color), gaussians.channels, cutoff), x, y
 
 
 def look_up(gaussians, points, cutoff, side=4, terms=value_terms, number=1):
     """Rows of sums at points, without the background."""
-    packed, shape, x, y = arrays_of(gaussians, points, cutoff)
-    cells = list_cells(shape, gaussians.width, gaussians.height, packed.radius, side)
+    cells, packed, x, y = arrays_of(gaussians, points, cutoff, side)
     count, active = number * gaussians.channels, types_of(x).Bool(True)
-    return sum_at_points(cells, packed, x, y, active, terms(packed.radius), count)
+    return sum_at_points(cells, packed, x, y, active, terms(packed), count)
 
 
 class TestValues:
@@ -70,9 +70,8 @@ class TestValues:
             scene = random_scene(0, count, size)._replace(
                 mean=rng.uniform(0, 1, (count, 2)) * size, factor=np.tile([0.3, 0, 0.3], (count, 1))
             )
-            packed, shape, *_ = arrays_of(scene.on(backend), some_points(size=size), 3)
-            ends = np.array(list_cells(shape, *size, packed.radius, 4).ends).reshape(-1, 2)
-            lengths.append(np.mean(ends[:, 1].astype(int) - ends[:, 0]))
+            cells, *_ = arrays_of(scene.on(backend), some_points(size=size), 3)
+            lengths.append(np.mean(np.diff(np.array(cells.levels[0].starts, int))))
         assert lengths[1] < 1.4 * lengths[0]  # fewer cells lie at the border
 
 
@@ -100,11 +99,9 @@ class TestDerivatives:
     def test_gradient_reaches_the_point(self, backend):
         """The loop hands on derivatives of where it is evaluated, which geometry may have."""
         gaussians = random_scene(8).on(backend, bits=64)
-        packed, shape, x, y = arrays_of(gaussians, POINTS, WIDE)
-        cells = list_cells(shape, *SIZE, packed.radius, 4)
+        cells, packed, x, y = arrays_of(gaussians, POINTS, WIDE)
         dr.enable_grad(x, y)
-        active = types_of(x).Bool(True)
-        sums = sum_at_points(cells, packed, x, y, active, value_terms(packed.radius))
+        sums = sum_at_points(cells, packed, x, y, types_of(x).Bool(True), value_terms(packed))
         dr.backward(dr.sum(sums[0]))
         rows = look_up(gaussians, POINTS, WIDE, terms=gradient_terms, number=3)
         np.testing.assert_allclose(np.array(dr.grad(x)), np.array(rows[1]), atol=1e-9)

@@ -1,7 +1,5 @@
 """Sums seen through a footprint, against brute force; its bounds, and the error function."""
 
-from dataclasses import replace
-
 import drjit as dr
 import numpy as np
 import pytest
@@ -22,11 +20,10 @@ from _helpers.footprints import (
 from _helpers.sets import SIZE, covariances, few, random_scene
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, arrange, bound_covariance, quick_erf
-from eigengs_dr.raster.lookup.points import Packed
+from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance, quick_erf
+from eigengs_dr.raster.lookup.points import Packed, invert
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.lookup.size_classes import classify_by_size
-from eigengs_dr.raster.parameters import pack_parameters
 from eigengs_dr.raster.render import decode_parameters
 
 FOOTPRINTS = [
@@ -45,7 +42,8 @@ def arguments(gaussians, wrap, points, covariance, cutoff=CUTOFF):
     types = types_of(gaussians.mean)
     shape = [dr.detach(r) for r in p.shape]
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
-    packed = Packed(pack_parameters([*p.shape, *p.color]), gaussians.channels, cutoff)
+    rows = sizes.cells.pack(*invert(p.shape, p.color))
+    packed = Packed(rows, gaussians.channels, cutoff, inverted=True)
     x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
     footprint = [types.Float(float(covariance[k])) for k in ((0, 0), (0, 1), (1, 1))]
     return sizes, packed, x, y, footprint, types.Bool(True)
@@ -136,18 +134,6 @@ class TestSumFiltered:
         scene = scene._replace(mean=scene.mean + 1e6)
         rows = stacked(filtered(scene.on(backend), "repeat", some_points(), FOOTPRINTS[1]))
         np.testing.assert_array_equal(rows, 0)
-
-
-@pytest.mark.parametrize("variance", [0.0, 0.1, 1.0, 9.0])
-def test_lists_in_order_give_the_same(backend, variance):
-    """Copies of the parameters in the order of the lists, with the inverse factor."""
-    gaussians, points = random_scene(4).on(backend), some_points(300)
-    covariance = variance * np.array([[1, 0.5], [0.5, 0.7]])
-    sizes, packed, *rest = arguments(gaussians, "repeat", points, covariance)
-    p = decode_parameters(gaussians)
-    copies = replace(packed, arranged=arrange(sizes.listed[0][1].splat, p.shape, p.color))
-    found, expected = (sum_prefiltered(sizes, q, *rest) for q in (copies, packed))
-    np.testing.assert_allclose(np.array(found), np.array(expected), atol=2e-5)
 
 
 class TestBoundedCovariance:

@@ -1,0 +1,128 @@
+"""Photos as a loss: a wall under a sky of light, seen by three cameras."""
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+
+mi = pytest.importorskip("mitsuba")
+pytestmark = pytest.mark.mitsuba
+
+SIDE = 24
+
+
+@pytest.fixture(autouse=True)
+def variant():
+    mi.set_variant("llvm_ad_rgb")
+
+
+def wall(texture, light=1.0):
+    """A diffuse wall under the same light from all sides: it looks like its texture."""
+    at, cameras = mi.ScalarTransform4f(), {}
+    film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "pixel_format": "rgb"}
+    film["rfilter"] = {"type": "box"}
+    for number, x in enumerate((-1, 0, 1)):
+        view = at.look_at([x, 0, 2.6], [0, 0, 0], [0, 1, 0])
+        cameras[f"camera{number}"] = {"type": "perspective", "film": film, "to_world": view}
+    data = mi.TensorXf(np.ascontiguousarray(texture, np.float32))
+    paint = {"type": "bitmap", "data": data, "raw": True}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "prb", "max_depth": 2},
+            "sky": {"type": "constant", "radiance": light},
+            "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": paint}},
+            **cameras,
+        }
+    )
+
+
+def true_texture():
+    x, y = np.meshgrid(np.linspace(0, 1, 32), np.linspace(0, 1, 32))
+    waves = 0.5 + 0.3 * np.sin(6 * x) * np.cos(5 * y)
+    return np.stack([waves, 0.6 * waves, 0.8 - 0.5 * waves], axis=2).astype(np.float32)
+
+
+def photos_of(scene, spp=64):
+    return [mi.render(scene, sensor=k, spp=spp, seed=77).numpy() for k in range(3)]
+
+
+GREY = np.full((32, 32, 3), 0.5, np.float32)
+NAME = "wall.bsdf.reflectance"
+
+
+def test_a_texture_is_recovered():
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), photos_of(wall(true_texture()))
+    loss = photo_loss(scene, NAME, photos)
+    found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=120, space="linear")
+    inner = np.s_[4:-4, 4:-4]
+    error = np.mean((found.image[inner] - eg.image.color.to_coded(true_texture())[inner]) ** 2)
+    assert error < 1e-3
+    assert found.gaussians.space == "linear" and found.iterations == 120
+
+
+def test_held_out_pixels_choose_the_number():
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), photos_of(wall(true_texture()))
+    loss = photo_loss(scene, NAME, photos, held_out=0.2)
+    found = eg.fit(loss=loss, size=(32, 32), iterations=60, space="linear")
+    tried = {row["gaussians"]: row["loss"] for row in found.trace if "gaussians" in row}
+    assert len(found.gaussians) == min(tried, key=tried.get) and len(tried) > 1
+
+
+def test_the_derivative_is_a_forward_difference():
+    """Along a random direction, through a scene; the renderings have other random numbers."""
+    import drjit as dr
+
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), photos_of(wall(true_texture()))
+    loss = photo_loss(scene, NAME, photos, spp=256)
+    random = np.random.default_rng(1)
+    texture, along = random.uniform(0.3, 0.7, (2, 32, 32, 3)).astype(np.float32)
+    picture = mi.TensorXf(texture)
+    dr.enable_grad(picture)
+    dr.backward(loss.function(picture, 1))
+    slope = float(np.sum(dr.grad(picture).numpy() * along))
+    ends = [loss.function(mi.TensorXf(texture + h * along), 1) for h in (0, 1e-2)]
+    low, high = (float(np.ravel(end.numpy())[0]) for end in ends)
+    assert slope == pytest.approx((high - low) / 1e-2, rel=0.1)
+
+
+def test_a_light_is_found_along():
+    """Of which the photos say nothing but the product with the texture; where that is known."""
+    from eigengs_dr.plugins import photo_loss
+
+    photos = photos_of(wall(true_texture(), light=1.5))
+    key = "sky.radiance.value"
+    light = mi.ad.Adam(lr=0.03, params={key: mi.Float(1.0)})
+    scene = wall(GREY)
+    loss = photo_loss(scene, NAME, photos, parameters=light)
+    start = eg.fit(eg.image.color.to_coded(true_texture()), 200, 100, space="linear").gaussians
+    method = eg.COARSE_TO_FINE.at_rates(0.01)
+    eg.fit(loss=loss, size=(32, 32), start=start, iterations=60, method=method)
+    assert light[key][0] == pytest.approx(1.5, abs=0.05)
+
+
+def test_photos_that_do_not_fit_are_refused():
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), [GREY[:SIDE, :SIDE]] * 3
+    for name, given, message in (
+        (
+            "wall.bsdf.reflektance",
+            photos,
+            "no bitmap 'wall.bsdf.reflektance'; it has wall.bsdf.ref",
+        ),
+        (NAME, photos + photos, "6 photos, but the scene has 3 sensors"),
+        (NAME, [], "0 photos"),
+        (NAME, [GREY], r"photo 0 has shape \(32, 32, 3\), but its film has 24x24"),
+        (NAME, [np.full_like(photos[0], np.nan)], "not finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            photo_loss(scene, name, given)
+    with pytest.raises(ValueError, match="3 photos, but 2 sensors"):
+        photo_loss(scene, NAME, photos, sensors=[0, 1])
