@@ -1,5 +1,6 @@
 """README and manual: their Python runs, their commands have the options they name, claims hold."""
 
+import itertools
 import re
 import runpy
 import shlex
@@ -193,14 +194,14 @@ def test_textures_are_recovered_from_photos(tmp_path, monkeypatch):
     write_balls(mi, to_linear(paint).astype(np.float32))
 
     def smaller(code):
-        return code.replace("256", "32").replace("240", "80").replace("160", "40")
+        return code.replace("256", "32").replace("240", "120").replace("160", "40")
 
     made = run_blocks(FOLDER / "how-to/recover.md", {"__name__": "page"}, smaller)
-    assert made["lamp"][made["light"]].numpy() == pytest.approx(12, rel=0.05)
+    assert made["lamp"][made["light"]].numpy() == pytest.approx(12, rel=0.08)
     assert list(made["material"].image) == ["albedo", "roughness"]
     counts, losses = zip(*made["curve"], strict=True)
-    assert list(counts) == sorted(counts) and len(counts) > 1
-    assert losses[0] > min(losses)
+    assert [*counts] == [8 * 2**k for k in range(len(counts))]
+    assert all(more < less for less, more in itertools.pairwise(losses[:-1]))
     seen = slice(8, 24)  # rows that cameras see from the front
     middle = np.broadcast_to(paint.mean(axis=(0, 1)), paint.shape)
     found = eg.picture_of(eg.Gaussians.load("paint.npz")).clip(0, 1)
