@@ -9,10 +9,13 @@ from .collection.fit_many import fit_many
 from .collection.manifest import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
+from .fitting.coarse import COARSE_TO_FINE, Coarse
 from .fitting.fit import Fit, FitInterrupted, fit
+from .fitting.loss import Loss
 from .fitting.maps import Map
 from .fitting.method import DEFAULT, Method
 from .fitting.options import Goal, level_counts
+from .fitting.place import lattices
 from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, sample, save_image
 from .image.metrics import ms_ssim, psnr, ssim
@@ -26,9 +29,11 @@ from .viewer.view import view
 __version__: str
 
 __all__ = [
+    "COARSE_TO_FINE",
     "DEFAULT",
     "BackendError",
     "ClusterError",
+    "Coarse",
     "EigenGS",
     "Eigenbasis",
     "Fit",
@@ -38,6 +43,7 @@ __all__ = [
     "ImageError",
     "ImageRow",
     "LargeFit",
+    "Loss",
     "Map",
     "Method",
     "RunInterrupted",
@@ -49,6 +55,7 @@ __all__ = [
     "fit_large",
     "fit_many",
     "from_tensors",
+    "lattices",
     "level_counts",
     "load_image",
     "ms_ssim",

@@ -9,14 +9,18 @@ except ImportError as error:
 
 from .cone import pixel_angle
 from .environment import bake_environment
+from .follow import follow
 from .gaussian_texture import register_plugins
 from .memory import resident_bytes
 from .parameters import gaussians_of, keep_in_bounds, texture_of
+from .photos import photo_loss
 
 __all__ = [
     "bake_environment",
+    "follow",
     "gaussians_of",
     "keep_in_bounds",
+    "photo_loss",
     "pixel_angle",
     "register_plugins",
     "resident_bytes",

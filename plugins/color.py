@@ -183,10 +183,26 @@ def show(texture: Texture, value: Float) -> Float:
 
 
 def show_all(texture: Texture, values: list) -> list:
-    """Apply `show` to all channels; normals get the length 1 instead, unless raw."""
+    """Apply `show` to all channels; normals get the length 1 instead, unless raw.
+
+    Two channels are the codes of x and y of normals, whose z follows from the length 1.
+    """
+    if len(values) == 2:
+        return _with_z([show(texture, value) for value in values])
     if texture.space == "normal" and not texture.raw:
         return unit_codes(values)
     return [show(texture, value) for value in values]
+
+
+def _with_z(codes: list) -> list:
+    """Add the code of z = sqrt(1 - x^2 - y^2), whose derivative is bounded."""
+    x, y = (2 * code - 1 for code in codes)
+    square = dr.fma(-x, x, dr.fma(-y, y, 1))
+    return [*codes, dr.fma(0.5, dr.sqrt(dr.maximum(square, FLATTEST)), 0.5)]
+
+
+FLATTEST = 1e-4
+"""Smallest square of z: with the slope 1/2z, codes of x and y count up to a hundredfold there."""
 
 
 def slope_of(texture: Texture, value: Float) -> Float:

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import rcp
-from eigengs_dr.backend.types import Bool
+from eigengs_dr.backend.types import Bool, Float
 
 from .versions import Interaction, footprint_of, has_footprints
 
@@ -41,14 +41,19 @@ def pixel_angle(sensor: mi.Sensor) -> float:
     ValueError
         If the sensor has no field of view.
     """
+    return float(dr.slice(current_angle(sensor)))
+
+
+def current_angle(sensor: mi.Sensor) -> Float:
+    """Return the angle of `pixel_angle` as an array of Dr.Jit, also while it records a program."""
     parameters = mi.traverse(sensor)
     if "x_fov" not in parameters:
         raise ValueError(
             f"pixel_angle: {type(sensor).__name__} has no x_fov; use a perspective or thinlens "
             "sensor, or set 'prefilter' to the angle of a pixel in radians"
         )
-    fov = math.radians(float(dr.slice(parameters["x_fov"])))
-    return 2 * math.tan(fov / 2) / sensor.film().size()[0]
+    half = dr.detach(parameters["x_fov"]) * (math.pi / 360)
+    return dr.tan(half) * (2 / sensor.film().size()[0])
 
 
 def footprint_inputs() -> tuple[str, ...]:
@@ -57,24 +62,35 @@ def footprint_inputs() -> tuple[str, ...]:
     return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *own)
 
 
-def seen_metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Bool]:
+def seen_metric(si: Interaction, inverse: tuple, angle: Float | None) -> tuple[list, Bool]:
     """Return the metric of the renderer's footprint, or where there is none, of the cone's.
 
     Parameters
     ----------
     si, inverse, angle
-        As for `metric`. With an angle of 0, surfaces without a footprint have no metric.
+        As for `metric`. Without an angle, surfaces without a footprint have no metric.
 
     Returns
     -------
     metric : list of 3 Float
     valid : Bool
+
+    Raises
+    ------
+    ValueError
+        If there is no angle, and rays carry no footprints.
     """
     found = footprint_of(si)
     if found is None:
+        if angle is None:
+            raise ValueError(
+                "gaussian_texture: prefilter = true needs a sensor, since rays of Mitsuba "
+                f"{mi.__version__} carry no footprints; call eigengs_dr.plugins.follow(scene, "
+                "sensor), or render by 'eigengs-dr scene'"
+            )
         return metric(si, inverse, angle)
     entries, present = footprint_metric(found, inverse)
-    if not angle:
+    if angle is None:
         return entries, present
     others, valid = metric(si, inverse, angle)
     return [dr.select(present, e, o) for e, o in zip(entries, others, strict=True)], present | valid
@@ -110,7 +126,7 @@ def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Bool]:
     return [n00 * n00 + n10 * n10, n00 * n01 + n10 * n11, n01 * n01 + n11 * n11], present
 
 
-def metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Bool]:
+def metric(si: Interaction, inverse: tuple, angle: Float) -> tuple[list, Bool]:
     """Return the metric of the texture plane in which the footprint of a pixel is the unit circle.
 
     At the distance t along the ray direction d, the cone of a pixel has the radius
@@ -124,7 +140,7 @@ def metric(si: Interaction, inverse: tuple, angle: float) -> tuple[list, Bool]:
     si : mitsuba.SurfaceInteraction3f
     inverse : tuple of 4 float
         Rows of the inverse of the linear part of ``to_uv``.
-    angle : float
+    angle : Float
         Angle of a pixel in radians.
 
     Returns

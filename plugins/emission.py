@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.recording import guest
-from eigengs_dr.backend.types import Float, Mask
+from eigengs_dr.backend.types import Float, Mask, UInt
 from eigengs_dr.gaussian.covariance import max_deviation
 from eigengs_dr.raster.evaluate import widen
 from eigengs_dr.raster.lookup.cells import cell_side, list_cells
@@ -144,23 +144,23 @@ class Emission:
     Attributes
     ----------
     cells : mitsuba.DiscreteDistribution2D
-    densities : mitsuba.Texture2f
+    densities : TensorXf, shape (rows, columns)
         Densities at the centres of the cells, between which they are interpolated linearly.
     """
 
     cells: mi.DiscreteDistribution2D
-    densities: mi.Texture2f
+    densities: mi.TensorXf
 
     @property
     def bytes(self) -> int:
         """Bytes of the arrays: two numbers for each cell, and the sum of each row."""
-        rows, columns, _ = self.densities.shape
+        rows, columns = self.densities.shape
         return (2 * rows * columns + rows) * dr.itemsize_v(mi.Float)
 
     def sample(self, sample: mi.Point2f, active: Mask) -> tuple[mi.Point2f, Float]:
         """Return positions (Point2f) and their densities for samples of the unit square."""
         cell, _, rest = self.cells.sample(sample, active)
-        rows, columns, _ = self.densities.shape
+        rows, columns = self.densities.shape
         # At the borders the tent of a cell folds back into the square.
         p = mi.Point2f(cell) + 0.5 + mi.warp.square_to_tent(rest)
         p = dr.abs(p) * mi.Point2f(1 / columns, 1 / rows)
@@ -169,20 +169,40 @@ class Emission:
 
     def density(self, p: mi.Point2f, active: Mask) -> Float:
         """Return the density at positions; 0 outside of the unit square."""
-        inside = dr.all((p >= 0) & (p <= 1))
-        return dr.select(inside, self.densities.eval(p, active)[0], 0)
+        # On cuda, Dr.Jit 1.5 ends the process when a frozen rendering meets a texture object
+        # without acceleration, and the fractions of an accelerated one have 8 bits.
+        inside = active & dr.all((p >= 0) & (p <= 1))
+        rows, columns = self.densities.shape
+        (left, right), along = _neighbours(p.x, columns)
+        (upper, lower), down = _neighbours(p.y, rows)
+
+        def between(row: UInt) -> Float:
+            """Return the density in a row."""
+            values = (
+                dr.gather(mi.Float, self.densities.array, row * columns + column, inside)
+                for column in (left, right)
+            )
+            return dr.lerp(*values, along)
+
+        return dr.select(inside, dr.lerp(between(upper), between(lower), down), 0)
+
+
+def _neighbours(u: Float, count: int) -> tuple[tuple, Float]:
+    """Return the cells of `count` whose centres lie around u in [0, 1], and the way between them.
+
+    At the borders both are the outermost cell.
+    """
+    position = u * count - 0.5
+    below = dr.floor(position)
+    index, last = mi.Int32(below), count - 1
+    around = (mi.UInt32(dr.clip(i, 0, last)) for i in (index, index + 1))
+    return tuple(around), position - below
 
 
 def emission_of(survey: Survey) -> Emission:
     """Return the distribution of emission for a survey of the brightness."""
-    density = np.maximum(survey.brightness.numpy(), 0)
+    density = np.maximum(survey.brightness.numpy()[..., 0], 0)
     floor = DARKEST * density.mean() or 1.0
     density = np.maximum(density, floor)
-    return Emission(
-        mi.DiscreteDistribution2D(density[..., 0]),
-        mi.Texture2f(
-            mi.TensorXf(density / density.mean(dtype=np.float64).astype(np.float32)),
-            use_accel=False,  # the fractions of hardware have 8 bits
-            wrap_mode=dr.WrapMode.Clamp,
-        ),
-    )
+    relative = density / density.mean(dtype=np.float64).astype(np.float32)
+    return Emission(mi.DiscreteDistribution2D(density), mi.TensorXf(relative))

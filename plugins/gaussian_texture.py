@@ -22,7 +22,7 @@ from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, su
 
 from . import properties
 from .color import STEP, luminance, show_all, slope_of, upload_table, upsample
-from .cone import footprint_inputs, seen_metric
+from .cone import current_angle, footprint_inputs, seen_metric
 from .emission import Emission, Survey, emission_of, make_survey, outside_of_recordings
 from .lookup import (
     list_gaussians,
@@ -64,7 +64,8 @@ def gaussian_texture() -> type:
         factor : tensor (N, 3)
             a, b, c in 1 / pixels.
         color : tensor (N, C)
-            C is 1 or 3, in the space of the set.
+            In the space of the set. C is 1 or 3; or 2 in the space ``data``: codes of x and y of
+            normals, whose z follows from the length 1.
         background : tensor (C,)
             Value without Gaussians; `texture_of` writes it as (1, C).
         width, height : integer
@@ -80,8 +81,9 @@ def gaussian_texture() -> type:
             Return values as they are, neither decoded nor clamped.
         prefilter : float or boolean, default: 0
             Angle of a pixel in radians, below 1, see `pixel_angle`: lookups average over the
-            footprint of the pixel; 0 looks at points. Footprints that rays carry (Mitsuba 3.10) go
-            before the angle, and ``true`` takes them alone. Slopes of bump maps ignore footprints.
+            footprint of the pixel; 0 looks at points. With ``true`` the texture follows a sensor:
+            call `follow` before a rendering, as ``eigengs-dr scene`` does. Footprints that rays
+            carry (Mitsuba 3.10) go before both. Slopes of bump maps ignore footprints.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         """
@@ -95,33 +97,42 @@ def gaussian_texture() -> type:
             self.raw = properties.raw(props)
             self.cutoff = properties.cutoff(props, start.cutoff)
             self.angle, self.follows = properties.prefilter(props)
-            self.inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
+            self.prefilter = dr.opaque(mi.Float, self.angle)
+            self.sensor: mi.Sensor | None = None
             self.wrap = properties.wrap_mode(props)
             self.to_uv = properties.to_uv(props)
             self.width, self.height = start.width, start.height
             self.space, self.channels = start.space, start.channels
             self.spectra = upload_table() if mi.is_spectral else None
+            properties.check_known(props)
+            self.changed = False
             self.parameters_changed([])
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             for name, tensor in self.source.tensors.items():
                 callback.put(name, tensor, mi.ParamFlags.Differentiable)
             callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
+            if self.sensor is not None:
+                self.prefilter = current_angle(self.sensor)
+            callback.put("prefilter", self.prefilter, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
             if not keys or "to_uv" in keys:
                 properties.check_invertible(self.to_uv)
                 self.transform = mi.Transform3f(self.to_uv)
                 dr.make_opaque(self.transform)  # another transform compiles no other programs
-            if set(keys) != {"to_uv"}:
-                self._take_over(not keys or any(key in SHAPES for key in keys), not keys)
+            self.changed |= bool(set(keys) - {"to_uv", "prefilter"})
+            if "prefilter" in keys:
+                self._set_prefilter()
+            if not keys or set(keys) - {"to_uv", "prefilter"}:
+                self._take_over(not keys or any(key in SHAPES for key in keys))
             sampled = getattr(self, "emission", None) is not None
             self.survey: Survey | None = None
             self.emission: Emission | None = None
             if sampled:  # a frozen rendering cannot make it
                 self._emission()
 
-        def _take_over(self, moved: bool, start: bool) -> None:
+        def _take_over(self, moved: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
             source, settings = self.source, (self.cutoff, self.wrap, self.filtered())
             if source.file and source.is_that_of_file():
@@ -131,14 +142,34 @@ def gaussian_texture() -> type:
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved or not self.table.lists.cells.packs:
                 shape = source.decode(dr.detach(source.tensors)).shape
-                size, side = (self.width, self.height), SIDE if start else NARROW
+                size, side = (self.width, self.height), NARROW if self.changed else SIDE
                 lists = list_gaussians(shape, size, *settings, side)
             else:
                 lists = self.table.lists
             table = make_table(lists, self.cutoff, source.tensors, source.decode)
             # Who has changed parameters once may change colours next, and needs all lists again.
-            self.table = replace(table, lists=lists) if start else table
+            self.table = table if self.changed else replace(table, lists=lists)
             self.part = slice(None)
+
+        def follow(self, sensor: mi.Sensor) -> None:
+            """Take footprints of the pixels of a sensor from now on, see `follow`."""
+            current_angle(sensor)  # it raises where there is none
+            filtered, self.sensor = self.filtered(), sensor
+            if not filtered:
+                self._take_over(True)
+
+        def _set_prefilter(self) -> None:
+            """Take over the parameter ``prefilter``, which may switch footprints on or off."""
+            angle = properties.check_angle(float(dr.slice(self.prefilter)))
+            filtered, self.angle, self.sensor, self.follows = self.filtered(), angle, None, False
+            if filtered != self.filtered():
+                self._take_over(True)
+
+        def _pixel(self) -> Float | None:
+            """Return the angle of a pixel; None if rays alone know it."""
+            if self.sensor is not None:
+                return current_angle(self.sensor)
+            return self.prefilter if self.angle else None
 
         # --- Lookups -----------------------------------------------------------------------------
 
@@ -165,15 +196,19 @@ def gaussian_texture() -> type:
 
         @collector_off()
         def eval_3(self, si: Interaction, active: Mask = True) -> mi.Color3f:
-            if self.channels != 3:
+            if self.channels == 1:
                 raise ValueError(
                     f"{_name(self)}: a lookup of three channels, such as a normal map, needs a set "
-                    "of three channels; this set has one"
+                    "of two or three channels; this set has one"
                 )
             return mi.Color3f(*self._color(si, active))
 
         @collector_off()
         def eval_1_grad(self, si: Interaction, active: Mask = True) -> mi.Vector2f:
+            if self.channels == 2:
+                raise ValueError(
+                    f"{_name(self)}: a bump map needs heights; this set has x and y of normals"
+                )
             (x, sx), (y, sy), inside = self.point(si.uv)
             packed = self.table.packed
             cells, terms, count = (
@@ -192,8 +227,9 @@ def gaussian_texture() -> type:
 
         def _color(self, si: Interaction, active: Mask) -> list:
             """Look up the channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
-            where = (self.wrap, self.angle, *np.array(self.to_uv.matrix).flat)
-            sums = reused(self.table, where, si, self.inputs, lambda: self._look_up(si))[self.part]
+            where = (self.wrap, self.angle, id(self.sensor), *np.array(self.to_uv.matrix).flat)
+            inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
+            sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))[self.part]
             background = self.table.background[self.part]
             shown = show_all(self, [s + b for s, b in zip(sums, background, strict=True)])
             _, _, inside = self.point(si.uv)
@@ -207,7 +243,7 @@ def gaussian_texture() -> type:
             # B of a transform with the rows of B^-1
             turned = self.transform.inverse_transpose
             inverse = tuple(turned[j, i] for i in range(2) for j in range(2))
-            seen = seen_metric(si, inverse, self.angle)
+            seen = seen_metric(si, inverse, self._pixel())
             if self.wrap == "clamp":  # a footprint beyond the border may see what lies inside
                 u, v = self.transform @ si.uv
                 x, y = (
@@ -279,13 +315,14 @@ def gaussian_texture() -> type:
 
         def filtered(self) -> bool:
             """Return whether lookups average over a footprint; Mitsuba 3.10 asks."""
-            return self.follows or self.angle > 0
+            return self.follows or self.sensor is not None or self.angle > 0
 
         def is_spatially_varying(self) -> bool:
             return True
 
         def to_string(self) -> str:
-            angle = "true" if self.follows else f"{self.angle:g}"
+            follows = self.follows or self.sensor is not None
+            angle = "true" if follows else f"{self.angle:g}"
             transform = str(self.to_uv).replace("\n", "\n  ")
             return (
                 f'GaussianTexture[\n  name = "{self.file}",\n'

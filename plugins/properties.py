@@ -15,7 +15,7 @@ from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.color import SPACES
 
 from .parameters import TextureParameters, model_source, shared_file, without_arrays
-from .versions import Properties, has_footprints
+from .versions import Properties
 
 WRAPS = ("repeat", "mirror", "clamp")
 """Names of the ways to continue an image outside of its borders."""
@@ -40,8 +40,8 @@ def source_of(props: Properties) -> TextureParameters:
     Raises
     ------
     ValueError
-        If none or several of these properties are given, a file has other content, or a set does
-        not have one or three channels.
+        If none or several of these properties are given, a file has other content, or a set
+        has more than three channels.
     """
     given = [key for key in ("filename", "model", "mean") if key in props]
     if len(given) != 1:
@@ -66,9 +66,9 @@ def source_of(props: Properties) -> TextureParameters:
     else:
         gaussians = _from_arrays(props, backend)
         source = TextureParameters(without_arrays(gaussians), to_tensors(gaussians))
-    if source.start.channels not in (1, 3):
+    if source.start.channels > 3:
         raise ValueError(
-            f"gaussian_texture: the set has {source.start.channels} channels; use a set of 1 or 3"
+            f"gaussian_texture: the set has {source.start.channels} channels; use a set of 1 to 3"
         )
     return source
 
@@ -116,22 +116,28 @@ def prefilter(props: Properties) -> tuple[float, bool]:
     -------
     angle : float
     follows : bool
-        Whether the footprints of rays alone decide: ``true``.
+        Whether footprints are those of rays, or of the sensor that renders: ``true``.
     """
     if props.get("prefilter", 0.0) is True:
-        if not has_footprints():
-            raise ValueError(
-                "gaussian_texture: prefilter = true needs Mitsuba 3.10, and this is "
-                f"{mi.__version__}; give the angle of a pixel in radians, see pixel_angle"
-            )
         return 0.0, True
-    value = float(_read(props, "prefilter", 0.0, float, "a number"))
+    value = _read(props, "prefilter", 0.0, float, "true, or the angle of a pixel in radians")
+    return check_angle(value), False
+
+
+def check_angle(value: float) -> float:
+    """Return the angle of a pixel; raise `ValueError` if it is none."""
     if not 0 <= value < 1:
         raise ValueError(
             f"gaussian_texture: prefilter is {value}; it is the angle of a pixel in radians, "
             "at least 0 and below 1"
         )
-    return value, False
+    return value
+
+
+def check_known(props: Properties) -> None:
+    """Raise `ValueError` if there are properties that nobody has read."""
+    if unknown := props.unqueried():
+        raise ValueError(f"gaussian_texture: it has no property {' and '.join(unknown)}")
 
 
 def wrap_mode(props: Properties) -> str:

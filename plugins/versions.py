@@ -6,7 +6,9 @@ Pull request 1885, which is open, turns `mitsuba.Texture` into `mitsuba.Field`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from functools import partial
+from operator import methodcaller
 from typing import Any
 
 import drjit as dr
@@ -50,9 +52,39 @@ def register_texture(name: str, create: Callable[[Properties], Texture]) -> None
         A subclass of `texture_class`, or a function that refuses the properties.
     """
     if hasattr(mi, "register_texture"):
-        mi.register_texture(name, create)
+        mi.register_texture(name, reason_first(create))
     else:
-        mi.register_field(name, _as_field(create) if isinstance(create, type) else create)
+        field = _as_field(create) if isinstance(create, type) else create
+        mi.register_field(name, reason_first(field))
+
+
+_ended: Generator[None] = (_ for _ in ())
+_ended.close()  # its method `throw` raises an error, and adds no traceback
+
+
+def reason_first(create: Callable[[Properties], Texture]) -> type:
+    """Return what calls `create` and raises its errors without a traceback.
+
+    Mitsuba prints an error of a plugin as nanobind does: the traceback, then what went wrong. Every
+    function of Python that an error passes adds to the traceback. So `__new__` returns the error,
+    and ``__init__``, which holds no code of Python, raises it.
+    """
+
+    class Created:
+        made = create
+
+        def __new__(cls, props: Properties) -> Any:
+            try:
+                return create(props)
+            except Exception as error:
+                refusal = object.__new__(cls)
+                refusal.end = partial(_ended.throw, error.with_traceback(None))
+                return refusal
+
+        end: Callable[[], None]
+        __init__ = property(methodcaller("end"))
+
+    return Created
 
 
 def _as_field(texture: Any) -> type:

@@ -1,97 +1,123 @@
-"""What recovers a texture from photos: texels, a pyramid of texels, Gaussians, coefficients.
+"""What recovers textures from photos: texels, a pyramid of texels, Gaussians, coefficients.
 
-Every method descends by Adam from grey; a step renders one camera by 4 samples a pixel. PSNRs are
-of pictures by cameras that took no photo. The parameters of a pyramid are differences of texels to
-the next coarser level (Weier et al. 2025, doi 10.1145/3730855), so coarse ones move many texels.
+A step renders one camera by a few samples a pixel. PSNRs are of pictures by cameras that took no
+photo, and of the maps of a material. The parameters of a pyramid are differences of texels to the
+next coarser level (Weier et al. 2025, doi 10.1145/3730855), so coarse ones move many texels.
 """
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import product
 from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
+from matplotlib.figure import Figure
 
+import eigengs_bench.report as fr
 import eigengs_dr as eg
 from eigengs_bench.clock import Image
-from eigengs_bench.report import Section, table
+from eigengs_bench.report import Section, Table, number, table
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.resize import center_crop
 
 SIDE, TEXELS, SPP, MANY = 128, 256, 4, 64  # pixels; texels; samples of a step, and of a photo
-STEPS = (120, 240)  # of the descents; each ends with small rates
-CAMERAS, JUDGES, SEED = (3, 16), 4, 1 << 20
+STEPS = (120, 240, 480)  # of the descents; each ends with small rates
+NOISES, NOISY_STEPS = (1, 16), 240  # samples of steps in other descents, and their number
+CAMERAS, MATERIAL_CAMERAS, JUDGES, SEED = (3, 16), (6, 8), 4, 1 << 20
 GREY = 0.2  # light of the start
 LAST_RATE, MOMENTUM = 0.05, 0.5  # share to which rates fall by a cosine; of Adam, best for all
-LATTICES = (16, 40, 100)  # Gaussians along a side: wide ones move much, as in a pyramid
+SIDES = (16, 40, 100)  # Gaussians along a side: wide ones move much, as in a pyramid
 CUTOFF = 2.5  # standard deviations: lookups sum fewer Gaussians, for the same PSNR
-PHOTOS = {"poster": "chelsea", "ball": "astronaut"}  # the rates were chosen with "coffee"
-NAMES = {"poster": "poster.bsdf.reflectance", "ball": "ball.bsdf.base_color"}
+PHOTOS = {  # what the maps show; the rates were chosen with "coffee"
+    "poster": {"color": "chelsea"},
+    "ball": {"color": "astronaut"},
+    "material": {"albedo": "astronaut", "roughness": "chelsea"},
+}
+NAMES = {
+    "poster": {"color": "poster.bsdf.reflectance"},
+    "ball": {"color": "ball.bsdf.base_color"},
+    "material": {"albedo": "ball.bsdf.base_color", "roughness": "ball.bsdf.roughness"},
+}
+SPACES = {"color": "linear", "albedo": "linear", "roughness": "data"}
+Maps = Mapping[str, Image]
+
+
+class Scene(NamedTuple):
+    """What is to be recovered: maps in linear light or data, by photos of some cameras."""
+
+    kind: str
+    count: int
+    maps: Maps
+    photos: Sequence[Image]  # of the cameras, and of the judges
+    spp: int
 
 
 class Unknown(NamedTuple):
-    """A texture; values to optimise, by their rates; the parameters of a scene that they make."""
+    """Textures; values to optimise, by their rates; the parameters of a scene that they make."""
 
-    texture: dict[str, Any]
+    textures: dict[str, dict[str, Any]]
     start: dict[str, Any]
     rates: dict[str, float]
     shown: Callable[[Any], dict[str, Any]] = dict
     bound: Callable[[Any], None] = lambda values: None
 
 
-def texels(mi: Any, name: str) -> Unknown:
-    """Describe a texture by texels."""
-    texture = bitmap(mi, np.full((TEXELS, TEXELS, 3), GREY, np.float32))
-    key = f"{name}.data"
-    return Unknown(texture, {key: mi.TensorXf(texture["data"])}, {key: 0.02})
+def texels(mi: Any, kind: str) -> Unknown:
+    """Describe textures by texels."""
+    textures = {name: bitmap(mi, grey(name)) for name in NAMES[kind]}
+    start = {f"{key}.data": mi.TensorXf(grey(name)) for name, key in NAMES[kind].items()}
+    return Unknown(textures, start, dict.fromkeys(start, 0.02))
 
 
-def pyramid(mi: Any, name: str) -> Unknown:
+def pyramid(mi: Any, kind: str) -> Unknown:
     """Describe texels by a level of them, added to the next coarser sum at twice its size."""
-    sides = [TEXELS >> level for level in range(7)]
-    start = {str(side): mi.TensorXf(np.zeros((side, side, 3), np.float32)) for side in sides}
-    start[str(sides[-1])] += GREY
+    sides, start = [TEXELS >> level for level in range(7)], {}
+    for name in NAMES[kind]:
+        channels = grey(name).shape[2]
+        for side in sides:
+            start[f"{name}{side}"] = mi.TensorXf(np.zeros((side, side, channels), np.float32))
+        start[f"{name}{sides[-1]}"] += float(grey(name)[0, 0, 0])
 
     def shown(values: Any) -> dict[str, Any]:
-        total = values[str(sides[-1])]
-        for side in sides[-2::-1]:
-            larger = dr.resample(total, (side, side, 3), "linear", boundary="nearest")
-            total = larger + values[str(side)]
-        return {f"{name}.data": total}
+        result = {}
+        for name, key in NAMES[kind].items():
+            total = values[f"{name}{sides[-1]}"]
+            for side in sides[-2::-1]:
+                size = (side, side, total.shape[2])
+                total = dr.resample(total, size, "linear", boundary="nearest")
+                total = total + values[f"{name}{side}"]
+            result[f"{key}.data"] = total
+        return result
 
-    return Unknown(texels(mi, name).texture, start, dict.fromkeys(start, 0.004), shown)
+    return Unknown(texels(mi, kind).textures, start, dict.fromkeys(start, 0.004), shown)
 
 
-def gaussians(mi: Any, name: str) -> Unknown:
-    """Describe a texture by lattices of Gaussians."""
+def lookups(mi: Any, kind: str) -> Unknown:
+    """Describe a texture by lattices of Gaussians, which every sample sums."""
     from eigengs_dr.plugins import keep_in_bounds, texture_of
 
-    places = [(np.indices((n, n)).reshape(2, -1).T + 0.5) * TEXELS / n for n in LATTICES]
-    narrow = np.concatenate([np.full(n * n, n / (0.65 * TEXELS)) for n in LATTICES])
-    factor = np.stack([narrow, 0 * narrow, narrow], axis=1)
-    size, grey = (TEXELS, TEXELS), [GREY] * 3
-    mean, color = np.concatenate(places), np.zeros((len(narrow), 3))
-    found = eg.Gaussians.from_arrays(mean, factor, color, grey, size=size, space="linear")
+    [(name, key)] = NAMES[kind].items()
+    found = eg.lattices((TEXELS, TEXELS), SIDES, [GREY] * 3, space="linear")
     rates = {"mean": 0.2, "factor": 0.02, "color": 0.01, "background": 0.005}
     texture = texture_of(found, cutoff=CUTOFF)
     tensors = mi.traverse(mi.load_dict(texture))
-    start = {f"{name}.{key}": mi.TensorXf(tensors[key]) for key in rates}
+    start = {f"{key}.{field}": mi.TensorXf(tensors[field]) for field in rates}
     named = dict(zip(start, rates.values(), strict=True))
 
     def bound(values: Any) -> None:
-        keep_in_bounds(values, name, found)
+        keep_in_bounds(values, key, found)
 
-    return Unknown(texture, start, named, bound=bound)
+    return Unknown({name: texture}, start, named, bound=bound)
 
 
-def coefficients(mi: Any, name: str) -> Unknown:
+def coefficients(mi: Any, kind: str) -> Unknown:
     """Describe a texture by coefficients of the model "natural", in units of their deviations."""
     model = eg.EigenGS.load("natural")
+    [(name, key)] = NAMES[kind].items()
     deviation = np.zeros((len(model.components), max(model.components)), np.float32)
     for row, values in zip(deviation, model.eigenvalues, strict=True):
         row[: len(values)] = values
@@ -99,15 +125,44 @@ def coefficients(mi: Any, name: str) -> Unknown:
     scale, texture = mi.TensorXf(deviation), {"type": "gaussian_texture"}
     start = {"z": dr.zeros(mi.TensorXf, deviation.shape)}
     texture["model"] = str(SHIPPED["natural"])
-    key = f"{name}.coefficients"
-    return Unknown(texture, start, {"z": 0.3}, lambda v: {key: v["z"] * scale})
+
+    def shown(values: Any) -> dict[str, Any]:
+        return {f"{key}.coefficients": values["z"] * scale}
+
+    return Unknown({name: texture}, start, {"z": 0.3}, shown)
 
 
-METHODS = (texels, pyramid, gaussians, coefficients)
+def fit(mi: Any, scene: Scene, steps: int) -> Row:
+    """Recover maps by `eg.fit` of a `photo_loss`; the second of two runs has compiled kernels."""
+    from eigengs_dr.plugins import photo_loss
+
+    names = NAMES[scene.kind]
+    spaces = {name: SPACES[name] for name in names}
+    for _ in range(2):
+        textures = {name: bitmap(mi, grey(name)) for name in names}
+        loaded = scene_of(mi, scene.kind, textures, scene.count)
+        loss = photo_loss(loaded, names, scene.photos[: scene.count], spp=scene.spp)
+        size = (TEXELS, TEXELS)
+        result = eg.fit(loss=loss, size=size, space=spaces, iterations=steps, progress=False)
+        dr.sync_thread()
+    drawn = eg.render(result.gaussians).numpy()
+    ends = np.cumsum([grey(name).shape[2] for name in names])[:-1]
+    found = dict(zip(names, np.split(drawn, ends, axis=2), strict=True))
+    count = sum(array.size for array in result.gaussians.to_arrays().values())
+    return {
+        "seconds": result.seconds,
+        "parameters": count,
+        "gaussians": len(result.gaussians),
+        **judge(mi, scene, {name: np.clip(picture, 0, 1) for name, picture in found.items()}),
+    }
+
+
+UNKNOWNS = (texels, pyramid, lookups, coefficients)
+SINGLE = ("lookups", "coefficients")  # of one map
 
 
 def run(task: Task) -> list[Row]:
-    """Recover a poster and the colour of a ball by every method, with few and many cameras."""
+    """Recover a poster, the colour of a ball and a material, with few and many cameras."""
     return task.measure("inverse", _jobs(task))
 
 
@@ -118,27 +173,42 @@ def _jobs(task: Task) -> Iterator[Job]:
 
     mi.set_variant("cuda_ad_rgb" if task.backend == "cuda" else "llvm_ad_rgb")
     register_plugins()
-    for scene, photo in PHOTOS.items():
-        image = np.clip(center_crop(eg.sample(photo), TEXELS, TEXELS), 0, 1)
-        for count in CAMERAS:
-            for steps, method in product(STEPS, METHODS):
-                job = {"scene": scene, "cameras": count, "method": method.__name__, "steps": steps}
-                unknown = method(mi, NAMES[scene])
-                yield job, partial(recover, mi, scene, count, unknown, image, steps)
+    methods = [unknown.__name__ for unknown in UNKNOWNS] + ["fit"]
+    for kind in PHOTOS:
+        maps = maps_of(kind)
+        for count in MATERIAL_CAMERAS if kind == "material" else CAMERAS:
+            photos = photos_of(mi, kind, maps, count)
+            settings = [(steps, SPP) for steps in STEPS]
+            settings += [(NOISY_STEPS, spp) for spp in NOISES]
+            for steps, spp in settings:
+                for method in methods:
+                    if method in SINGLE and (len(maps) > 1 or spp != SPP):
+                        continue
+                    job = {"scene": kind, "cameras": count, "method": method, "steps": steps}
+                    scene = Scene(kind, count, maps, photos, spp)
+                    yield {**job, "spp": spp}, partial(recover, mi, scene, method, steps)
 
 
-def recover(mi: Any, kind: str, count: int, unknown: Unknown, image: Image, steps: int) -> Row:
-    """Descend, and return seconds, without the first step, which compiles, and psnr_rgb."""
-    photos = _photos(mi, scene_of(mi, kind, bitmap(mi, to_linear(image)), count), 0)
-    scene = scene_of(mi, kind, unknown.texture, count)
-    parameters, values = mi.traverse(scene), mi.ad.Adam(1.0, unknown.start, beta_1=MOMENTUM)
+def recover(mi: Any, scene: Scene, method: str, steps: int) -> Row:
+    """Recover the maps of a scene by a method; return seconds, parameters and PSNRs."""
+    if method == "fit":
+        return fit(mi, scene, steps)
+    [unknown] = [describe(mi, scene.kind) for describe in UNKNOWNS if describe.__name__ == method]
+    return descend(mi, scene, unknown, steps)
+
+
+def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int) -> Row:
+    """Descend by Adam; the seconds are without the first step, which compiles."""
+    loaded = scene_of(mi, scene.kind, unknown.textures, scene.count)
+    parameters, values = mi.traverse(loaded), mi.ad.Adam(1.0, unknown.start, beta_1=MOMENTUM)
+    photos = [mi.TensorXf(photo) for photo in scene.photos[: scene.count]]
     started = 0.0
     for step in range(steps):
-        camera = step % count
+        camera = step % scene.count
         rate = LAST_RATE + (1 - LAST_RATE) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
         parameters.update(unknown.shown(values))
         values.set_learning_rate({key: rate * r for key, r in unknown.rates.items()})
-        shown = mi.render(scene, parameters, sensor=camera, spp=SPP, seed=step)
+        shown = mi.render(loaded, parameters, sensor=camera, spp=scene.spp, seed=step)
         dr.backward(dr.mean(dr.square(shown - photos[camera]), axis=None))
         values.step()
         unknown.bound(values)
@@ -147,42 +217,100 @@ def recover(mi: Any, kind: str, count: int, unknown: Unknown, image: Image, step
             started = time.perf_counter()
     dr.sync_thread()
     seconds = time.perf_counter() - started
-    parameters.update(unknown.shown(values))
-    pairs = _photos(mi, scene, count), photos[count:]
-    coded = (to_coded(np.maximum(np.concatenate(pictures), 0)) for pictures in pairs)
-    return {"seconds": seconds, "psnr_rgb": eg.psnr(*coded)}
+    last = unknown.shown(values)
+    parameters.update(last)
+    row = {"seconds": seconds, "parameters": sum(dr.width(v) for v in unknown.start.values())}
+    row["psnr_rgb"] = _psnr(_photos(mi, loaded, scene.count), scene.photos[scene.count :])
+    if len(scene.maps) > 1:
+        found = {n: last[f"{key}.data"].numpy() for n, key in NAMES[scene.kind].items()}
+        row |= _judge_maps(scene, found)
+    return row
 
 
-def bitmap(mi: Any, light: Image) -> dict[str, Any]:
-    """Return a texture of texels in linear light, shape (H, W, 3)."""
-    data = mi.TensorXf(np.ascontiguousarray(light))
+def judge(mi: Any, scene: Scene, found: Maps) -> Row:
+    """Return psnr_rgb of the cameras that took no photo, and the PSNRs of several maps."""
+    loaded = scene_of(mi, scene.kind, _bitmaps(mi, found), scene.count)
+    views = _photos(mi, loaded, scene.count)
+    row = {"psnr_rgb": _psnr(views, scene.photos[scene.count :])}
+    return row | (_judge_maps(scene, found) if len(scene.maps) > 1 else {})
+
+
+def _judge_maps(scene: Scene, found: Maps) -> Row:
+    """Return the PSNRs of maps, and of the best constant in place of each."""
+    row = {}
+    for name, true in scene.maps.items():
+        constant = np.broadcast_to(true.mean(axis=(0, 1)), true.shape)
+        for key, picture in ((name, found[name]), (f"{name}_constant", constant)):
+            pair = np.clip(picture, 0, 1), true
+            if SPACES[name] == "linear":
+                row[key] = eg.psnr(*(to_coded(p) for p in pair))
+            else:
+                row[key] = float(-10 * np.log10(np.mean(np.square(pair[0] - pair[1]))))
+    return row
+
+
+def _psnr(pictures: Sequence[Image], photos: Sequence[Image]) -> float:
+    coded = (to_coded(np.maximum(np.concatenate(p), 0)) for p in (pictures, photos))
+    return eg.psnr(*coded)
+
+
+def maps_of(kind: str) -> Maps:
+    """Return the maps of a scene: photos in linear light; of one, the grey as roughness."""
+    maps = {}
+    for name, photo in PHOTOS[kind].items():
+        codes = np.clip(center_crop(eg.sample(photo), TEXELS, TEXELS), 0, 1)
+        rough = 0.2 + 0.6 * codes.mean(axis=2, keepdims=True)
+        maps[name] = to_linear(codes) if SPACES[name] == "linear" else rough.astype(np.float32)
+    return maps
+
+
+def photos_of(mi: Any, kind: str, maps: Maps, count: int) -> list[Image]:
+    """Render the photos of the cameras and of the judges."""
+    return _photos(mi, scene_of(mi, kind, _bitmaps(mi, maps), count), 0)
+
+
+def grey(name: str) -> Image:
+    """Return the texels of a map before the first step."""
+    channels, value = (3, GREY) if SPACES[name] == "linear" else (1, 0.5)
+    return np.full((TEXELS, TEXELS, channels), value, np.float32)
+
+
+def bitmap(mi: Any, values: Image) -> dict[str, Any]:
+    """Return a texture of texels in linear light or data, shape (H, W, C)."""
+    data = mi.TensorXf(np.ascontiguousarray(values, np.float32))
     return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
 
 
-def scene_of(mi: Any, kind: str, texture: dict[str, Any], count: int) -> Any:
+def _bitmaps(mi: Any, maps: Maps) -> dict[str, dict[str, Any]]:
+    return {name: bitmap(mi, values) for name, values in maps.items()}
+
+
+def scene_of(mi: Any, kind: str, textures: Mapping[str, dict[str, Any]], count: int) -> Any:
     """Load a poster or a ball over a floor, under a lamp and the sky; judges look from between."""
     at, box = mi.ScalarTransform4f(), {"type": "box"}
     film = {"type": "hdrfilm", "pixel_format": "rgb", "width": SIDE, "height": SIDE, "rfilter": box}
     scene = {"type": "scene", "integrator": {"type": "prb", "max_depth": 3}}
     places = [*np.arange(0.5, count) / count, *np.arange(0.75, JUDGES) / JUDGES]
-    for number, share in enumerate(places):
-        angle = 2 * math.pi * share if kind == "ball" else 1.4 * (share - 0.5)
+    for camera_number, share in enumerate(places):
+        angle = 1.4 * (share - 0.5) if kind == "poster" else 2 * math.pi * share
         place = [3.7 * math.sin(angle), 0.9 * math.sin(16 * share), 3.7 * math.cos(angle)]
         view = at.look_at(place, [0, 0, 0], [0, 1, 0])
         camera = {"type": "perspective", "film": film, "fov": 36, "to_world": view}
-        scene[f"camera{number:02}"] = camera
+        scene[f"camera{camera_number:02}"] = camera
     light = {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}
     lamp = at.look_at([1.5, 3, 3], [0, 0, 0], [0, 1, 0]).scale(0.7)
     floor = at.translate([0, -1.3, 0]).rotate([1, 0, 0], -90).scale(5)
     scene["floor"] = {"type": "rectangle", "to_world": floor}
     scene["lamp"] = {"type": "rectangle", "to_world": lamp, "emitter": light}
     scene["sky"] = {"type": "constant", "radiance": 0.5}
-    if kind == "ball":
-        coat = {"type": "principled", "base_color": texture, "roughness": 0.4}
-        scene[kind] = {"type": "sphere", "to_world": at.rotate([1, 0, 0], 90), "bsdf": coat}
-    else:
-        paint = {"type": "diffuse", "reflectance": texture}
+    if kind == "poster":
+        paint = {"type": "diffuse", "reflectance": textures["color"]}
         scene[kind] = {"type": "rectangle", "to_world": at.scale([1, -1, 1]), "bsdf": paint}
+    else:
+        coat = {"type": "principled", "roughness": 0.4}
+        for name, texture in textures.items():
+            coat["roughness" if name == "roughness" else "base_color"] = texture
+        scene["ball"] = {"type": "sphere", "to_world": at.rotate([1, 0, 0], 90), "bsdf": coat}
     return mi.load_dict(scene)
 
 
@@ -193,15 +321,91 @@ def _photos(mi: Any, scene: Any, first: int) -> list[Image]:
         return [mi.render(scene, sensor=k, spp=MANY, seed=SEED).numpy() for k in cameras]
 
 
+# ---------------------------------------------------------------------------------------------
+#  Tables and a chart
+# ---------------------------------------------------------------------------------------------
+
+METHODS = {"texels": "#888888", "pyramid": "#b5442f", "lookups": "#d9a441", "fit": "#0b6e99"}
+METHODS |= {"coefficients": "#5a8f3c"}
+
+
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay out the PSNR and the seconds of each descent."""
-    found = {
-        tuple(row["job"][k] for k in ("scene", "cameras", "steps", "method")): row for row in rows
-    }
+    """Lay out PSNR, seconds and parameters of each descent, and the gain at equal seconds."""
+    curves: dict[tuple, dict[str, dict[int, Row]]] = {}
+    for row in rows:
+        job = row["job"]
+        case = job["scene"], job["cameras"], job["spp"]
+        curves.setdefault(case, {}).setdefault(job["method"], {})[job["steps"]] = row
+    tables = [_methods(curves), _gains(curves), _materials(curves)]
+    return Section([t for t in tables if len(t.frame)], {"inverse": _chart(curves)})
+
+
+def _methods(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
     lines = []
-    for kind, count, steps in dict.fromkeys(key[:3] for key in found):
-        each = (found.get((kind, count, steps, method.__name__)) for method in METHODS)
-        cells = (f"{r['psnr_rgb']:.1f} dB, {r['seconds']:.1f} s" if r else "" for r in each)
-        lines.append((f"{kind}, {count} cameras", f"{steps}", *cells))
-    columns = ("photos", "steps", *(method.__name__ for method in METHODS))
-    return Section([table("psnr_rgb and seconds of a descent", columns, lines, name="methods")])
+    for (scene, cameras, spp), methods in curves.items():
+        for steps in sorted({steps for curve in methods.values() for steps in curve}):
+            found = [methods.get(name, {}).get(steps) for name in METHODS]
+            cells = [f"{r['psnr_rgb']:.1f} dB, {r['seconds']:.1f} s" if r else "" for r in found]
+            lines.append((f"{scene}, {cameras} cameras, {spp} samples", f"{steps}", *cells))
+    columns = ("photos", "steps", *METHODS)
+    return table("psnr_rgb and seconds of a descent", columns, lines, name="methods")
+
+
+def gain(methods: Mapping[str, Mapping[int, Row]], key: str = "psnr_rgb") -> list[float]:
+    """Return the decibels of each fit above the pyramid at equal seconds.
+
+    Between two descents of the pyramid, its PSNR is linear in the logarithm of the seconds; outside
+    of them it is that of the nearest.
+    """
+    curve = sorted((row["seconds"], row[key]) for row in methods["pyramid"].values())
+    seconds, psnr = zip(*curve, strict=True)
+    return [
+        row[key] - float(np.interp(math.log(row["seconds"]), np.log(seconds), psnr))
+        for _, row in sorted(methods["fit"].items())
+    ]
+
+
+def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
+    lines = []
+    for (scene, cameras, spp), methods in curves.items():
+        if not {"pyramid", "fit"} <= methods.keys():
+            continue
+        gains = zip(sorted(methods["fit"]), gain(methods), strict=True)
+        for steps, decibels in gains:
+            row, other = methods["fit"][steps], next(iter(methods["pyramid"].values()))
+            share = row["parameters"] / other["parameters"]
+            name = f"{scene}, {cameras} cameras, {spp} samples"
+            line = (name, f"{steps}", f"{row['gaussians']:,}", f"{share:.2f}", f"{decibels:+.1f}")
+            lines.append(line)
+    columns = ("photos", "steps", "Gaussians", "share of parameters", "dB at equal seconds")
+    return table("fit over the pyramid of texels", columns, lines, name="gains")
+
+
+def _materials(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
+    lines = []
+    for (scene, cameras, spp), methods in curves.items():
+        for method in METHODS if scene == "material" else ():
+            for steps, row in sorted(methods.get(method, {}).items()):
+                name = f"{cameras} cameras, {spp} samples"
+                figures = [row["seconds"], row["albedo"], row["roughness"]]
+                cells = [number(value) for value in [*figures, row["roughness_constant"]]]
+                lines.append((name, method, f"{steps}", *cells))
+    columns = ("photos", "method", "steps", "seconds", "albedo", "roughness", "best constant")
+    return table("PSNRs of the maps of a material in dB", columns, lines, name="materials")
+
+
+def _chart(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Figure:
+    """Draw PSNR over seconds, a part for each scene and number of cameras."""
+    cases = [case for case in curves if len(next(iter(curves[case].values()))) > 1]
+    figure = fr.new_figure(10, 2 + 2.6 * math.ceil(len(cases) / 2), "Textures from photos")
+    axes = np.ravel(figure.subplots(max(1, math.ceil(len(cases) / 2)), 2, squeeze=False))
+    for axis, case in zip(axes, cases, strict=False):
+        for method, color in METHODS.items():
+            rows = sorted(curves[case].get(method, {}).values(), key=lambda row: row["seconds"])
+            if rows:
+                text = f"{method}, {rows[0]['parameters']:,} parameters"
+                seconds, psnr = ([row[k] for row in rows] for k in ("seconds", "psnr_rgb"))
+                axis.plot(seconds, psnr, color=color, marker="o", ms=4, label=text)
+        axis.set_title(f"{case[0]}, {case[1]} cameras", fontsize=9)
+        fr.label_axes(axis, "seconds", "psnr_rgb / dB")
+    return figure

@@ -161,6 +161,23 @@ def settle(rows: list[kinds.Float]) -> list[kinds.Float]:
     return rows
 
 
+def gather_run(
+    types: ArrayTypes,
+    source: kinds.Float | kinds.UInt,
+    index: kinds.UInt,
+    length: int,
+    active: kinds.Mask,
+) -> list:
+    """Gather ``source[index * length : (index + 1) * length]``, in packets if the length is even.
+
+    Return a list of `length` Float.
+    """
+    shape, kind = (length, dr.width(index)), types.FloatX
+    if dr.type_v(source) == dr.VarType.Float16:
+        kind = dr.float16_array_t(kind)
+    return list(dr.gather(kind, source, index, active, shape=shape))
+
+
 TANH_NUMERATOR = (-9.64399179425052238628e-1, -9.92877231001918586564e1, -1.61468768441708447952e3)
 TANH_DENOMINATOR = (
     1.0,

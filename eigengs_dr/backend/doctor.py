@@ -12,7 +12,7 @@ import sys
 from importlib.metadata import requires
 
 from . import libllvm
-from .selection import BACKENDS, UNTESTED_ON_GPU, UNTESTED_ON_METAL, version_of
+from .selection import BACKENDS, UNTESTED_ON_METAL, version_of
 from .types import Record
 
 TRIAL = """
@@ -88,8 +88,9 @@ def describe(found: Record) -> str:
         if not trial["works"]:
             lines.append(f"{name:8} does not work: {trial['problem']}")
             continue
-        states = {"cuda": UNTESTED_ON_GPU, "metal": UNTESTED_ON_METAL}
-        versions, detail = trial["versions"], f"; {states.get(name)}"
+        versions, detail = trial["versions"], ""
+        if name == "metal":
+            detail = f"; {UNTESTED_ON_METAL}"
         if name == "llvm":
             library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
             detail = f", {library}, {trial['threads']} threads on {trial['cpu']}"

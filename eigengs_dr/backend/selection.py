@@ -19,9 +19,6 @@ from .types import Record
 
 BACKENDS = ("llvm", "cuda", "metal")
 
-UNTESTED_ON_GPU = "tested with a simulated driver only, not yet on a GPU"
-"""State of the cuda backend, until the whole suite has passed on a GPU."""
-
 UNTESTED_ON_METAL = "never run; only its names are tested"
 """State of the metal backend of Dr.Jit, which is on Macs."""
 
@@ -55,8 +52,8 @@ def select(backend: str | None = None) -> ModuleType:
     Warns
     -----
     UserWarning
-        At the first use of cuda or metal in a process: `UNTESTED_ON_GPU`, `UNTESTED_ON_METAL`. If
-        a GPU is there and disagrees with llvm.
+        At the first use of metal in a process: `UNTESTED_ON_METAL`. If a GPU is there and disagrees
+        with llvm.
 
     Examples
     --------
@@ -70,10 +67,9 @@ def select(backend: str | None = None) -> ModuleType:
     if backend == "metal":
         if not _has(dr, "Metal"):
             raise BackendError("no Metal GPU was found; use backend 'llvm'")
-        _announce("metal", UNTESTED_ON_METAL)
+        _announce_metal()
         return dr.metal.ad
     if backend != "llvm" and _has(dr, "CUDA") and (backend == "cuda" or _cuda_agrees()):
-        _announce("cuda", UNTESTED_ON_GPU)
         return dr.cuda.ad
     if backend == "cuda":
         raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
@@ -106,9 +102,9 @@ def _has(dr: ModuleType, name: str) -> bool:
 
 
 @cache  # the second call is silent
-def _announce(backend: str, state: str) -> None:
-    """Warn of the state of a backend, once in a process."""
-    warn(f"backend {backend}: {state}; compare with backend 'llvm'")
+def _announce_metal() -> None:
+    """Warn of the state of the metal backend, once in a process."""
+    warn(f"backend metal: {UNTESTED_ON_METAL}; compare with backend 'llvm'")
 
 
 @cache  # it asks a file, or compares fits, and warns once

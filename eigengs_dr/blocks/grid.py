@@ -247,9 +247,9 @@ class BlockSets:
         is_own = np.arange(len(apart)) == block.number
         for number in np.flatnonzero(~apart.any(axis=1) | is_own):
             part = self._part(self.blocks[number])
-            mean = self.arrays["mean"][part]
-            # Rounding may move an own one across the edge.
-            inside = np.all((mean >= low) & (mean <= high) | is_own[number], axis=1)
+            x, y = self.arrays["mean"][part].T  # NumPy reduces rows of two slowly
+            inside = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
+            inside |= is_own[number]  # rounding may move an own one across the edge
             yield part.start + np.flatnonzero(inside), part.start + np.flatnonzero(~inside)
 
     def _part(self, block: Block) -> slice:

@@ -6,9 +6,10 @@ bitmaps of a scene by Gaussians.
 
 from __future__ import annotations
 
+import json
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -25,10 +26,8 @@ from .console import MISSED, bar, table
 from .outputs import check_outputs, claim, name_outputs
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from ..scene.convert import ConvertedScene
+    from ..scene.rendering import Rendering
 
 
 SUFFIXES = (".png", ".exr")
@@ -41,6 +40,20 @@ def definition(text: str) -> tuple[str, str]:
     if not (key and sign):
         raise click.BadParameter(f"{text}: expected a name and a value, such as spp=16")
     return key, value
+
+
+def integrator(text: str) -> Record:
+    """Parse the type of an integrator and its parameters, as in "path,max_depth=4"."""
+    kind, *settings = text.split(",")
+    return {"type": kind, **{key: _value(value) for key, value in map(definition, settings)}}
+
+
+def _value(text: str) -> object:
+    """Return a number or a boolean; other texts are as they are."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 variant_option = options.value(
@@ -57,6 +70,10 @@ definitions_option = click.option(
 @options.output(".png or .exr file, or a folder.", "OUT")
 @variant_option
 @options.number("--spp", "Samples per pixel.  [default: from the scene]", least=1)
+@options.value(
+    "--camera", "ID|N|all", str, "Camera to render; all writes OUT-ID for each.  [default: 1]"
+)
+@options.value("--integrator", "TYPE[,KEY=VALUE...]", integrator, "Replaces that of the scene.")
 @definitions_option
 @options.shared("quiet")
 def scene(
@@ -65,13 +82,16 @@ def scene(
     output: Path,
     variant: str | None,
     spp: int | None,
+    camera: str | None,
+    integrator: Record | None,
     definitions: dict[str, str],
 ) -> None:
     """Render Mitsuba scenes with Gaussian textures.
 
     The mitsuba executable does not know the texture gaussian_texture, because it is a plugin in
     Python; this command does. For several scenes, -o names a folder, and the pictures have the
-    names of the scenes.
+    names of the scenes. An EXR file has AOVs and layers by their names; a PNG file has the colours.
+    Textures whose prefilter is true follow the camera.
 
     \b
     Examples:
@@ -79,29 +99,65 @@ def scene(
       eigengs-dr scene scenes/plane.xml -o plane.png -D prefilter=0 --spp 64
       eigengs-dr scene scenes/*.xml -o build/scenes/
       eigengs-dr scene scenes/ball.xml -o ball.exr --variant llvm_ad_spectral
+      eigengs-dr scene room.xml -o room.png --camera all       writes room-1.png, room-2.png, ...
+      eigengs-dr scene room.xml -o room.exr --integrator aov,aovs=distance:depth
     """
     outputs = name_outputs(scenes, output, SUFFIXES)
     check_outputs(outputs, scenes)
     claim(*outputs)
     mi = load_mitsuba(variant, run.quiet)
-    from ..scene.convert import render_in_passes
+    from ..scene.rendering import render_in_passes
 
     for path, target in zip(scenes, outputs, strict=True):
-        started = time.perf_counter()
-        with explained(path), bar(run.quiet) as show:
-            found = mi.load_file(str(path), **definitions)
-            if not isinstance(found, mi.Scene):
+        with explained(path):
+            loaded = mi.load_file(str(path), **definitions)
+            if not isinstance(loaded, mi.Scene):
                 raise ValueError("it holds no scene; its root must be <scene version='3.0.0'>")
-            if not found.sensors():
+            if not loaded.sensors():
                 raise ValueError("the scene has no sensor; add one")
-            pixels, samples = render_in_passes(found, 0, spp, partial(show, str(path)))
-        _write(mi, target, pixels)
-        height, width = pixels.shape[:2]
-        run.tell(
-            f"{path}: {width}x{height}, samples per pixel: {samples}, "
-            f"{time.perf_counter() - started:.1f} s",
-            f"  wrote {target}",
-        )
+            cameras = _cameras([sensor.id() for sensor in loaded.sensors()], camera)
+            renderer = mi.load_dict(integrator) if integrator else None
+        files = _files(target, cameras, scenes) if camera == "all" else [target]
+        for (number, name), file in zip(cameras.items(), files, strict=True):
+            started = time.perf_counter()
+            with explained(path), bar(run.quiet) as show:
+                seen = render_in_passes(loaded, number, spp, partial(show, str(path)), renderer)
+                left_out = _write(mi, file, seen)
+            height, width = seen.pixels.shape[:2]
+            by = f", camera {name}" if len(loaded.sensors()) > 1 else ""
+            run.tell(
+                f"{path}{by}: {width}x{height}, samples per pixel: {seen.spp}, "
+                f"{time.perf_counter() - started:.1f} s",
+                f"  wrote {file}" + f", without {', '.join(left_out)}" * bool(left_out),
+            )
+        if camera is None and len(loaded.sensors()) > 1:
+            run.tell(f"  the first of {len(loaded.sensors())} cameras; --camera all renders each")
+
+
+def _cameras(ids: list[str], wanted: str | None) -> dict[int, str]:
+    """Choose cameras by an id or a number from 1, all of them, or the first.
+
+    Returns
+    -------
+    dict of int to str
+        The name of each by its place: its id if files may have it in their names, or its number.
+    """
+    names = [name if re.fullmatch(r"[\w.-]+", name) else f"{k}" for k, name in enumerate(ids, 1)]
+    if wanted is None or wanted == "all":
+        return dict(enumerate(names if wanted else names[:1]))
+    numbers = [f"{k}" for k in range(1, len(ids) + 1)]
+    for known in (ids, names, numbers):
+        if wanted in known:
+            return {known.index(wanted): names[known.index(wanted)]}
+    raise ValueError(f"it has no camera {wanted}; use all, or one of {', '.join(names)}")
+
+
+def _files(target: Path, cameras: dict[int, str], scenes: Sequence[Path]) -> list[Path]:
+    """Name a picture for each camera, and claim it."""
+    files = [target.with_stem(f"{target.stem}-{name}") for name in cameras.values()]
+    check_outputs(files, scenes)
+    claim(*files)
+    return files
 
 
 def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
@@ -123,16 +179,22 @@ def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
     return mi
 
 
-def _write(mi: ModuleType, path: Path, pixels: NDArray[np.float32]) -> None:
-    """Write a picture, all or nothing."""
+def _write(mi: ModuleType, path: Path, seen: Rendering) -> list[str]:
+    """Write a picture, all or nothing; return the names of channels that it leaves out."""
+    left_out = []
     if path.suffix.lower() == ".png":
-        channels = pixels.shape[2] if pixels.shape[2] <= 4 else 3  # AOVs follow the colours
-        bitmap = mi.Bitmap(pixels[..., :channels].copy())
+        colors = seen.picture()
+        if not colors.size:
+            raise ValueError(f"it shows no colours but {', '.join(seen.channels)}; write .exr")
+        left_out = [name for name in seen.channels if name not in {*"RGBAY"}]
+        bitmap = mi.Bitmap(colors)
         bitmap = bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
     else:
-        bitmap = mi.Bitmap(pixels)
+        kind = mi.Bitmap.PixelFormat.MultiChannel  # else four AOVs count as RGBA
+        bitmap = mi.Bitmap(seen.pixels, kind, list(seen.channels))
     with atomic_write(path) as temporary:
         bitmap.write(str(temporary))
+    return left_out
 
 
 @contextmanager
@@ -152,10 +214,7 @@ def explained(path: Path) -> Iterator[None]:
         if isinstance(cause, KeyboardInterrupt):
             raise KeyboardInterrupt from error
         text = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(cause))
-        # For an error in a plugin, Mitsuba prints the whole traceback; its last line says why.
-        where, _, trace = text.partition("Traceback (most recent call last):")
-        if trace:
-            text = where + re.sub(r"^\w+: (\[Errno \d+\] )?", "", trace.strip().splitlines()[-1])
+        text = re.sub(r"(?<=: )\w+Error: (\[Errno \d+\] )?", "", text)  # of Python, in a plugin
         raise ValueError(f"{path}: {text or type(cause).__name__}") from error
 
 
@@ -167,6 +226,7 @@ def explained(path: Path) -> Iterator[None]:
 )
 @options.number("--iterations", "Steps of optimisation for each number of Gaussians.", 100, 0)
 @options.number("--spp", "Samples a pixel; 0 renders nothing.  [default: from the scene]", least=0)
+@click.option("--replace-all", is_flag=True, help="Also bitmaps that are smaller or faster.")
 @variant_option
 @definitions_option
 @options.shared("report", "quiet")
@@ -177,16 +237,19 @@ def convert(
     target_psnr: float,
     iterations: int,
     spp: int | None,
+    replace_all: bool,
     variant: str | None,
     definitions: dict[str, str],
 ) -> None:
-    """Replace every bitmap of a Mitsuba scene by as many Gaussians as its cameras resolve.
+    """Replace the bitmaps of a Mitsuba scene by as many Gaussians as its cameras resolve.
 
     FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
     after, and 8 times their difference. If a rendering misses the PSNR, the command says so and
-    exits with code 1. Environment maps, bump maps, images of two values such as masks, data beyond
-    0 and 1, and images that no camera sees stay as they are; the command says why. Other files stay
-    where they are, and the new scene names them relative to FOLDER.
+    exits with code 1. A bitmap that takes less memory than its Gaussians, or an eighth of their
+    time, stays; the command shows both. Environment maps, bump maps with which the renderings would
+    miss the PSNR, images of two values such as masks, data beyond 0 and 1, and images that no
+    camera sees stay too; the command says why. Other files stay where they are, and the new scene
+    names them relative to FOLDER.
 
     \b
     Examples:
@@ -201,12 +264,13 @@ def convert(
     started = time.perf_counter()
     with explained(scene), bar(run.quiet) as show:
         found = convert_scene(
-            scene, output, target_psnr, iterations, spp, definitions, progress=show
+            scene, output, target_psnr, iterations, spp, definitions, replace_all, progress=show
         )
     before = sum(texture.bytes for texture in found.textures)
     after = sum(texture.gaussian_bytes for texture in found.textures)
     figures: dict[str, object] = {"output": found.scene, "bytes_before": before, "bytes": after}
     figures["textures"] = [texture._asdict() for texture in found.textures]
+    figures["better"] = [texture._asdict() for texture in found.better]
     figures["left"] = [{"name": name, "reason": reason} for name, reason in found.left]
     figures["psnr_rgb"] = found.psnr
     run.write_report(figures, mi.variant().partition("_")[0])
@@ -218,14 +282,18 @@ def convert(
 
 def _table(found: ConvertedScene, before: int, after: int) -> list[str]:
     """Lay out the textures, what stayed, and how close the renderings are."""
-    rows = [("texture", "texels", "bytes", "Gaussians", "bytes", "PSNR seen")]
-    for t in found.textures:
-        figures = f"{t.bytes:,}", f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.psnr:.1f} dB"
-        rows.append((t.names[0], f"{t.width}x{t.height}", *figures))
-        rows += [(name, "(the same set)", "", "", "", "") for name in t.names[1:]]
+    rows: list[Sequence[str]] = [
+        ("texture", "texels", "bytes", "ns", "Gaussians", "bytes", "ns", "PSNR seen")
+    ]
+    for t in [*found.textures, *found.better]:
+        bitmap = f"{t.width}x{t.height}", f"{t.bytes:,}", f"{t.lookup_ns:.1f}"
+        gaussians = f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.gaussian_lookup_ns:.1f}"
+        rows.append((t.names[0], *bitmap, *gaussians, f"{t.psnr:.1f} dB"))
+        rows += [(name, "(the same set)", *[""] * 6) for name in t.names[1:]]
     lines = table(rows)
     if before:
         lines.append(f"memory: {after:,} of {before:,} bytes ({after / before:.3f})")
+    lines += [f"stays, the bitmap is better: {name}" for t in found.better for name in t.names]
     lines += [f"left alone: {name}: {reason}" for name, reason in found.left]
     psnrs = enumerate(found.psnr, 1)
     lines += [f"camera {k}: psnr_rgb {psnr:.1f} dB between the renderings" for k, psnr in psnrs]

@@ -23,7 +23,7 @@ from ..raster.kernels import sum_lanes
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import bin_gaussians
 from .method import Method
-from .objective import Pixels, Quadratic
+from .objective import Pixels, Quadratic, Slope
 from .variables import Coordinates, Variables
 
 LOSS_EPSILON = 1e-10
@@ -228,7 +228,7 @@ def step_program(objective: Pixels, method: Method) -> StepProgram:
         largest: int,
         moving: Moving,
         fixed: Gaussians,
-        model: Quadratic,
+        model: Quadratic | Slope,
         lists: list[TileLists],
         rates: Float,
         index: UInt,

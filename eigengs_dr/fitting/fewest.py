@@ -203,12 +203,14 @@ class _Run:
                     self.show(self.trace[-1])
                 if self.ended():
                     break
+        found = dr.detach(current.gaussians)
         # An interrupt may come before the last relocation.
-        return self.score(prune(dr.detach(current.gaussians), self.objective, current.count))
+        return self.score(prune(found, self.objective.around(found), current.count))
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Place `count` Gaussians anew, denser where a set leaves more error."""
-        return redistribute(gaussians, self.objective, count, self.method.solve_steps)
+        near = self.objective.around(gaussians)
+        return redistribute(gaussians, near, count, self.method.solve_steps)
 
     def score(self, gaussians: Gaussians) -> _Trial:
         figure, goal = self.goal
@@ -328,18 +330,20 @@ def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) ->
             )
             if wanted == count or -missing < ENOUGH:
                 return
-            changed = prune(trial.gaussians, run.objective, wanted)
+            changed = prune(trial.gaussians, run.objective.around(trial.gaussians), wanted)
         elif found.missing <= 0 and len(found.gaussians) <= FAR * count:
             # The best number lies between this one and that of the best set; or a polish suffices.
             wanted = max(
                 count, _count_for_gain(run, count, missing, (count + len(found.gaussians)) // 2)
             )
-            changed = densify(trial.gaussians, run.objective, wanted)
+            changed = densify(trial.gaussians, run.objective.around(trial.gaussians), wanted)
         else:
             wanted = max(
                 _count_for_gain(run, count, missing, most), math.ceil(least_growth * count)
             )
-            changed = densify(trial.gaussians, run.objective, min(wanted, most))
+            changed = densify(
+                trial.gaussians, run.objective.around(trial.gaussians), min(wanted, most)
+            )
             if len(changed) == count:  # `most` is reached, or no Gaussian would reduce the error
                 return
             least_growth = 2 * least_growth - 1
@@ -363,5 +367,6 @@ def _trim(run: _Run) -> None:
         wanted = (too_few + len(above.gaussians)) // 2
         if wanted in (too_few, len(above.gaussians)):
             return
-        trial = run.score(prune(above.gaussians, run.objective, wanted))
+        near = run.objective.around(above.gaussians)
+        trial = run.score(prune(above.gaussians, near, wanted))
         above, too_few = (trial, too_few) if trial.missing <= 0 else (above, wanted)

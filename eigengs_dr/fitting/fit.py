@@ -18,15 +18,18 @@ from ..backend.notebook import to_html
 from ..backend.progress import shows_progress
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
-from ..gaussian.gaussians import Gaussians, scale_channels
+from ..gaussian.gaussians import Gaussians, one_image, scale_channels
 from ..image.metrics import float_space, target_key
 from ..raster.render import picture_of
+from .coarse import COARSE_TO_FINE
 from .control import Redistribute, Surplus
 from .descent import begin
 from .fewest import fewest
+from .from_loss import Spaces, refine_loss, views_of_spaces
 from .levels import place_levels, sort_levels
 from .loop import FitProgress, Refinement, Score, refine, sets_of
-from .maps import Map, MapImage, balance, combine, read_maps, score_maps
+from .loss import Loss, LossFunction, LossObjective, View
+from .maps import Map, MapImage, balance, combine, read_maps, score_maps, views_of
 from .measure import Row, psnrs
 from .method import DEFAULT, Method
 from .objective import Affine, Pixels, data_of, fitted, picture, restored
@@ -53,6 +56,9 @@ class Fit:
         A descent may have more Gaussians than requested until two thirds of its steps are taken,
         see `eigengs_dr.fitting.control.Surplus`; those sets have no rows. With a weight, the
         squared errors of all PSNRs are weighted, by the mean over the channels.
+        With a loss the key is loss, see `eigengs_dr.Loss.judge`; there are PSNRs too where there is
+        an image. Without an image the first row shows the picture of the texels, and rows with the
+        key gaussians the numbers that were tried.
         With space "data", psnr_ycbcr is the PSNR of the data, with their range as the peak, or 1
         for codes between 0 and 1; psnr_rgb is that of codes after rounding to 8 bits, and NaN for
         other data, which have none. With space "normal" both have the peak 1. With space "radiance"
@@ -71,7 +77,10 @@ class Fit:
         RGB image to add to renderings of the set. The method of the paper EigenGS keeps the mean
         image of the model as pixels. The attribute `image` includes the mean image.
     psnr_ycbcr, psnr_rgb : float
-        PSNR of the set in dB, from its row of the trace; for maps, the means over the maps.
+        PSNR of the set in dB, from its row of the trace; for maps, the means over the maps; NaN
+        without an image.
+    loss : float
+        The loss of the set, from the same row; NaN without a loss.
     source : str
         Name of the image, if it was a file or a URL.
     maps : dict of str to dict
@@ -88,16 +97,21 @@ class Fit:
     mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
     psnr_ycbcr: float = math.nan
     psnr_rgb: float = math.nan
+    loss: float = math.nan
     source: str = field(default="", repr=False)
     maps: dict[str, dict[str, float]] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
         g, space = self.gaussians, "ycbcr" if self.maps else float_space(self.gaussians.space)
-        maps = f"maps {', '.join(self.maps)}, " if self.maps else ""
+        maps = f"maps {', '.join(m.name for m in g.maps)}, " if g.maps else ""
+        figures = f"psnr_{space}={self.psnr_ycbcr:.2f}, psnr_rgb={self.psnr_rgb:.2f}, "
+        if math.isnan(self.psnr_ycbcr):
+            figures = ""
+        if not math.isnan(self.loss):
+            figures = f"loss={self.loss:.4g}, {figures}"
         return (
             f"Fit({len(g)} Gaussians, "
-            f"{g.width}x{g.height} pixels, {maps}{self.iterations} iterations, "
-            f"psnr_{space}={self.psnr_ycbcr:.2f}, psnr_rgb={self.psnr_rgb:.2f}, "
+            f"{g.width}x{g.height} pixels, {maps}{self.iterations} iterations, {figures}"
             f"seconds={self.seconds:.2f}, stopped={self.stopped!r})"
         )
 
@@ -127,20 +141,22 @@ class FitInterrupted(KeyboardInterrupt):
 @shows_progress
 @door
 def fit(
-    image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map],
+    image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map] | None = None,
     gaussians: int | Sequence[int] | None = None,
     iterations: int = 1000,
     target_psnr: float | Goal | None = None,
     start: Start | None = None,
-    space: str | None = None,
+    space: str | Mapping[str, str] | None = None,
     weight: ArrayLike | None = None,
-    method: Method = DEFAULT,
+    method: Method | None = None,
     seed: int = 0,
     backend: str | None = None,
     progress: Any = None,
     encoding: str | None = None,
+    loss: Loss | LossFunction | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Fit:
-    """Fit an image by a given number of Gaussians, or by as few as a target PSNR needs.
+    """Fit an image, or a loss of your own, by a number of Gaussians or as few as a target needs.
 
     Several maps of one size, such as those of a material, share the means and shapes of one set:
     ``result.gaussians["albedo"]`` is the set of one map.
@@ -151,10 +167,11 @@ def fit(
         A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`. A
         mapping holds the images of maps by name, with at most 16 channels together; a `Map` says
         the space, the weight and the goal of one. Data whose three channels are equal count as one
-        channel.
+        channel. Without an image, give a loss and the size of its picture.
     gaussians : int or sequence of int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
-        images; with a start, the number of its Gaussians. Several rising numbers such as
+        images; with a start, the number of its Gaussians; without an image, one for 16 pixels, or
+        as many as the judge of the loss says, see `eigengs_dr.Loss`. Several rising numbers such as
         ``[5000, 7000, 9000]`` are levels of detail, see `level_counts`: the first Gaussians form
         the image too, and ``result.gaussians[:n]`` is a level. Inside a level, Gaussians with a
         larger removal cost come first, so that every prefix forms an image.
@@ -170,7 +187,7 @@ def fit(
         the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
         that it makes of the image, which suits many images. The set gets the cutoff of the method.
         A start that turns out to be useless in the first steps is placed anew.
-    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"}, optional
+    space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
         weigh more in the dark. "data" uses one or three channels unchanged (roughness, heights).
@@ -178,13 +195,15 @@ def fit(
         1. "radiance" is "linear" without an upper bound. "log" suits light above 1 best: the
         Gaussians sum to logarithms of light, see `eigengs_dr.image.color.to_log`. For an image of
         light above 1, "linear" becomes "radiance", and "ycbcr" and "rgb" become "log": a texture
-        would clamp their sums.
+        would clamp their sums. For a loss without an image, a mapping such as ``{"albedo":
+        "linear", "roughness": "data"}`` makes maps; data then have one channel.
     weight : array_like, shape (H, W) or (H, W, C), optional
         Factors of the squared errors of pixels, or of their channels in the space of the colours,
         for maps of pixels alone; finite and at least 0. A pixel of weight 0 does not count; it may
         be NaN.
     method : Method, optional
-        How to fit, by default `DEFAULT`; `eigengs_dr.paper` has those of the papers.
+        How to fit, by default `DEFAULT`, or `COARSE_TO_FINE` without an image; `eigengs_dr.paper`
+        has those of the papers.
     seed : int, optional
         Seed of all random numbers: of the noise by which means and shapes are perturbed, and of
         the placements that draw some.
@@ -198,6 +217,12 @@ def fit(
         What the pixels of the image are: sRGB codes, or light as in renderings. By default what the
         image says (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
         Data are used as they are.
+    loss : callable or Loss, optional
+        What to make small instead of the squared error: ``loss(picture, step) -> number``, any
+        function of the rendered picture (or the dict of maps) that Dr.Jit differentiates. With an
+        image, the image places the Gaussians and gives PSNRs.
+    size : (int, int), optional
+        Width and height of the picture of a loss without an image, in pixels.
 
     Returns
     -------
@@ -233,20 +258,26 @@ def fit(
     Gaussians(100, 32x32 pixels, maps albedo, roughness, cutoff=3)
     """
     started = time.perf_counter()
+    spaces, space = space, space if isinstance(space, str) else None
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
         target_psnr=target_psnr,
         start=start,
         space=space,
-        method=method,
+        method=method or (COARSE_TO_FINE if image is None else DEFAULT),
         seed=seed,
         backend=backend,
         encoding=encoding,
+        loss=loss if loss is None or isinstance(loss, Loss) else Loss(loss),
     )
     factors = check_weight(weight)
+    if image is None:
+        return fit_loss(size, spaces, options, started, progress)
+    if size is not None:
+        raise ValueError("size is for a loss without an image; leave it or the image out")
     if isinstance(image, Mapping):
-        if start is not None or space is not None:
+        if start is not None or spaces is not None:
             raise ValueError(
                 "maps take no start and no space; a Map says the space of one: "
                 "Map(image, space='data')"
@@ -278,6 +309,8 @@ def fit_images(
     """
     started, source = time.perf_counter(), options.start
     start = None if source is None else load_start(source, options.backend)
+    if isinstance(start, Gaussians):
+        one_image(start)
     wanted = options.space or (set_in(start).space if start is not None else "ycbcr")
     read = [read_pixels(image, wanted, weight, options.encoding) for image in images]
     pixels, space = [p for p, _ in read], read[0][1]
@@ -300,21 +333,69 @@ def fit_images(
             base = objective.pictures[0].base
             if base is not None:
                 mean_image = objective.picture(base).numpy()
+        if options.loss is not None:
+            view = View("", space, range(channels), *data[0].affine)
+            objective = LossObjective.of_loss(options.loss, [view], objective)
 
         def score(gaussians: Gaussians) -> list[Row]:
             seconds = (time.perf_counter() - started) / len(images)
             [figures] = psnrs(gaussians, objective.pictures).transpose(0, 2, 1)
             return [
-                {"seconds": seconds, "psnr_ycbcr": ycbcr, "psnr_rgb": rgb}
+                {
+                    "seconds": seconds,
+                    **objective.judged(gaussians),
+                    "psnr_ycbcr": ycbcr,
+                    "psnr_rgb": rgb,
+                }
                 for ycbcr, rgb in figures.tolist()
             ]
 
-        figure = target_key(space, options.goal.space) if options.goal else ""
+        figure = target_key(space, options.goal.space) if options.goal else "margin"
         found, seconds_init = _refined(
             objective, options, begun, score, figure, started, progress, interrupted
         )
     affines = [d.affine for d in data]
     return _finished(found, affines, mean_image, started, seconds_init)
+
+
+def fit_loss(
+    size: tuple[int, int] | None,
+    spaces: Spaces,
+    options: FitOptions,
+    started: float,
+    progress: FitProgress | None = None,
+) -> Fit:
+    """Fit a loss without an image; see `fit` for results and errors."""
+    if options.loss is None or size is None:
+        raise ValueError(
+            "fit needs an image, or a loss and the size of its picture: "
+            "fit(loss=f, size=(width, height))"
+        )
+    if options.goal is not None or options.levels:
+        raise ValueError(
+            "without an image there is no PSNR and there are no levels; give the loss a target"
+        )
+    start = None if options.start is None else load_start(options.start, options.backend)
+    if start is not None and not isinstance(start, Gaussians):
+        raise ValueError("a model needs an image to start from; give a set")
+    if start is not None and spaces is None:
+        spaces = {m.name: m.space for m in start.maps} or start.space
+    views, maps = views_of_spaces(spaces)
+    channels, (width, height) = sum(len(view.channels) for view in views), size
+    options.check_image(width, height, channels)
+    if start is not None:
+        space = "data" if maps else views[0].space
+        check_start(start, size, channels, space, options)
+        cutoff = float(options.method.cutoff)
+        start = replace(start.scaled(width, height), cutoff=cutoff, maps=()).bounded()
+    with defer_interrupts() as interrupted:
+        types = types_for(start, options.backend)
+        found, seconds_init = refine_loss(
+            options.loss, size, views, options, types, start, started, progress, interrupted
+        )
+    found = replace(found, gaussians=replace(found.gaussians, maps=maps))
+    [result] = _finished([found], [Affine()], None, started, seconds_init)
+    return result
 
 
 def fit_maps(
@@ -332,14 +413,18 @@ def fit_maps(
     goal = options.goal
     with defer_interrupts() as interrupted:
         first = options.count_for(width * height)
-        if goal:
+        if options.searches:
             first = options.first_try(width * height, channels)
         factors = balance(images, options, first, types, weight)
         objective = combine(images, factors, types, weight)
+        if options.loss is not None:
+            views = views_of(images, factors)
+            objective = LossObjective.of_loss(options.loss, views, objective)
 
         def score(gaussians: Gaussians) -> list[Row]:
             row = score_maps(gaussians, objective, images, goal.space if goal else "rgb")
-            return [{"seconds": time.perf_counter() - started, **row}]
+            seconds = time.perf_counter() - started
+            return [{"seconds": seconds, **objective.judged(gaussians), **row}]
 
         [found], seconds_init = _refined(
             objective, options, None, score, "margin", started, progress, interrupted
@@ -380,13 +465,13 @@ def _refined(
         objective = replace(objective, levels=counts[:-1])
     elif begun is None:
         count = options.count_for(width * height)
-        if options.goal:
+        if options.searches:
             count = options.first_try(width * height, channels)
         begun = method.place_and_solve(objective, count, key)
     seconds_init = (time.perf_counter() - started) / objective.grid.images
-    if options.goal:
+    if options.searches:
         most = options.most_for(width * height, channels)
-        goal = options.goal.psnr if figure != "margin" else 0.0
+        goal = options.goal.psnr if options.goal and figure != "margin" else 0.0
         found = fewest(
             objective,
             method,
@@ -436,8 +521,9 @@ def _finished(
                 iterations=one.iterations,
                 stopped=one.stopped,
                 mean_image=mean_image,
-                psnr_ycbcr=one.row["psnr_ycbcr"],
-                psnr_rgb=one.row["psnr_rgb"],
+                psnr_ycbcr=one.row.get("psnr_ycbcr", math.nan),
+                psnr_rgb=one.row.get("psnr_rgb", math.nan),
+                loss=one.row.get("loss", math.nan),
                 maps=one.row.get("maps", {}),
             )
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -10,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import drjit as dr
 import numpy as np
 
+from ..backend.arrays import types_of
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
@@ -53,11 +53,13 @@ def descend(
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
     factors, largest = method.rate_factors(iterations, state.chosen), 0
     rates = rate_table(objective.types, method, factors)
-    with release_later(state), freeze_program(step_program(objective, method)) as take_step:
+    program = step_program(objective, method)
+    with release_later(state), objective.models() as model_at, freeze_program(program) as take_step:
         for step in part:
-            for control, steps in acts:
-                if step in steps:
-                    state = control(state, objective, step, iterations, key)
+            acting = [control for control, steps in acts if step in steps]
+            squares = objective.around(state.gaussians) if acting else objective
+            for control in acting:
+                state = control(state, squares, step, iterations, key)
             if state.moving is None:
                 state = started(state, method, step, objective.grid.images)
             if not state.lists or step >= state.until:
@@ -67,7 +69,7 @@ def descend(
                 largest,
                 state.moving,
                 state.fixed,
-                objective.model,
+                model_at(state),
                 list(state.lists),
                 rates,
                 dr.opaque(objective.types.UInt, step),
@@ -87,11 +89,29 @@ def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussian
     return dr.detach(gaussians)
 
 
+def averaged(states: Generator[State, None, None], first: int) -> Generator[State, None, None]:
+    """Yield the states of a descent with the mean of all sets after the first ones.
+
+    With noisy derivatives, the mean is closer to the minimum than any of the sets (Polyak and
+    Juditsky, "Acceleration of stochastic approximation by averaging", 1992).
+    """
+    with closing(states):
+        mean: list = []
+        for step, state in enumerate(states):
+            current = state.gaussians
+            moved = [dr.detach(rows) for rows in (current.mean, current.factor, current.color)]
+            share = dr.opaque(types_of(current.mean).Float, 1 / max(1, step - first + 1))
+            mean = [m + (r - m) * share for m, r in zip(mean or moved, moved, strict=True)]
+            dr.eval(mean)
+            fields = dict(zip(("mean", "factor", "color"), mean, strict=True))
+            yield replace(state, gaussians=replace(current, **fields))
+
+
 FitProgress = Callable[[int, int, Row], None]
 
 Score = Callable[[Gaussians], list[Row]]
-"""``score(gaussians)`` returns a row for each image of a batch; its psnr_ycbcr decides which set is
-the best."""
+"""``score(gaussians)`` returns a row for each image of a batch; `Pixels.merit` of it says
+which set is the best."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +121,7 @@ class Refinement:
     Attributes
     ----------
     gaussians : Gaussians
-        The set with the highest psnr_ycbcr in the trace; the batch with it, if there is one.
+        The set with the highest `Pixels.merit` in the trace; the batch with it, if there is one.
     trace : list of dict
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb, for sets with as many
         Gaussians as requested.
@@ -119,11 +139,11 @@ class Refinement:
     stopped: str = "iterations"
     row: Row = field(default_factory=Row)
 
-    def judged(self, gaussians: Gaussians, row: Row) -> Refinement:
+    def judged(self, gaussians: Gaussians, row: Row, objective: Pixels) -> Refinement:
         """Return the result with another row of its trace, and the set if it is the best."""
         self.trace.append(row)
-        best = row["psnr_ycbcr"] > self.row.get("psnr_ycbcr", -math.inf)
-        stopped = "exact" if row["psnr_ycbcr"] > MAX_PSNR else self.stopped
+        best = not self.row or objective.merit(row) > objective.merit(self.row)
+        stopped = "exact" if row.get("psnr_ycbcr", 0.0) > MAX_PSNR else self.stopped
         step = row["iteration"]
         if best:
             return replace(self, gaussians=gaussians, row=row, stopped=stopped, iterations=step)
@@ -135,9 +155,10 @@ class Best:
 
     Parameters
     ----------
+    objective : Pixels
     state : State
         Before the first step.
-    images, iterations : int
+    iterations : int
     score : Score
     progress : callable, optional
         See `refine`.
@@ -145,13 +166,14 @@ class Best:
 
     def __init__(
         self,
+        objective: Pixels,
         state: State,
-        images: int,
         iterations: int,
         score: Score,
         progress: FitProgress | None = None,
     ) -> None:
-        self.found = [Refinement(state.gaussians) for _ in range(images)]
+        self.objective = objective
+        self.found = [Refinement(state.gaussians) for _ in range(objective.grid.images)]
         self.iterations, self.score, self.progress = iterations, score, progress
         self.marks, self.step, self.state = trace_steps(iterations), 0, state
         self.row = Row()
@@ -172,24 +194,27 @@ class Best:
         rows = self.score(gaussians)
         self.row = {"iteration": step, **rows[0]}
         if len(gaussians) > len(self.found) * self.state.count:
-            figure = self.row["psnr_ycbcr"]
+            figure = self.objective.merit(self.row)
             if self.larger is None or figure > self.larger[0]:
                 self.larger = figure, step, gaussians
             return
         self.larger = None
         self.found = [
-            one if one.stopped == "exact" else one.judged(gaussians, {"iteration": step, **row})
+            one
+            if one.stopped == "exact"
+            else one.judged(gaussians, {"iteration": step, **row}, self.objective)
             for one, row in zip(self.found, rows, strict=True)
         ]
 
-    def end_early(self, objective: Pixels) -> None:
+    def end_early(self) -> None:
         """Measure the best set with a surplus, and that of the last step, both without it."""
         if len(self.found) > 1:
             raise KeyboardInterrupt
         larger = [self.larger] if self.larger else []
         for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
             if step not in [row["iteration"] for row in self.found[0].trace]:
-                self.judge(step, prune(dr.detach(gaussians), objective, self.state.count))
+                near = self.objective.around(gaussians)
+                self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
         self.found = [
             replace(one, stopped="interrupted", iterations=self.step) for one in self.found
         ]
@@ -236,17 +261,20 @@ def refine(
     KeyboardInterrupt
         If the refinement of a batch is interrupted.
     """
-    best = Best(state, objective.grid.images, iterations, score, progress)
+    best = Best(objective, state, iterations, score, progress)
     try:
         ended = best.offer(0, state)
-        with closing(descend(objective, method, state, iterations, key)) as states:
+        states = descend(objective, method, state, iterations, key)
+        if method.average:
+            states = averaged(states, round((1 - method.average) * iterations))
+        with closing(states):
             while not (ended or interrupted()) and best.step < iterations:
                 ended = best.offer(best.step + 1, next(states))
         stopped = interrupted()
     except KeyboardInterrupt:
         stopped = True
     if stopped:
-        best.end_early(objective)
+        best.end_early()
     batches = {id(one.gaussians): one.gaussians for one in best.found}
     detached = {name: dr.detach(batch) for name, batch in batches.items()}
     return [replace(one, gaussians=detached[id(one.gaussians)]) for one in best.found]

@@ -20,6 +20,7 @@ from ..image.color import rendered_as
 from ..image.metrics import target_key
 from ..image.pixels import ImageError
 from ..storage.npz import BadValue
+from .loss import View
 from .measure import Row, psnrs
 from .objective import Data, Pixels, data_of, is_codes, picture
 from .options import FitOptions, Goal
@@ -169,6 +170,17 @@ def combine(
         for image, first, factor in zip(images, firsts, factors, strict=True)
     ]
     return replace(objective, pictures=tuple(pictures))
+
+
+def views_of(images: Sequence[MapImage], factors: Sequence[float]) -> list[View]:
+    """Return what the channels of `combine` show."""
+    maps = [image.map(1) for image in images]
+    return [
+        View(m.name, m.space, range(own.start, own.stop), a.scale / factor, a.offset)
+        for m, own, a, factor in zip(
+            maps, slices(maps), (image.data.affine for image in images), factors, strict=True
+        )
+    ]
 
 
 def _join(parts: Sequence[Image], factors: Sequence[float]) -> Image:

@@ -88,6 +88,9 @@ class Method:
     rate_exponent : float
         Exponent by which the rates of means and shapes fall with the colour, see
         `eigengs_dr.fitting.descent.rate_scale_of`.
+    average : float
+        Share of the steps at the end whose mean set is the result, in [0, 1): for derivatives with
+        noise, see `eigengs_dr.fitting.loop.averaged`. Controls must leave their Gaussians alone.
     solve_steps : int
         Steps of conjugate gradients in the colour solve before the first step.
     cutoff : float
@@ -111,6 +114,7 @@ class Method:
     decay: float = 0.03
     drift: float = 1.0
     rate_exponent: float = 0.0
+    average: float = 0.0
     solve_steps: int = 10
     cutoff: float = CUTOFF
 
@@ -123,6 +127,11 @@ class Method:
         if not 0 < self.cutoff <= MAX_CUTOFF:
             raise ValueError(
                 f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
+            )
+        if not 0 <= self.average < 1 or (self.average and self.controls):
+            raise ValueError(
+                f"average is {self.average}; it must be in [0, 1), and 0 with controls, which "
+                "exchange Gaussians"
             )
         if self.solve_steps < 0:
             raise ValueError(f"solve_steps is {self.solve_steps!r}; it must be at least 0")

@@ -9,16 +9,17 @@ model is exact: t is the image and h the weight, for all pictures.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_of, upload
-from ..backend.types import Float, Tensor
+from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import LIGHT, UNBOUNDED, rgb_to_ycbcr, to_coded, to_linear, to_log
 from ..image.pixels import MAX_PIXEL
@@ -28,6 +29,9 @@ from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums, forward, residual
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import batch_to_tiles, bin_gaussians, pixels_inside, to_tensor
+
+if TYPE_CHECKING:
+    from .descent import State
 
 Image = NDArray[np.float32]
 
@@ -90,6 +94,24 @@ class Quadratic(NamedTuple):
         own = dr.width(self.curvature) // (grid.tiles * grid.pixels)
         sums = channel_sums(self.curvature, own, grid)
         return sum(sums) * dr.opaque(types.Float, 1 / (own * grid.width * grid.height))
+
+
+class Slope(NamedTuple):
+    """The derivative of a loss at the picture of a step, instead of a model around it.
+
+    Attributes
+    ----------
+    derivative : Float, shape (pixels * channels,)
+        In tile layout, times half the number of values, as `Quadratic.compare` returns it.
+    """
+
+    derivative: Float
+
+    def compare(
+        self, packed: Float, background: list, lists: TileLists, radius: float
+    ) -> tuple[Float, list]:
+        """Return the derivative; there are no squares."""
+        return self.derivative, []
 
 
 class Picture(NamedTuple):
@@ -246,6 +268,23 @@ class Pixels:
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.grid.width, self.grid.height
+
+    @contextmanager
+    def models(self) -> Iterator[Callable[[State], Quadratic | Slope]]:
+        """Give the model of each step during a descent: a function of its state."""
+        yield lambda state: self.model
+
+    def around(self, gaussians: Gaussians) -> Pixels:
+        """Return the squared error that stands for the objective near a set: this one."""
+        return self
+
+    def judged(self, gaussians: Gaussians) -> dict[str, float]:
+        """Return what a row of a trace has beside PSNRs: nothing."""
+        return {}
+
+    def merit(self, row: Record) -> float:
+        """Return the number of a row of a trace of which the best set has most: its PSNR."""
+        return float(row["psnr_ycbcr"])
 
     def minus(self, gaussians: Gaussians) -> Pixels:
         """Return the objective for Gaussians that are added to these, which stay as they are."""

@@ -19,7 +19,9 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
+from .coarse import Coarse
 from .control import Redistribute
+from .loss import Loss
 from .method import DEFAULT, Method, Model
 from .place import Adaptive
 
@@ -124,6 +126,7 @@ class FitOptions:
     seed: int = 0
     backend: str | None = None
     encoding: str | None = None
+    loss: Loss | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.gaussians, Sequence) and not isinstance(self.gaussians, str):
@@ -159,16 +162,21 @@ class FitOptions:
         places = self.method.place == Adaptive() and self.start is None
         if self.levels and not (places and not self.method.needs_model):
             raise ValueError("levels need the placement Adaptive and no start; leave them out")
-        if self.goal is None:
+        if self.levels and self.loss is not None:
+            raise ValueError("levels are for the squared error; leave them or the loss out")
+        if not self.searches:
             return
+        target = "target_psnr" if self.goal else "the target of a loss"
         if self.gaussians is not None:
             raise ValueError(
-                "gaussians and target_psnr exclude each other; give one of them, or "
+                f"gaussians and {target} exclude each other; give one of them, or "
                 "target_psnr=Goal(psnr, max_gaussians=...)"
             )
+        if isinstance(self.method.place, Coarse):
+            return
         if not places or self.method.control(Redistribute) is None:
             raise ValueError(
-                "target_psnr needs a method that places Gaussians by the image and redistributes "
+                f"{target} needs a method that places Gaussians by the image and redistributes "
                 "them, such as DEFAULT, and no start"
             )
 
@@ -176,6 +184,11 @@ class FitOptions:
     def goal(self) -> Goal | None:
         """The goal of a search."""
         return self.target_psnr if isinstance(self.target_psnr, Goal) else None
+
+    @property
+    def searches(self) -> bool:
+        """Whether the number of Gaussians is the smallest that reaches something."""
+        return self.goal is not None or (self.loss is not None and self.loss.target is not None)
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -187,19 +200,20 @@ class FitOptions:
         check_sides((width, height))
         check_index_range(width, height, channels)
         limit = self.goal.max_gaussians if self.goal else None
-        for name, count in (("gaussians", self._count), ("max_gaussians", limit)):
+        for name, count in (("gaussians", self.count), ("max_gaussians", limit)):
             if count is not None and not 1 <= count <= width * height:
                 raise ValueError(
                     f"{name} is {count}; an image of {width}x{height} takes 1 to {width * height}"
                 )
 
     @property
-    def _count(self) -> int | None:
+    def count(self) -> int | None:
+        """Number of Gaussians, if the user gives one; of all levels."""
         return self.levels[-1] if self.levels else self.gaussians  # type: ignore[return-value]
 
     def count_for(self, pixels: int) -> int:
         """Return the number of Gaussians for so many pixels, if the fit does not search it."""
-        return self._count or default_count(pixels)
+        return self.count or default_count(pixels)
 
     def most_for(self, pixels: int, channels: int) -> int:
         """Return the largest number of Gaussians that a search tries."""

@@ -12,6 +12,7 @@ from ..backend.types import PathLike, Values
 from ..image.color import rendered_as
 from ..image.io import check_data, check_image, read_image
 from ..image.pixels import MAX_PIXEL, MIN_PIXEL, EncodedImage, ImageError
+from ..image.pixels import check_weight as check_weight
 
 PixelsOrPath: TypeAlias = ArrayLike | PathLike | EncodedImage
 """An image: array_like pixels, such as a ``mitsuba.Bitmap``; pixels that know their encoding; or
@@ -83,26 +84,6 @@ def check_normals(pixels: Image) -> None:
             f"image: normals run from {pixels.min():g} to {pixels.max():g}, not 0 to 1; pass "
             "(n + 1) / 2"
         )
-
-
-def check_weight(weight: ArrayLike | None) -> Image | None:
-    """Return the factors of the squared errors as float32, shape (H, W) or (H, W, C), with mean 1.
-
-    Raises
-    ------
-    ValueError
-        If a factor is negative or not finite, or all are 0.
-    """
-    if weight is None:
-        return None
-    factors = np.asarray(weight, np.float32)
-    if factors.ndim not in (2, 3) or not factors.size:
-        raise ValueError(f"weight has shape {factors.shape}; expected (H, W) or (H, W, C)")
-    if not np.isfinite(factors).all() or factors.min() < 0:
-        raise ValueError("weight: factors of the errors must be finite and at least 0")
-    if not factors.any():
-        raise ValueError("weight is 0 for all pixels; at least one must count")
-    return np.asarray(factors / factors.mean(dtype=np.float64), np.float32)
 
 
 def check_channels(weight: Image | None, channels: int) -> None:

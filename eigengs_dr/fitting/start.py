@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_in, types_of
 from ..backend.selection import select
-from ..gaussian.gaussians import Fitted, Gaussians, one_image, set_of
+from ..gaussian.gaussians import Fitted, Gaussians, set_of
 from .method import Method, Model
 from .objective import Pixels
 from .options import FitOptions, Start
@@ -28,8 +28,8 @@ def load_start(start: Start | Fitted, backend: str | None) -> Gaussians | Model:
         If the start is something else.
     """
     if isinstance(start, (str, os.PathLike)):
-        return one_image(Gaussians.load(start, backend))
-    found = start if isinstance(start, Model) else dr.detach(one_image(set_of(start)))
+        return Gaussians.load(start, backend)
+    found = start if isinstance(start, Model) else dr.detach(set_of(start))
     current = types_of(set_in(found).mean).backend
     if backend not in (None, current):
         raise ValueError(

@@ -9,6 +9,7 @@
 - ``resize``: other sizes
 - ``sheet``: pictures side by side, with text
 - ``metrics``: PSNR, SSIM, MS-SSIM
+- ``structure``: SSIM of tensors, with derivatives
 - ``strips``: rows of an image by threads
 - ``hilbert``: a curve through the cells of a square
 """

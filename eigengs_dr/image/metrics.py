@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..backend.types import Doubles, Float, Singles, Tensor
 from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear, to_pu21
 from .io import pixels_of, to_8bit
-from .pixels import peak_of
+from .pixels import check_weight, peak_of
 from .strips import Pixels, map_threads, strips
+from .structure import C1, C2, is_tensor, similarity
 
 MAX_PSNR = 100.0
 """Upper bound of reported PSNRs, in dB: above it, only rounding errors differ."""
@@ -28,7 +31,7 @@ PSNR_SPACES = ("rgb", "ycbcr", "data", "pu21")
 """Spaces in which `psnr` compares images."""
 
 
-def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
+def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb", weight: ArrayLike | None = None) -> float:
     """Compute the peak signal-to-noise ratio of two images, in decibels.
 
     ``"rgb"`` compares 8-bit images: both are clamped to [0, 1] and rounded, and the peak is 255.
@@ -47,6 +50,10 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
         `eigengs_dr.image.color.to_coded`.
     space : {"rgb", "ycbcr", "data", "pu21"}
         Space in which the mean squared error over all pixels and channels is computed.
+    weight : array_like, shape (H, W), (H, W, 1) or (H, W, C), optional
+        Factors of the squared errors of pixels, or of their channels in that space; finite and at
+        least 0. The mean squared error is then ``sum w e^2 / sum w``. What has the weight 0 does
+        not count; it may be NaN.
 
     Returns
     -------
@@ -57,34 +64,39 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb") -> float:
     Raises
     ------
     ValueError
-        If the shapes differ, shapes or dtypes are not as above, or the space is unknown.
+        If the shapes differ, shapes or dtypes are not as above, the space is unknown, or a weight
+        is negative or not finite, or all are 0.
 
     Examples
     --------
     >>> round(psnr(np.zeros((4, 4, 3)), np.full((4, 4, 3), 0.1), space="ycbcr"), 2)
     26.09
     """
-    total = squared_error(a, b, space)
+    total = squared_error(a, b, space, weight)
     return psnr_from_mse(total / (3 * math.prod(np.shape(a)[:2])))
 
 
-def squared_error(a: ArrayLike, b: ArrayLike, space: str) -> float:
+def squared_error(a: ArrayLike, b: ArrayLike, space: str, weight: ArrayLike | None = None) -> float:
     """Return the sum of the squared errors of two images, of which `psnr` takes the mean.
 
     Sums of the parts of an image add up to that of the whole. Grey images count as three channels.
-    For parameters and errors see `psnr`.
+    Weights are divided by their mean. For parameters and errors see `psnr`.
     """
     if space not in PSNR_SPACES:
         raise ValueError(f"space {space!r} is unknown; use one of {', '.join(PSNR_SPACES)}")
     x, y = _pair(a, b)
+    factors = _weight_of(np.shape(a), weight)
 
     def squares(rows: slice) -> float:
-        return _sum_squares(x[rows].astype(np.float64), y[rows].astype(np.float64), space)
+        p, q = (image[rows].astype(np.float64) for image in (x, y))
+        return _sum_squares(p, q, space, None if factors is None else factors[rows])
 
     return sum(map_threads(squares, strips(*x.shape[:2])))
 
 
-def _sum_squares(a: NDArray[np.floating], b: NDArray[np.floating], space: str) -> float:
+def _sum_squares(
+    a: NDArray[np.floating], b: NDArray[np.floating], space: str, weight: Singles | None
+) -> float:
     """Return the sum of the squared differences of two images in a space; overwrite both."""
     if space == "rgb":
         for image in (a, b):
@@ -92,6 +104,10 @@ def _sum_squares(a: NDArray[np.floating], b: NDArray[np.floating], space: str) -
     if space == "pu21":
         a, b = to_pu21(to_linear(a)), to_pu21(to_linear(b))
     np.subtract(a, b, out=a)
+    if weight is not None:
+        with np.errstate(invalid="ignore"):  # what has the weight 0 may be any number
+            squares = weight * np.square(a @ RGB_TO_YCBCR.T if space == "ycbcr" else a)
+        return float(squares.sum(where=weight > 0)) / (255**2 if space == "rgb" else 1)
     if space == "ycbcr":
         # |M d|^2 = trace(M d d^T M^T): the sums of the products of R, G and B are enough.
         difference = a.reshape(-1, 3)
@@ -127,28 +143,53 @@ def psnr_from_mse(mse: float) -> float:
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
-def ssim(a: ArrayLike, b: ArrayLike) -> float:
+if TYPE_CHECKING:
+
+    @overload
+    def ssim(a: Tensor, b: Any, weight: Any = None) -> Float: ...
+
+    @overload
+    def ssim(a: ArrayLike, b: Tensor, weight: Any = None) -> Float: ...
+
+    @overload
+    def ssim(a: ArrayLike, b: ArrayLike, weight: ArrayLike | None = None) -> float: ...
+
+
+def ssim(a: Any, b: Any, weight: Any = None) -> Any:
     """Compute the structural similarity of two images, with the settings of Wang et al. 2004.
 
     Images are clamped to [0, 1]. The window is Gaussian, 11 pixels wide with sigma 1.5. The mean is
     taken over the channels and over the pixels whose window lies inside the image. If a side is
     shorter than 11 pixels, the window shrinks to the largest odd size that fits.
 
+    Of tensors of Dr.Jit, such as those of `eigengs_dr.render`, the function is differentiable in
+    forward and reverse mode, by both images. It clamps neither of the two then, so that values
+    outside [0, 1] have derivatives too.
+
     Parameters
     ----------
-    a, b : array_like, shape (H, W, 3) or (H, W, 1)
+    a, b : array_like, shape (H, W, 3) or (H, W, 1); or Dr.Jit tensor, shape (H, W, C)
         RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
-        [0, 1]). Their order does not matter.
+        [0, 1]). Their order does not matter. Tensors are of floats from ``drjit.llvm.ad`` or that
+        of another backend, with any number of channels. An array beside a tensor is uploaded at
+        every call; what `drjit.freeze` records keeps the array that it saw.
+    weight : array_like, or tensor, shape (H, W), (H, W, 1) or (H, W, C), optional
+        Factors w of the similarity s of the window around each pixel, or of each channel of it;
+        finite and at least 0, which is not checked of a tensor. The mean is then
+        ``sum w s / sum w``. Windows of weight 0 do not count, but their pixels belong to the
+        windows of others: NaN there gives NaN. Weights get no derivatives.
 
     Returns
     -------
-    float
-        At most 1; 1 for equal images.
+    float; or Float, shape (1,)
+        At most 1; 1 for equal images. An array of Dr.Jit if `a` or `b` is such a tensor, in double
+        precision if one of them is.
 
     Raises
     ------
     ValueError
-        If the shapes differ, or shapes or dtypes are not as above.
+        If the shapes differ, or shapes or dtypes are not as above, or a weight is negative or not
+        finite, or all weights of windows are 0; or if tensors are too large for indices of 32 bits.
 
     References
     ----------
@@ -162,9 +203,25 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     take 5.4 s and no memory that counts; scikit-image takes 10.3 s and 726 MiB. 512x512 pixels take
     0.16 s, in scikit-image 0.06 s (2 cores). 1200x1024 pixels take 0.18 s, in scikit-image 0.36 s
     by the same strips and 0.53 s at once (1 core).
+
+    Examples
+    --------
+    >>> import drjit as dr
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[8, 8]], [[0.5, 0, 0.5]], [[1]], size=(16, 16), space="data")
+    >>> picture = eg.render(g)
+    >>> dr.enable_grad(picture)
+    >>> dr.backward(1 - eg.ssim(picture, dr.zeros(type(picture), picture.shape)))
+    >>> dr.grad(picture).shape
+    (16, 16, 1)
     """
+    if is_tensor(a) or is_tensor(b):
+        x, y = (v if is_tensor(v) else _scaled(np.asarray(pixels_of(v))) for v in (a, b))
+        _check_shapes(x.shape, y.shape)
+        return similarity(x, y, _weight_of_windows(x.shape, weight), _window(x.shape))
     x, y = _pair(a, b)
-    return float(_similarity(x, y, lambda rows: np.clip(rows, 0, 1))[0].mean())
+    factors = _weight_of_windows(np.shape(a), weight)
+    return float(_similarity(x, y, lambda rows: np.clip(rows, 0, 1), factors)[0].mean())
 
 
 def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
@@ -234,14 +291,58 @@ def _scaled(image: Pixels) -> Pixels:
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[Pixels, Pixels]:
     """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
     x, y = (_scaled(np.asarray(pixels_of(image))) for image in (a, b))
-    if x.shape != y.shape:
-        raise ValueError(f"images have shapes {x.shape} and {y.shape}; crop or scale one of them")
-    if x.ndim != 3 or x.shape[2] not in (1, 3) or x.size == 0:
-        raise ValueError(
-            f"images have shape {x.shape}; expected (H, W, 3) or (H, W, 1) with pixels in it"
-        )
+    _check_shapes(x.shape, y.shape, (1, 3))
     shape = (*x.shape[:2], 3)
     return np.broadcast_to(x, shape), np.broadcast_to(y, shape)
+
+
+def _check_shapes(
+    a: tuple[int, ...], b: tuple[int, ...], channels: tuple[int, ...] | None = None
+) -> None:
+    """Raise ValueError unless two images have one shape (H, W, C), with certain numbers C."""
+    if a != b:
+        raise ValueError(f"images have shapes {a} and {b}; crop or scale one of them")
+    if len(a) != 3 or (channels and a[2] not in channels) or 0 in a:
+        shapes = " or ".join(f"(H, W, {c})" for c in channels or "C")
+        raise ValueError(f"images have shape {a}; expected {shapes} with pixels in it")
+
+
+def _weight_of(shape: tuple[int, ...], weight: ArrayLike | None) -> Singles | None:
+    """Return weights of images of a shape as shape (H, W, 1) or (H, W, C), with mean 1."""
+    factors = check_weight(weight)
+    if factors is None:
+        return None
+    _check_weight_shape(shape, factors.shape)
+    return np.atleast_3d(factors)
+
+
+def _check_weight_shape(shape: tuple[int, ...], weight: tuple[int, ...]) -> None:
+    height, width, channels = shape
+    if weight[:2] != (height, width):
+        raise ValueError(f"weight has shape {weight}, but the images have {width}x{height} pixels")
+    if len(weight) != 2 and weight[2:] not in ((1,), (channels,)):
+        raise ValueError(
+            f"weight has shape {weight}, but the images have {channels} channels; give (H, W), or "
+            f"(H, W, {channels})"
+        )
+
+
+def _weight_of_windows(shape: tuple[int, ...], weight: Any) -> Any:
+    """Check the weights of SSIM; those in arrays then have the mean 1 over the windows."""
+    if is_tensor(weight):
+        _check_weight_shape(shape, weight.shape)
+        return weight
+    factors, radius = _weight_of(shape, weight), len(_window(shape)) - 1
+    if factors is None:
+        return None
+    height, width = shape[:2]
+    mean = factors[radius : height - radius, radius : width - radius].mean(dtype=np.float64)
+    if not mean:
+        raise ValueError(
+            f"weight is 0 for all windows inside the image, whose centres are {radius} pixels or "
+            "more from its edges; at least one must count"
+        )
+    return factors / np.float32(mean)
 
 
 WINDOW = 11
@@ -254,40 +355,57 @@ Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Changes the values of some rows of an image, in double precision."""
 
 
+def _window(shape: tuple[int, ...]) -> Doubles:
+    """Return one half of the window of SSIM along an axis of images of a shape (H, W, C)."""
+    return gaussian_taps(SIGMA, min(WINDOW // 2, (min(shape[:2]) - 1) // 2) / SIGMA)
+
+
 def _similarity(
-    x: Pixels, y: Pixels, convert: Convert
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x: Pixels, y: Pixels, convert: Convert, weight: Singles | None = None
+) -> tuple[Doubles, Doubles]:
     """Return mean SSIM and mean contrast-structure term per channel of two (H, W, 3) images.
 
     The images are converted and compared strip by strip: large ones need no copy in double
-    precision. Only pixels whose window lies inside the image count.
+    precision. Only pixels whose window lies inside the image count. Weights (H, W, 1) or (H, W, 3)
+    have the mean 1 there.
     """
-    height, width = x.shape[:2]
-    radius = min(WINDOW // 2, (min(height, width) - 1) // 2)
-    taps = gaussian_taps(SIGMA, radius / SIGMA)
-    rows, columns = height - 2 * radius, width - 2 * radius
+    taps = _window(x.shape)
+    radius = len(taps) - 1
+    rows, columns = (side - 2 * radius for side in x.shape[:2])
+    planes = None
+    if weight is not None:
+        center = weight[radius : radius + rows, radius : radius + columns]
+        planes = np.broadcast_to(center, (rows, columns, 3))
 
-    def sums(strip: slice) -> NDArray[np.float64]:
+    def sums(strip: slice) -> Doubles:
         inside = slice(strip.start, strip.stop + 2 * radius)
         p, q = (convert(image[inside].astype(np.float64)) for image in (x, y))
-        return np.array([_similarity_sums(p[..., k], q[..., k], taps) for k in range(3)])
+        w = None if planes is None else planes[strip]
+        return np.array(
+            [
+                _similarity_sums(p[..., k], q[..., k], taps, None if w is None else w[..., k])
+                for k in range(3)
+            ]
+        )
 
-    whole, structure = (sum(map_threads(sums, strips(rows, width))) / (rows * columns)).T
+    whole, structure = (sum(map_threads(sums, strips(rows, columns))) / (rows * columns)).T
     return whole, structure
 
 
 def _similarity_sums(
-    x: NDArray[np.floating], y: NDArray[np.floating], taps: NDArray[np.float64]
+    x: NDArray[np.floating], y: NDArray[np.floating], taps: Doubles, weight: Singles | None
 ) -> tuple[float, float]:
-    """Return the sums of SSIM and of its contrast-structure term over two planes (H, W)."""
-    c1, c2 = 0.01**2, 0.03**2
+    """Return the weighted sums of SSIM and its contrast-structure term over two planes (H, W)."""
     x, y = np.ascontiguousarray(x), np.ascontiguousarray(y)
     mean_x, mean_y = blur(x, taps), blur(y, taps)
     product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
     covariance, variances = blur(x * y, taps) - product, blur(x * x + y * y, taps) - squares
-    structure = (2 * covariance + c2) / (variances + c2)
-    luminance = (2 * product + c1) / (squares + c1)
-    return float((luminance * structure).sum()), float(structure.sum())
+    structure = (2 * covariance + C2) / (variances + C2)
+    luminance = (2 * product + C1) / (squares + C1)
+    whole = luminance * structure
+    if weight is not None:
+        whole, structure = (np.where(weight > 0, weight * term, 0) for term in (whole, structure))
+    return float(whole.sum()), float(structure.sum())
 
 
 def halve(image: NDArray[np.floating]) -> NDArray[np.float64]:

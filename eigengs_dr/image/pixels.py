@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.messages import warn
+from ..backend.types import Singles
 from .strips import Pixels, by_strips
 
 ENCODINGS = ("srgb", "linear")
@@ -177,6 +178,26 @@ def _check_range(pixels: NDArray[np.float32], name: str, encoding: str) -> None:
         raise ImageError(
             f"{name}: pixels run from {low:g} to {high:g}, not 0 to 1; {hint} first{light}"
         )
+
+
+def check_weight(weight: ArrayLike | None) -> Singles | None:
+    """Return factors of the errors of pixels as float32, shape (H, W) or (H, W, C), with mean 1.
+
+    Raises
+    ------
+    ValueError
+        If a factor is negative or not finite, or all are 0.
+    """
+    if weight is None:
+        return None
+    factors = np.asarray(weight, np.float32)
+    if factors.ndim not in (2, 3) or not factors.size:
+        raise ValueError(f"weight has shape {factors.shape}; expected (H, W) or (H, W, C)")
+    if not np.isfinite(factors).all() or factors.min() < 0:
+        raise ValueError("weight: factors of the errors must be finite and at least 0")
+    if not factors.any():
+        raise ValueError("weight is 0 for all pixels; at least one must count")
+    return np.asarray(factors / factors.mean(dtype=np.float64), np.float32)
 
 
 def check_size(size: Iterable[int]) -> tuple[int, int]:

@@ -7,6 +7,7 @@ import drjit as dr
 from ..backend.arrays import types_of
 from ..backend.types import Float, FloatLike, Mask, UInt
 from .binning.lists import Pieces, TileLists
+from .binning.tiles import granularity_of
 from .evaluate import weights, weights_vjp
 from .kernels import shares_of
 from .parameters import NUM_SHAPE_PARAMS, gather_index, gather_run, unpack_parameters
@@ -140,6 +141,8 @@ def adjoint_pieces(
 def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt | None = None) -> list:
     """Add the results of the pieces of every Gaussian, in the order of the pieces.
 
+    On a GPU blocks of pieces are added first, see `Granularity.block`.
+
     Parameters
     ----------
     parts : Float
@@ -163,18 +166,69 @@ def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt | None = N
         known = splat < count
     begin = dr.gather(types.UInt, pieces.first, splat, known)
     end = begin + dr.gather(types.UInt, pieces.number, splat, known)
-    length = dr.width(parts) // dr.width(pieces.slot)  # of the shares of all lanes of a piece
-    stride = -(-number // 4) * 4
+    slots, stride = dr.width(pieces.slot), -(-number // 4) * 4
+    length = dr.width(parts) // slots  # of the shares of all lanes of a piece
+
+    def add(source: Float, first: UInt, last: UInt, sums: list) -> list:
+        """Add the results `[first, last)` of pieces, or of blocks."""
+
+        def add_one(i: UInt, sums: list) -> tuple:
+            values = gather_run(types, source, i, length, i < last)
+            return i + 1, [sum(values[k::stride], s) for k, s in enumerate(sums)]
+
+        found: list = dr.while_loop(
+            (types.UInt(first), sums),
+            lambda i, sums: i < last,
+            add_one,
+            label="sum pieces",
+            max_iterations=-1,
+        )[-1]
+        return found
+
+    sums, block = [types.Float(0) for _ in range(number)], granularity_of(types).block
+    if not block or slots < block:
+        return add(parts, begin, end, sums)
+    # What comes before the blocks that a Gaussian fills alone, these blocks, and what comes after.
+    blocks = _sum_blocks(parts, slots // block, block, stride, length // stride)
+    first, last = (begin + (block - 1)) // block, end // block
+    fills = first < last
+    sums = add(parts, begin, dr.select(fills, first * block, end), sums)
+    sums = add(blocks, first, last, sums)
+    return add(parts, dr.select(fills, last * block, end), end, sums)
+
+
+def _sum_blocks(parts: Float, number: int, block: int, stride: int, shares: int) -> Float:
+    """Add the results of blocks of neighbouring pieces, in the layout of `adjoint_pieces`.
+
+    Parameters
+    ----------
+    parts : Float
+        From `adjoint_pieces`.
+    number : int
+        Number of blocks.
+    block : int
+        Number of pieces in a block.
+    stride : int
+        Number of results of a lane.
+    shares : int
+        Lanes of a piece.
+    """
+    types = types_of(parts)
+    lane = dr.arange(types.UInt, number * shares)
+    start = (lane // shares) * (block * shares) + lane % shares
 
     def add(i: UInt, sums: list) -> tuple:
-        values = gather_run(types, parts, i, length, i < end)
-        return i + 1, [sum(values[k::stride], s) for k, s in enumerate(sums)]
+        values = gather_run(types, parts, start + i * shares, stride, i < block)
+        return i + 1, [s + v for s, v in zip(sums, values, strict=True)]
 
-    sums: list = dr.while_loop(
-        (begin, [types.Float(0) for _ in range(number)]),
-        lambda i, sums: i < end,
+    sums = dr.while_loop(
+        (types.UInt(0), [types.Float(0) for _ in range(stride)]),
+        lambda i, sums: i < block,
         add,
-        label="sum pieces",
+        label="sum blocks",
         max_iterations=-1,
     )[-1]
-    return sums
+    blocks = dr.empty(types.Float, stride * shares * number)
+    dr.scatter(blocks, types.FloatX(sums), lane)
+    dr.eval(blocks)
+    return blocks

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from ..backend.arrays import ArrayTypes, types_of
+from ..backend.arrays import ArrayTypes, gather_run, types_of
 from ..backend.types import Bool, Float, Mask, UInt
 from ..gaussian.gaussians import Gaussians
 
@@ -108,19 +108,6 @@ def pack_parameters(values: list, before: Sequence[float] = ()) -> Float:
 def _stride(number: int) -> int:
     """Return the number of values from one Gaussian to the next, which gathers in packets allow."""
     return 2 if number <= 2 else -(-number // 4) * 4
-
-
-def gather_run(
-    types: ArrayTypes, source: Float | UInt, index: UInt, length: int, active: Mask
-) -> list:
-    """Gather ``source[index * length : (index + 1) * length]``, in packets if the length is even.
-
-    Return a list of `length` Float.
-    """
-    shape, kind = (length, dr.width(index)), types.FloatX
-    if dr.type_v(source) == dr.VarType.Float16:
-        kind = dr.float16_array_t(kind)
-    return list(dr.gather(kind, source, index, active, shape=shape))
 
 
 def unpack_parameters(packed: Float, index: UInt, number: int, active: Mask = True) -> list:

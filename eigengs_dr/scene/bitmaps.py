@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +27,13 @@ KEPT = ("to_uv", "wrap_mode")
 """Properties of a bitmap that a ``gaussian_texture`` has too."""
 
 
+GAUSSIANS = "gaussian_texture"
+"""Name of the plugin in scenes."""
+
+UDIM = re.compile(r"<udim>|<uvtile>|%\(udim\)d", re.IGNORECASE)
+"""What stands for the number of a tile in names of files, by Mari, Mudbox and Houdini."""
+
+
 class Use(NamedTuple):
     """A bitmap in a scene.
 
@@ -42,6 +51,8 @@ class Use(NamedTuple):
         Whether the values are data.
     wrap : str
         Wrap mode.
+    is_height : bool
+        Whether a bump map uses it.
     name : str
         How a report calls it.
     """
@@ -52,15 +63,15 @@ class Use(NamedTuple):
     file: str
     raw: bool
     wrap: str
+    is_height: bool
     name: str
 
 
 class Parsed(NamedTuple):
-    """A scene that is parsed but not instantiated: all nodes, and the folder of its files."""
+    """A scene that is parsed but not instantiated: all nodes, with absolute names of files."""
 
     config: mi.parser.ParserConfig
     state: mi.parser.ParserState
-    folder: Path
 
 
 def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None) -> Parsed:
@@ -76,34 +87,62 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
     Raises
     ------
     ValueError
-        If the root is no scene.
+        If the root is no scene, or a file name stands for UDIM tiles.
     RuntimeError
         Mitsuba's error, if the scene does not parse.
     """
     register_plugins()
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = config.parallel = False
-    if isinstance(scene, Mapping):
-        folder, state = Path.cwd(), mi.parser.parse_dict(config, dict(scene))
-    else:
-        folder = Path(scene).resolve().parent
-        state = mi.parser.parse_file(config, str(scene), **dict(parameters or {}))
-    mi.parser.transform_all(config, state)
-    if state.root.props.plugin_name() != "scene":
-        raise ValueError("holds no scene; its root must be <scene version='3.0.0'>")
+    with _own_resolver() as resolver:  # parsing adds the folders of <path> to it
+        if isinstance(scene, Mapping):
+            state = mi.parser.parse_dict(config, dict(scene))
+        else:
+            for path in (Path(scene).resolve(), Path(scene).absolute()):  # the scene may be a link
+                resolver.prepend(str(path.parent))
+            state = mi.parser.parse_file(config, str(scene), **dict(parameters or {}))
+        mi.parser.transform_all(config, state)
+        if state.root.props.plugin_name() != "scene":
+            raise ValueError("holds no scene; its root must be <scene version='3.0.0'>")
+        for node in state.nodes:
+            _make_absolute(node.props)
     for node in state.nodes:
-        for key in file_keys(node.props):
-            path = folder / node.props[key]
-            if path.exists():
-                node.props[key] = str(path)
         if "data" in node.props and is_bitmap(node):  # an instance takes the tensor away
             node.props["data"] = mi.TensorXf(np.array(node.props["data"], np.float32))
-    return Parsed(config, state, folder)
+        if node.props.plugin_name() == GAUSSIANS:  # Mitsuba does not know what dictionaries name
+            node.type = texture_kind()
+    return Parsed(config, state)
+
+
+@contextmanager
+def _own_resolver() -> Iterator[mi.FileResolver]:
+    """Use a copy of Mitsuba's file resolver in a block."""
+    before = mi.file_resolver()
+    own = mi.FileResolver(before)
+    mi.set_file_resolver(own)
+    try:
+        yield own
+    finally:
+        mi.set_file_resolver(before)
+
+
+def _make_absolute(props: Properties) -> None:
+    """Look files up as Mitsuba does: in the folders of ``<path>``, then beside the scene."""
+    for key in file_keys(props):
+        path = Path(str(mi.file_resolver().resolve(props[key])))
+        if path.exists():
+            props[key] = str(path.absolute())
+        elif UDIM.search(props[key]):
+            raise ValueError(
+                f"{props[key]} stands for UDIM tiles, and Mitsuba reads one image a bitmap; split "
+                "the mesh by tiles, and give each part the bitmap of its tile"
+            )
 
 
 def file_keys(props: Properties) -> list[str]:
     """Return the properties that name files."""
-    return [key for key in props.keys() if key == "filename" or key.endswith("_filename")]  # noqa: SIM118
+    named = ("filename", "model") if props.plugin_name() == GAUSSIANS else ("filename",)
+    return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 
 
 def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
@@ -132,12 +171,13 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
         above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
         parent, slot = above[0] if above else (0, "")
         name = _label(props, nodes[parent].props, slot)
-        if reason := _reason(props, [(nodes[p].props.plugin_name(), s) for p, s in above]):
+        parents_of = [nodes[p].props.plugin_name() for p, _ in above]
+        if reason := _reason(props, parents_of):
             left.append((name, reason))
             continue
         file = os.path.realpath(props["filename"]) if "filename" in props else f"{slot}-{index}"
         raw, wrap = bool(props.get("raw", False)), str(props.get("wrap_mode", "repeat"))
-        uses.append(Use(index, parent, slot, file, raw, wrap, name))
+        uses.append(Use(index, parent, slot, file, raw, wrap, "bumpmap" in parents_of, name))
     return uses, left
 
 
@@ -154,12 +194,12 @@ def _label(props: Properties, parent: Properties | None, slot: str) -> str:
     return f"{file} ({parent.id() or parent.plugin_name()}.{slot})"
 
 
-def _reason(props: Properties, slots: list[tuple[str, str]]) -> str:
-    """Say why a bitmap stays a bitmap by its properties, or nothing."""
-    if not slots:
+def _reason(props: Properties, parents: list[str]) -> str:
+    """Say why a bitmap stays a bitmap by its properties and the plugins that use it, or nothing."""
+    if not parents:
         return "nothing uses it"
-    if any(plugin == "bumpmap" for plugin, _ in slots):
-        return "heights of a bump map: cameras see their slopes, and a PSNR of heights says little"
+    if "bumpmap" in parents and len(set(parents)) > 1:
+        return "heights of a bump map that are something else too"
     if str(props.get("filter_type", "bilinear")) != "bilinear":
         return "its filter shows single texels"
     return ""

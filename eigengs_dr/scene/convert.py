@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,14 +16,14 @@ from ..backend.doors import door
 from ..backend.messages import warn
 from ..backend.progress import shows_progress
 from ..backend.types import PathLike, Record
-from ..gaussian.gaussians import Gaussians
-from ..image.color import to_coded
-from ..image.io import ImageError, save_image
-from ..image.metrics import psnr
+from ..gaussian.gaussians import FIELDS
+from ..image.io import ImageError
+from ..plugins.properties import source_of, to_uv
+from ..plugins.versions import Properties
 from ..storage.atomic import atomic_folder, refuse_url, remove_stale
 from ..storage.locks import lock_output
 from .bitmaps import (
-    KEPT,
+    GAUSSIANS,
     Parsed,
     Unsuitable,
     Use,
@@ -30,37 +31,40 @@ from .bitmaps import (
     is_bitmap,
     parse,
     read_pixels,
-    space_of,
     uses_of,
 )
-from .fit_scene import SceneFit, fit_for_scene
+from .costs import costs_of
+from .fit_uses import Original, fit_heights, fit_picture, replace_bitmap
+from .rendering import Progress, compare, pictures
 
 SCENE = "scene.xml"
 """Name of the new scene in its folder."""
-
-Progress = Callable[[str, int, int], None]
-"""``progress(label, done, total)``."""
 
 NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directly"
 
 
 class ConvertedTexture(NamedTuple):
-    """A bitmap that became Gaussians.
+    """An image, as bitmaps and as Gaussians.
 
     Attributes
     ----------
     names : tuple of str
         Its uses: the file, and in brackets what uses it.
     file : str
-        The new file, relative to the folder.
+        The new file, relative to the folder; "" if the bitmap stayed.
     width, height, channels : int
     bytes : int
-        Memory of the bitmap with 8 bits a value.
+        Memory of its bitmaps in the scene, see `eigengs_dr.plugins.resident_bytes`.
+    lookup_ns : float
+        Time of a lookup in the bitmap, in nanoseconds, on all cores of this machine.
     gaussians : int
     gaussian_bytes : int
-        Memory of means, shapes and colours in single precision.
+        Memory of the textures of Gaussians in the scene. Those of one wrap mode share it.
+    gaussian_lookup_ns : float
+        Time of a lookup in the Gaussians.
     psnr : float
-        Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`.
+        Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`; of a bump
+        map, lowest PSNR between the renderings with and without this set alone.
     """
 
     names: tuple[str, ...]
@@ -69,8 +73,10 @@ class ConvertedTexture(NamedTuple):
     height: int
     channels: int
     bytes: int
+    lookup_ns: float
     gaussians: int
     gaussian_bytes: int
+    gaussian_lookup_ns: float
     psnr: float
 
 
@@ -83,14 +89,18 @@ class ConvertedScene(NamedTuple):
         The new XML file. Beside it are the sets of Gaussians, and for each camera the pictures
         before-1.png, after-1.png and difference-1.png, 8 times louder.
     textures : list of ConvertedTexture
+        Bitmaps that became Gaussians.
+    better : list of ConvertedTexture
+        Bitmaps that stayed, since they take less memory or time than Gaussians.
     left : list of (str, str)
-        What stayed as it was, and why.
+        What else stayed as it was, and why.
     psnr : list of float
         psnr_rgb in dB between the renderings of each camera; both have the same random numbers.
     """
 
     scene: Path
     textures: list[ConvertedTexture]
+    better: list[ConvertedTexture]
     left: list[tuple[str, str]]
     psnr: list[float]
 
@@ -104,13 +114,16 @@ def convert_scene(
     iterations: int = 100,
     spp: int | None = None,
     parameters: Mapping[str, str] | None = None,
+    replace_all: bool = False,
     progress: Any = None,
 ) -> ConvertedScene:
-    """Replace every bitmap of a scene by as many Gaussians as its cameras resolve.
+    """Replace the bitmaps of a scene by as many Gaussians as its cameras resolve.
 
-    Uses of one image share a set. The function leaves alone what Gaussians would spoil or cannot
-    replace: environment maps, bump maps, images of two values such as masks, data beyond 0 and 1,
-    images of no shape or that no camera sees, and those that would take more Gaussians than texels.
+    Uses of one image share a set. A bitmap that takes less memory than its Gaussians, or an eighth
+    of their time, is better and stays. The function leaves alone what Gaussians would spoil or
+    cannot replace: environment maps, bump maps with which the renderings would miss the PSNR,
+    images of two values such as masks, data beyond 0 and 1, and images of no shape or that no
+    camera sees.
 
     Parameters
     ----------
@@ -126,6 +139,8 @@ def convert_scene(
         Samples per pixel of the renderings, by default those of the scene; 0 renders nothing.
     parameters : mapping of str to str, optional
         Values for the defaults of an XML file.
+    replace_all : bool, optional
+        Whether better bitmaps are replaced too: Gaussians are differentiable, and have no texels.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(label, done, total)``.
@@ -163,19 +178,28 @@ def convert_scene(
     refuse_url(output)
     target = Path(os.path.realpath(output))  # of a link, the folder that it names
     _check_empty(output, target)
+    settings = Settings(target_psnr, iterations, spp, replace_all)
     with lock_output(output):
         remove_stale(target.parent)
         with atomic_folder(output) as work:
-            textures, left, seen = _convert_into(
-                work, target, scene, parameters, target_psnr, iterations, spp, progress or _silent
-            )
-    for camera, decibels in enumerate(seen, 1):
+            make = partial(parse, scene, parameters)
+            result = _convert_into(work, target, make, settings, progress or _silent)
+    for camera, decibels in enumerate(result.psnr, 1):
         if decibels < target_psnr:
             warn(
                 f"{output}: camera {camera} sees psnr_rgb {decibels:.1f} dB between the "
                 f"renderings, below the goal of {target_psnr:g}; look at difference-{camera}.png"
             )
-    return ConvertedScene(Path(output) / SCENE, textures, left, seen)
+    return result._replace(scene=Path(output) / SCENE)
+
+
+class Settings(NamedTuple):
+    """Arguments of `convert_scene`."""
+
+    target_psnr: float
+    iterations: int
+    spp: int | None
+    replace_all: bool
 
 
 def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
@@ -191,104 +215,90 @@ def _silent(label: str, done: int, total: int) -> None:
 def _convert_into(
     work: Path,
     target: Path,
-    scene: PathLike | Record,
-    parameters: Mapping[str, str] | None,
-    target_psnr: float,
-    iterations: int,
-    spp: int | None,
+    make: Callable[[], Parsed],
+    settings: Settings,
     progress: Progress,
-) -> tuple[list[ConvertedTexture], list[tuple[str, str]], list[float]]:
-    """Write a scene and its files into a folder that becomes the target.
-
-    Returns
-    -------
-    textures, left, psnr
-        See `ConvertedScene`.
-    """
-    parsed, again = parse(scene, parameters), parse(scene, parameters)
-    uses, left = uses_of(parsed)
-    before = mi.parser.instantiate(parsed.config, parsed.state)
+) -> ConvertedScene:
+    """Write a scene and its files into a folder that becomes the target; `make` parses it."""
+    again = make()
+    uses, left = uses_of(again)
+    original = Original(make, settings.spp)
+    result = ConvertedScene(work / SCENE, [], [], left, [])
     made = dict[int, str]()
-    textures = list[ConvertedTexture]()
-    groups: dict[tuple[str, bool], list[Use]] = {}
-    on_shapes = [mi.traverse(shape).hierarchy for shape in before.shapes()]
+    groups: dict[tuple[str, bool, bool], list[Use]] = {}
+    on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
-        if any(_texture(parsed, use) in found for found in on_shapes):
-            groups.setdefault((use.file, use.raw), []).append(use)
+        if any(original.textures([use])[0] in found for found in on_shapes):
+            groups.setdefault((use.file, use.raw, use.is_height), []).append(use)
         else:
             left.append((use.name, NO_SHAPE))
     for number, group in enumerate(groups.values()):
         progress("textures", number, len(groups))
-        file = _file_name(group[0], {texture.file for texture in textures})
+        file = work / _file_name(group[0], {texture.file for texture in result.textures})
         pixels = read_pixels(again.state.nodes[group[0].node].props)
-        found = _convert(before, parsed, group, pixels, target_psnr, iterations)
+        found = _convert(original, group, pixels, file, settings)
         if isinstance(found, str):
             left += [(use.name, found) for use in group]
-            continue
-        found.gaussians.save(work / file)
-        made |= {use.node: file for use in group}
-        textures.append(_describe(group, file, found))
+        elif not found.file:
+            result.better.append(found)
+        else:
+            result.textures.append(found)
+            made |= {use.node: found.file for use in group}
     progress("textures", len(groups), len(groups))
     _rewrite(again, made, work, target)
-    (work / SCENE).write_text(_to_xml(again), encoding="utf-8")
-    seen = list[float]()
-    if spp != 0:
-        after = mi.load_file(str(work / SCENE))
-        seen = compare_renderings(before, after, work, spp, progress)
-    return textures, left, seen
+    result.scene.write_text(_to_xml(again), encoding="utf-8")
+    if settings.spp != 0:
+        progress("renderings", 0, 2)
+        after = pictures(mi.load_file(str(result.scene)), settings.spp)
+        progress("renderings", 1, 2)
+        result.psnr.extend(compare(original.pictures, after, work))
+        progress("renderings", 2, 2)
+    return result
 
 
 # --- The textures --------------------------------------------------------------------------------
 
 
 def _convert(
-    scene: PathLike | Record,
-    parsed: Parsed,
+    original: Original,
     group: list[Use],
     pixels: NDArray[np.float32],
-    psnr: float,
-    iterations: int,
-) -> SceneFit | str:
-    """Fit the image of some uses, or return why it must stay."""
-    nodes, use = parsed.state.nodes, group[0]
-    # Raw colours are colours all the same; pixels in memory are raw as a rule.
-    is_data = pixels.shape[2] == 1 or nodes[use.parent].props.plugin_name() == "normalmap"
+    file: Path,
+    settings: Settings,
+) -> ConvertedTexture | str:
+    """Fit the image of some uses and save the set, or return why it must stay.
+
+    Where the bitmap is better, there is no file.
+    """
+    use, asked = group[0], (settings.target_psnr, settings.iterations)
     try:
-        space = space_of(pixels, use.raw and is_data)
-        found = fit_for_scene(
-            scene,
-            [_texture(parsed, use) for use in group],
-            pixels,
-            psnr,
-            space,
-            iterations=iterations,
-            wrap_mode=[use.wrap for use in group],
-            encoding="linear",
-        )
+        if use.is_height:
+            g, seen = fit_heights(original, group, pixels, *asked, file)
+        else:
+            g, seen = fit_picture(original, group, pixels, *asked)
+            g.save(file)
     except (Unsuitable, ImageError) as error:
         return str(error)
-    if _memory(found.gaussians) >= pixels.size:
-        return f"{len(found.gaussians):,} Gaussians take more memory than its texels"
-    return found
-
-
-def _texture(parsed: Parsed, use: Use) -> mi.Texture:
-    """Return the texture of a scene that was made from what was parsed."""
-    return parsed.state.nodes[use.parent].props[use.slot]
-
-
-def _memory(gaussians: Gaussians) -> int:
-    """Return the bytes of means, shapes and colours in single precision."""
-    channels = gaussians.channels
-    return 4 * (len(gaussians) * (5 + channels) + channels)
-
-
-def _describe(group: list[Use], file: str, found: SceneFit) -> ConvertedTexture:
-    g = found.gaussians
-    names = tuple(use.name for use in group)
-    size = g.width, g.height, g.channels
-    memory = g.width * g.height * g.channels, len(g), _memory(g)
-    return ConvertedTexture(names, file, *size, *memory, min(found.psnr))
+    saved, wraps = {"type": GAUSSIANS, "filename": str(file)}, {use.wrap for use in group}
+    sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted(wraps)]
+    bitmaps = original.textures(group)
+    bitmap, gaussians = costs_of((bitmaps, sets), use.raw or use.is_height, g.channels)
+    stays = bitmap.is_better_than(gaussians) and not settings.replace_all
+    if stays:
+        file.unlink()
+    return ConvertedTexture(
+        names=tuple(use.name for use in group),
+        file="" if stays else file.name,
+        width=g.width,
+        height=g.height,
+        channels=g.channels,
+        bytes=bitmap.bytes,
+        lookup_ns=bitmap.nanoseconds,
+        gaussians=len(g),
+        gaussian_bytes=gaussians.bytes,
+        gaussian_lookup_ns=gaussians.nanoseconds,
+        psnr=seen,
+    )
 
 
 def _file_name(use: Use, taken: set[str]) -> str:
@@ -304,17 +314,18 @@ def _file_name(use: Use, taken: set[str]) -> str:
 def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> None:
     """Put the sets in the place of the bitmaps, and name other files relative to the folder.
 
-    `made` holds the new file for the index of each node that was a bitmap. Bitmaps that stay and
-    are in memory become files too.
+    `made` holds the new file for the index of each node that was a bitmap. Bitmaps that stay, and
+    sets that were there, become files too if they are in memory.
     """
     for index, node in enumerate(parsed.state.nodes):
         props = node.props
         if index in made:
-            for key in list(props.keys()):
-                if key not in KEPT:
-                    del props[key]
-            props.set_plugin_name("gaussian_texture")
-            props["filename"] = made[index]
+            replace_bitmap(props, made[index])
+            continue
+        if props.plugin_name() == GAUSSIANS and "to_uv" in props:
+            props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML lacks
+        if props.plugin_name() == GAUSSIANS and ("mean" in props or "coefficients" in props):
+            _save_set(props, work, f"gaussians-{index}.npz")
             continue
         if (is_bitmap(node) or props.plugin_name() == "envmap") and "filename" not in props:
             file = f"bitmap-{index}.exr"
@@ -327,99 +338,21 @@ def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> 
                 props[key] = os.path.relpath(path, target)
 
 
+def _save_set(props: Properties, folder: Path, file: str) -> None:
+    """Write the arrays of a ``gaussian_texture``, or a model with its coefficients, to a file."""
+    source = source_of(props)
+    source.gaussians(source.tensors).save(folder / file)
+    for key in (*FIELDS, "width", "height", "space", "model", "coefficients"):
+        if key in props:
+            del props[key]
+    props["filename"] = file
+
+
 def _to_xml(parsed: Parsed) -> str:
     try:
         return str(mi.parser.write_string(parsed.state))
     except RuntimeError as error:
         reason = str(error).partition("] ")[2] or str(error)
         raise ValueError(
-            f"the scene cannot be written as XML ({reason}); give meshes by files"
+            f"the scene cannot be written as XML ({reason}); give meshes and volumes by files"
         ) from None
-
-
-SAMPLES_PER_PASS = 1 << 24
-"""Most samples in one pass. The state of a sample takes some 20 bytes; progress and Ctrl-C wait
-for the end of a pass."""
-
-
-def render_in_passes(
-    scene: mi.Scene,
-    camera: int,
-    spp: int | None,
-    show: Callable[[int, int], None] = lambda *_: None,
-) -> tuple[NDArray[np.float32], int]:
-    """Render a scene by one of its cameras; each pass has its own seed.
-
-    Parameters
-    ----------
-    scene : mitsuba.Scene
-    camera : int
-    spp : int or None
-        Samples per pixel, by default those of the camera.
-    show : callable, optional
-        ``show(done, total)`` after each pass, in samples per pixel.
-
-    Returns
-    -------
-    pixels : ndarray of float32, shape (H, W, C)
-        Linear light, and the channels of AOVs.
-    spp : int
-        Samples per pixel.
-    """
-    sensor = scene.sensors()[camera]
-    width, height = sensor.film().crop_size()
-    total = spp or sensor.sampler().sample_count()
-    most = max(1, SAMPLES_PER_PASS // (width * height))
-    pixels, done = np.zeros(()), 0
-    while done < total:
-        count = min(most, total - done)
-        part = mi.render(scene, sensor=camera, spp=count, seed=done)
-        pixels = pixels + count * np.array(part, np.float64)
-        done += count
-        show(done, total)
-    return (pixels / total).astype(np.float32), total
-
-
-LOUDER = 8.0
-"""Factor of the differences in their pictures."""
-
-
-def compare_renderings(
-    before: mi.Scene, after: mi.Scene, folder: Path, spp: int | None, progress: Progress
-) -> list[float]:
-    """Render two scenes by each camera, with the same random numbers, and write the pictures.
-
-    Parameters
-    ----------
-    before, after : mitsuba.Scene
-        With the same cameras.
-    folder : Path
-        Gets before-1.png, after-1.png and difference-1.png, 8 times louder, and so on.
-    spp : int or None
-        Samples per pixel, by default those of the camera.
-    progress : callable
-        ``progress(label, done, total)``.
-
-    Returns
-    -------
-    list of float
-        psnr_rgb in dB for each camera.
-    """
-    found, cameras = [], len(before.sensors())
-    for number in range(cameras):
-        progress("renderings", number, cameras)
-        pair = [_picture(scene, number, spp) for scene in (before, after)]
-        loud = np.clip(LOUDER * np.abs(pair[0] - pair[1]), 0, 1)
-        for name, picture in zip(("before", "after", "difference"), [*pair, loud], strict=True):
-            save_image(folder / f"{name}-{number + 1}.png", picture)
-        found.append(psnr(pair[0], pair[1]))
-    progress("renderings", cameras, cameras)
-    return found
-
-
-def _picture(scene: mi.Scene, camera: int, spp: int | None) -> NDArray[np.float32]:
-    """Render a scene in sRGB, shape (H, W, 3) or (H, W, 1)."""
-    light, _ = render_in_passes(scene, camera, spp)
-    channels = 3 if light.shape[2] >= 3 else 1
-    shown = to_coded(np.maximum(light[..., :channels], 0))
-    return np.clip(shown, 0, 1).astype(np.float32)

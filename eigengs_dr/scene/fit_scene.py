@@ -36,7 +36,7 @@ from ..plugins.versions import Texture
 from ..raster.render import render
 from .bitmaps import Unsuitable
 from .target import MARGIN, error_weights, seen_by, smoothest_target
-from .visibility import Visibility, visibility
+from .visibility import Box, Visibility, visibility
 
 COLORS = ("linear", "radiance", "data")
 """Names of the spaces of textures: linear light to 1, or of any range, or data."""
@@ -157,10 +157,19 @@ def fit_for_scene(
     peak = max(1.0, float(values.max())) if space == "radiance" else 1.0
     values, kind = values / np.float32(peak), "data" if space == "data" else "linear"
     found = visibility(scene, texture, width, height, wrap_mode)
-    values = _resized(values, float(found.footprint.min() / PIXEL))
-    fine, (fine_height, fine_width) = found, values.shape[:2]
+    texels, box = float(found.footprint.min() / PIXEL), Box(0, 0, width, height)
+    if texels < ENOUGH:  # enlarged where it is seen: 8k texels would become 7 GB
+        box = _seen_box(found.seen, margin=1)
+        values = zoom(box.of(values), (FINER, FINER, 1), order=1, mode="nearest", grid_mode=True)
+        fine_width, fine_height = FINER * width, FINER * height
+        box = Box(*(FINER * side for side in box))
+    else:
+        values = halved(values, found)
+        fine_height, fine_width = values.shape[:2]
+        box = Box(0, 0, fine_width, fine_height)
+    fine = found
     if (fine_height, fine_width) != (height, width):
-        fine = visibility(scene, texture, fine_width, fine_height, wrap_mode)
+        fine = visibility(scene, texture, fine_width, fine_height, wrap_mode, box)
     values, fine, corner = _crop_to_seen(values, fine)
     goal = [seen_by(values, rows, kind, peak) for rows in fine.pixel_to_texel]
 
@@ -193,7 +202,8 @@ def fit_for_scene(
             f"{target_psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
         )
     gaussians = _without_unseen(search.gaussians.scaled(*size), fine.seen)
-    mean = gaussians.mean + type(gaussians.mean)(*corner)  # of the crop
+    left, top = box.left + corner.left, box.top + corner.top
+    mean = gaussians.mean + type(gaussians.mean)(left, top)
     placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height, space=space)
     tried = [(row["gaussians"], row["psnr_ycbcr"]) for row in search.trace]
     whole = restored(placed.scaled(width, height), Affine(peak))
@@ -211,10 +221,9 @@ def _objective(
     return Pixels.of(Data(target, shown, weight), space, types)
 
 
-def _resized(values: Image, texels: float) -> Image:
-    """Enlarge or halve an image, by the smallest number of texels per pixel of any camera."""
-    if texels < ENOUGH:
-        return zoom(values, (FINER, FINER, 1), order=1, mode="nearest", grid_mode=True)
+def halved(values: Image, found: Visibility) -> Image:
+    """Halve an image while pixels are at least `ENOUGH` texels large."""
+    texels = max(float(found.footprint.min() / PIXEL), ENOUGH)
     return _shrunk(values, 2 ** int(np.log2(texels / ENOUGH)))
 
 
@@ -226,14 +235,23 @@ def _shrunk(values: Image, times: int) -> Image:
     return resize_local_mean(values, small, channel_axis=2)
 
 
-def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, tuple[int, int]]:
-    """Crop to the bounding box of the seen texels; also return its corner (column, row)."""
-    kept = [np.flatnonzero(found.seen.any(axis=axis)) for axis in (1, 0)]
-    part = tuple(slice(k[0], k[-1] + 1) for k in kept)
-    texels = np.arange(found.seen.size).reshape(found.seen.shape)[part].ravel()
+def _seen_box(seen: NDArray[np.bool_], margin: int = 0) -> Box:
+    """Return the bounding box of the seen texels, wider by a margin inside of the image."""
+    spans = []
+    for axis, side in ((0, seen.shape[1]), (1, seen.shape[0])):
+        kept = np.flatnonzero(seen.any(axis=axis))
+        spans.append((max(0, int(kept[0]) - margin), min(side, int(kept[-1]) + 1 + margin)))
+    (left, right), (top, bottom) = spans
+    return Box(left, top, right - left, bottom - top)
+
+
+def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, Box]:
+    """Crop to the bounding box of the seen texels; also return it."""
+    box = _seen_box(found.seen)
+    texels = box.of(np.arange(found.seen.size).reshape(found.seen.shape)).ravel()
     lookups = [rows[:, texels] for rows in found.pixel_to_texel]
-    cut = Visibility(found.footprint[part], lookups)
-    return np.ascontiguousarray(values[part]), cut, (int(kept[1][0]), int(kept[0][0]))
+    cut = Visibility(box.of(found.footprint), lookups)
+    return np.ascontiguousarray(box.of(values)), cut, box
 
 
 def _without_unseen(gaussians: Gaussians, seen: NDArray[np.bool_]) -> Gaussians:

@@ -1,10 +1,13 @@
 """Visibility: the texels of a texture that the cameras of a Mitsuba scene see, and how sharply.
 
-Rays go through every pixel of every camera to their first hit. Where they hit the texture, the ray
-differentials give the parallelogram ``J`` that the pixel covers there, in texels, and with it the
-footprint ``PIXEL^2 J J^T`` of the prefilter (`eigengs_dr.plugins.cone`). The smallest footprint of
-a texel counts. Rays go on through holes of masks, but do not follow mirrors or glass, and the lens
-is a pinhole. A lamp is seen by what it lights too, coarsely.
+Rays go through every pixel of every camera to their first hit. Where they hit the texture, rays
+through other points of the pixel give the parallelogram ``J`` that the pixel covers there, in
+texels, and with it the footprint ``PIXEL^2 J J^T`` of the prefilter (`eigengs_dr.plugins.cone`).
+The smallest footprint of a texel counts. Rays go on through holes of masks, but do not follow
+mirrors or glass, and the lens is a pinhole. A lamp is seen by what it lights too, coarsely.
+
+Mitsuba's ray differentials and footprints would give J too, but versions differ in them, and
+footprints end at the first surface.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -46,6 +49,16 @@ MAX_LAYERS = 16
 
 LAMP_BLOCKS = 16
 """Number of blocks along a side of a lamp. Their means count like what a pixel sees."""
+
+
+Ray = Any
+"""A ``mitsuba.Ray3f`` of the current variant."""
+
+Point = Any
+"""A ``mitsuba.Point2f`` of the current variant."""
+
+Vector = Any
+"""A ``mitsuba.Vector2f`` of the current variant."""
 
 
 class View(NamedTuple):
@@ -103,28 +116,26 @@ def _trace_batch(view: View, pixels: NDArray[np.uint32], side: int) -> Iterator[
 
     Rays that meet a hole of a mask go on behind it, for the next layer.
     """
-    columns, rows = view.sensor.film().crop_size()
+    columns, _ = view.sensor.film().crop_size()
     ray = dr.arange(mi.UInt32, len(pixels) * side * side)
     across = dr.opaque(mi.UInt32, side)  # one program for every number of rays
     pixel = dr.gather(mi.UInt32, upload(mi.UInt32, pixels), ray // (across * across))
     inside = ray % (across * across)
-    x = pixel % columns + (mi.Float(inside % across) + 0.5) / across
-    y = pixel // columns + (mi.Float(inside // across) + 0.5) / across
-    film = mi.Point2f(x / columns, y / rows)
+    place = (mi.Point2f(inside % across, inside // across) + 0.5) / mi.Float(across)
+    corner = mi.Point2f(pixel % columns, pixel // columns)
     with dr.suspend_grad():
-        ray, _ = view.sensor.sample_ray_differential(0.0, 0.5, film, mi.Point2f(0.5))
-        ray.has_differentials = True  # a batch of sensors computes them but leaves this False
+        ray, others = _rays(view, corner, place)
         has_holes = any(
             mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in view.scene.shapes()
         )
         onward, active = ray, mi.Bool(True)
         for _ in range(MAX_LAYERS if has_holes else 1):
-            si = view.scene.ray_intersect(onward, mi.RayFlags.All, True, active)
-            si.compute_uv_partials(ray)
+            si = view.scene.ray_intersect(onward, active)
             hit = mi.Bool(False)
             for shape in view.shapes:
                 hit |= si.shape == mi.ShapePtr(shape)
-            x, y, short, long = _on_texture(si, view)
+            partials = [_uv_at(si, other) / step for other, step in others]
+            x, y, short, long = _on_texture(si, partials, view)
             hit &= si.is_valid() & dr.isfinite(long) & (long > 0)
             dr.eval(hit, x, y, short, long)
             yield hit, pixel, x, y, short, long
@@ -137,10 +148,42 @@ def _trace_batch(view: View, pixels: NDArray[np.uint32], side: int) -> Iterator[
                 onward = si.spawn_ray(ray.d)
 
 
-def _on_texture(si: Interaction, view: View) -> tuple[Float, Float, Float, Float]:
+def _rays(view: View, corner: Point, place: Point) -> tuple[Ray, list[tuple[Ray, Float]]]:
+    """Return rays through places in pixels, and two others with their steps to the right and down.
+
+    They are half a pixel away, towards its middle: in a batch of cameras, the next pixel may be
+    that of another camera.
+    """
+
+    def through(place: Point) -> Ray:
+        film = (corner + place) / mi.Point2f(view.sensor.film().crop_size())
+        return view.sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))[0]
+
+    x, y = (dr.select(p < 0.5, mi.Float(0.5), mi.Float(-0.5)) for p in place)
+    right, down = through(place + mi.Vector2f(x, 0)), through(place + mi.Vector2f(0, y))
+    return through(place), [(right, x), (down, y)]
+
+
+def _uv_at(si: Interaction, ray: Ray) -> Vector:
+    """Return the step in uv from a hit to where another ray meets its tangent plane.
+
+    The step p in space is ``dp_du u + dp_dv v``, which two equations of the least squares solve.
+    """
+    t = dr.dot(si.n, si.p - ray.o) / dr.dot(si.n, ray.d)
+    step = ray(t) - si.p
+    uu, uv, vv = (
+        dr.dot(a, b) for a, b in ((si.dp_du, si.dp_du), (si.dp_du, si.dp_dv), (si.dp_dv, si.dp_dv))
+    )
+    u, v = dr.dot(si.dp_du, step), dr.dot(si.dp_dv, step)
+    return mi.Vector2f(vv * u - uv * v, uu * v - uv * u) / (uu * vv - uv * uv)
+
+
+def _on_texture(
+    si: Interaction, partials: list[Vector], view: View
+) -> tuple[Float, Float, Float, Float]:
     """Return the position (x, y) of a hit and the singular values of J, all in texels."""
     at = view.to_texels @ si.uv
-    right, down = (view.to_texels @ mi.Vector2f(d) for d in (si.duv_dx, si.duv_dy))
+    right, down = (view.to_texels @ d for d in partials)
     (x, _), (y, _) = (fold(v, side, view.wrap) for v, side in zip(at, view.size, strict=True))
     # Eigenvalues of J J^T; the determinant gives the smaller one, as a difference would cancel.
     xx, yy = right.x * right.x + down.x * down.x, right.y * right.y + down.y * down.y
@@ -155,6 +198,19 @@ than half a diagonal."""
 
 NEIGHBOURS = 1.5
 """Texels added to this radius, because bilinear lookups read neighbours, also diagonal ones."""
+
+
+class Box(NamedTuple):
+    """A part of an image, in texels."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def of(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Return the part of an image, shape (H, W, ...)."""
+        return image[self.top : self.top + self.height, self.left : self.left + self.width]
 
 
 class Visibility(NamedTuple):
@@ -193,6 +249,7 @@ def visibility(
     width: int,
     height: int,
     wrap_mode: str | Sequence[str] = "repeat",
+    part: Box | None = None,
 ) -> Visibility:
     """Measure what the cameras of a scene resolve of a texture.
 
@@ -208,6 +265,8 @@ def visibility(
         Size in texels: that of the image for the texture.
     wrap_mode : {"repeat", "mirror", "clamp"}, or a sequence of them, optional
         Wrap mode of each bitmap, which Mitsuba does not tell; a ``gaussian_texture`` uses its own.
+    part : Box, optional
+        The part of the image that is measured, by default all of it. Nothing else may be seen.
 
     Returns
     -------
@@ -231,21 +290,23 @@ def visibility(
         uses.append((shapes, mi.Transform3f(scaled), getattr(node, "wrap", mode)))
         emitters = (shape.emitter() for shape in shapes)
         is_lamp |= any(e is not None and node in mi.traverse(e).hierarchy for e in emitters)
+    size, part = (width, height), part or Box(0, 0, width, height)
     lookups = [_blocks(width, height)] if is_lamp else []
     coarsest = PIXEL * max(width, height) / LAMP_BLOCKS if is_lamp else np.inf
-    footprint = np.full(height * width, coarsest, np.float32)
+    footprint = np.full(part.height * part.width, coarsest, np.float32)
     for sensor, (shapes, to_texels, wrap) in product(scene.sensors(), uses):
-        hits = trace_samples(View(scene, sensor, shapes, to_texels, wrap, (width, height)))
+        hits = trace_samples(View(scene, sensor, shapes, to_texels, wrap, size))
         if hits is None:
             continue
-        np.minimum(footprint, _min_footprint(hits, width, height), out=footprint)
-        lookups.append(_rows(hits, width, height))
+        hits = hits._replace(x=hits.x - part.left, y=hits.y - part.top)
+        np.minimum(footprint, _min_footprint(hits, part.width, part.height), out=footprint)
+        lookups.append(_rows(hits, part.width, part.height))
     if not lookups:
         raise Unsuitable(
             f"no pixel of the scene's {len(scene.sensors())} cameras sees {_name(texture)}; check "
             "where the cameras look, and what hides the texture"
         )
-    return Visibility(footprint.reshape(height, width), lookups)
+    return Visibility(footprint.reshape(part.height, part.width), lookups)
 
 
 # --- The texture in its scene --------------------------------------------------------------------

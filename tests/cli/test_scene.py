@@ -70,10 +70,111 @@ def test_several_scenes_into_a_folder(scene, tmp_path):
 
 
 def test_passes_make_one_picture(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.scene.convert.SAMPLES_PER_PASS", 8 * 6 * 2)
+    monkeypatch.setattr("eigengs_dr.scene.rendering.SAMPLES_PER_PASS", 8 * 6 * 2)
     told = said("scene", scene(), "-o", tmp_path / "x.exr", "--spp", 5)
     assert "samples per pixel: 5" in told
     assert np.allclose(mi.Bitmap(str(tmp_path / "x.exr")), 0.5)
+
+
+CAMERAS = """
+<scene version="3.0.0">
+    <integrator type="aov"><string name="aovs" value="far:depth,up:sh_normal"/>
+        <integrator type="path" name="all"/><integrator type="direct" name="once"/></integrator>
+    <sensor type="perspective" id="left"><float name="fov" value="40"/>FILM</sensor>
+    <sensor type="perspective"><float name="fov" value="40"/>FILM</sensor>
+    <shape type="sphere"><point name="center" x="0" y="0" z="4"/></shape>
+    <emitter type="constant"/>
+</scene>
+""".replace(
+    "FILM",
+    '<film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="4"/>'
+    '<string name="pixel_format" value="rgb"/></film>',
+)
+
+
+def channels_of(path):
+    """Names of the channels of a file."""
+    return [field.name for field in mi.Bitmap(str(path)).struct_()]
+
+
+def test_layers_have_their_names_and_a_depth_is_no_alpha(scene, tmp_path):
+    path = scene(text=CAMERAS)
+    name = str(tmp_path / "x.exr")
+    said("scene", path, "-o", name, *LLVM, "--spp", 2)
+    seen = dict(zip(channels_of(tmp_path / "x.exr"), np.array(mi.Bitmap(name)).T, strict=True))
+    layers = [f"once.{c}" for c in "RGB"]
+    assert {*seen} == {*"RGB", *layers, "far.T", *(f"up.{c}" for c in "XYZ")}
+    assert seen["far.T"][3, 2] == pytest.approx(3, abs=0.1)
+    assert seen["up.Z"][3, 2] == pytest.approx(-1, abs=0.1)
+    assert np.abs(seen["R"] - seen["once.R"]).max() < 0.5  # both integrators see this light
+    told = said("scene", path, "-o", tmp_path / "x.png", "--spp", 2)
+    assert "x.png, without once.R" in told and "the first of 2 cameras; --camera all" in told
+    assert mi.Bitmap(str(tmp_path / "x.png")).pixel_format() == mi.Bitmap.PixelFormat.RGB
+
+
+def test_another_integrator(scene, tmp_path):
+    """Of AOVs alone, which may be one or four; or of colours, whose parameters count."""
+    path = scene(text=CAMERAS)
+    for aovs, names in (("far:depth", ["far.T"]), ("uv:uv", ["uv.U", "uv.V"])):
+        depth = ("--integrator", f"aov,aovs={aovs}")
+        said("scene", path, "-o", tmp_path / "x.exr", *depth)
+        assert channels_of(tmp_path / "x.exr") == names
+        words = f"it shows no colours but {', '.join(names)}; write .exr"
+        assert_refused(run("scene", path, "-o", tmp_path / "x.png", *depth), path, words)
+    seen = []
+    for depth in (1, 2):
+        renderer = ("--integrator", f"path,max_depth={depth},hide_emitters=true")
+        said("scene", path, "-o", tmp_path / "x.exr", *renderer, "--spp", 4)
+        seen.append(np.array(mi.Bitmap(str(tmp_path / "x.exr"))).mean())
+    assert seen[0] == 0 and seen[1] > 0.05
+    for wrong, words in (("pathh", "pathh"), ("path,depth=1", "depth"), ("path,depth", "spp=16")):
+        command = ("scene", path, "-o", tmp_path / "x.png", "--integrator", wrong)
+        assert_refused(run(*command), words)
+
+
+def test_cameras(scene, tmp_path):
+    path = scene(text=CAMERAS.replace('value="6"', 'value="5"', 1))
+    sizes = {}
+    for name in ("left", "1", "2"):
+        told = said("scene", path, "-o", tmp_path / f"{name}.png", "--camera", name)
+        assert f"camera {'2' if name == '2' else 'left'}: " in told
+        sizes[name] = mi.Bitmap(str(tmp_path / f"{name}.png")).width()
+    assert sizes == {"left": 5, "1": 5, "2": 6}
+    said("scene", path, "-o", tmp_path / "all.exr", "--camera", "all", "--integrator", "direct")
+    assert sorted(p.name for p in tmp_path.glob("all*")) == ["all-2.exr", "all-left.exr"]
+    assert_refused(
+        run("scene", path, "-o", tmp_path / "x.png", "--camera", "3"),
+        "it has no camera 3; use all, or one of left, 2",
+    )
+
+
+def test_a_texture_follows_each_camera(scene, tmp_path):
+    """And a prefilter that is a number for another film does not blur in silence."""
+    name = save_halves(tmp_path) / "roughness.npz"
+    wall = (
+        '<shape type="rectangle"><transform name="to_world"><translate z="4"/></transform>'
+        '<bsdf type="twosided"><bsdf type="diffuse"><texture type="gaussian_texture" '
+        f'name="reflectance"><string name="filename" value="{name}"/>PREFILTER</texture></bsdf>'
+        "</bsdf></shape>"
+    )
+    pictures = []
+    for prefilter in ('<boolean name="prefilter" value="true"/>', "NUMBER"):
+        number = '<float name="prefilter" value="$angle"/>'
+        text = CAMERAS.replace('value="6"', 'value="12"', 1).replace(
+            '<shape type="sphere"><point name="center" x="0" y="0" z="4"/></shape>', wall
+        )
+        path = scene(text=text.replace("PREFILTER", prefilter.replace("NUMBER", number)))
+        for camera, width in (("left", 12), ("2", 6)):
+            angle = 2 * np.tan(np.radians(20)) / width
+            define = () if "true" in prefilter else ("-D", f"angle={angle}")
+            arguments = ("--camera", camera, "--integrator", "direct", "--spp", 4, *define)
+            said("scene", path, "-o", tmp_path / "x.exr", *arguments)
+            pictures.append(np.array(mi.Bitmap(str(tmp_path / "x.exr"))))
+    np.testing.assert_allclose(pictures[0], pictures[2], rtol=1e-5)
+    np.testing.assert_allclose(pictures[1], pictures[3], rtol=1e-5)
+    assert pictures[0].shape != pictures[1].shape
+    result = run("scene", path, "-o", tmp_path / "x.png", "-D", "angle=0.5", *LLVM)
+    assert result.exit_code == 0 and "say true, and the texture follows" in result.stderr
 
 
 BROKEN = [
@@ -147,15 +248,22 @@ def test_without_mitsuba(scene, tmp_path):
     assert "pip install 'mitsuba>=3.9,<4'" in result.stderr
 
 
-def test_convert(tmp_path):
+def test_convert(tmp_path, monkeypatch):
+    monkeypatch.setattr("eigengs_dr.scene.costs.NEGLIGIBLE", 0)  # the photo is small
     scene = sky(save_images(tmp_path))
-    settings = ("--psnr", 25, "--iterations", 5, "-D", "spp=2", *LLVM)
-    told = said("convert", scene, "-o", tmp_path / "new", *settings, "--report", tmp_path / "r")
+    settings = ("--psnr", 34, "--iterations", 5, "-D", "spp=2", *LLVM, "--report", tmp_path / "r")
+    told = said("convert", scene, "-o", tmp_path / "new", "--replace-all", *settings)
     for words in ("32x32", "(the same set)", "memory: ", "left alone: leaf.png", "camera 1: "):
         assert words in told
     report = json.loads((tmp_path / "r").read_text())
-    assert report["bytes"] < report["bytes_before"] and len(report["left"]) == 5
+    [texture] = report["textures"]
+    assert report["bytes"] == texture["gaussian_bytes"] > report["bytes_before"] == 2 * 32 * 32 * 3
+    assert report["better"] == [] and len(report["left"]) == 5
     assert (tmp_path / "new" / "scene.xml").exists()
+    told = said("convert", scene, "-o", tmp_path / "other", *settings)
+    assert "stays, the bitmap is better: photo.png (diffuse.reflectance)" in told
+    [better] = json.loads((tmp_path / "r").read_text())["better"]
+    assert better["gaussian_bytes"] == texture["gaussian_bytes"] and better["file"] == ""
     assert_refused(run("convert", scene, "-o", tmp_path / "new"), "exists and is not empty")
 
 

@@ -129,7 +129,7 @@ def test_rates_that_are_too_high_are_lowered():
         eg.fit(image, 100, 200, method=eg.DEFAULT.at_rates(factor)).psnr_ycbcr for factor in (1, 8)
     )
     start = eg.fit(image, 100, 0).psnr_ycbcr
-    assert high > start + 0.5 * (good - start)
+    assert high > start + 0.4 * (good - start)
 
 
 def test_relocation_lets_the_surplus_go_evenly():

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import correlate2d
 from skimage import color, metrics
 
-from eigengs_dr.image.color import to_coded, to_pu21
+from eigengs_dr.image.color import to_coded, to_linear, to_pu21
 from eigengs_dr.image.metrics import ms_ssim, psnr, ssim
 
 SIZES = [(1, 1), (1, 9), (2, 3), (10, 11), (12, 40), (23, 22), (45, 50)]
@@ -34,6 +34,61 @@ def test_psnr_of_equal_images_and_of_nan(rng, space):
     image = rng.random((2, 2, 3))
     assert psnr(image, image, space=space) == math.inf
     assert math.isnan(psnr(image, np.where(np.eye(2)[..., None] > 0, np.nan, image), space))
+
+
+SPACES = {
+    "rgb": lambda image: np.rint(np.clip(image, 0, 1) * 255) / 255,
+    "ycbcr": lambda image: color.rgb2ycbcr(image) / 255,
+    "data": lambda image: image,
+    "pu21": lambda image: to_pu21(to_linear(image)),
+}
+"""What `psnr` compares, by the space."""
+
+
+@pytest.mark.parametrize("layers", [0, 1, 3])
+@pytest.mark.parametrize("space", SPACES)
+def test_psnr_weighs_squared_errors_in_its_space(rng, space, layers):
+    a, b = rng.random((2, 610, 900, 3))  # of several strips
+    weight = rng.uniform(0, 7, (610, 900, layers) if layers else (610, 900))
+    weight[200:] *= rng.random(410)[(slice(None),) + (None,) * (weight.ndim - 1)] > 0.5
+    squares = np.square(SPACES[space](a) - SPACES[space](b))
+    factors = np.broadcast_to(np.atleast_3d(weight), squares.shape)
+    expected = -10 * math.log10(np.average(squares, weights=factors))
+    assert psnr(a, b, space, weight) == pytest.approx(expected, abs=1e-5)
+    a[~weight.reshape(610, 900, -1).any(axis=2)] = np.nan
+    assert psnr(a, b, space, weight) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_equal_weights_are_no_weights(rng, space):
+    a, b = rng.random((2, 30, 20, 3))
+    assert psnr(a, b, space, np.full((30, 20), 3)) == pytest.approx(psnr(a, b, space), abs=1e-6)
+    assert ssim(a, b, np.full((30, 20), 3)) == pytest.approx(ssim(a, b), abs=1e-7)
+    assert psnr(a, a, space, weight=np.ones((30, 20))) == math.inf
+
+
+def test_psnr_of_grey_images_takes_weights(rng):
+    a, b = rng.random((2, 9, 7, 1))
+    weight = rng.random((9, 7, 1)) > 0.5
+    expected = -10 * math.log10(np.square(a - b)[weight].mean())
+    assert psnr(a, b, "data", weight) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("weight", "words"),
+    [
+        (np.zeros((4, 5)), "weight is 0 for all pixels; at least one must count"),
+        (-np.eye(4, 5), "finite and at least 0"),
+        (np.full((4, 5), np.inf), "finite and at least 0"),
+        (np.ones((5, 4)), r"weight has shape \(5, 4\), but the images have 5x4 pixels"),
+        (np.ones((4, 5, 4)), r"have 3 channels; give \(H, W\), or \(H, W, 3\)"),
+        (1.0, r"weight has shape \(\); expected"),
+    ],
+)
+def test_weights_that_psnr_refuses(rng, weight, words):
+    with pytest.raises(ValueError, match=words) as error:
+        psnr(*rng.random((2, 4, 5, 3)), weight=weight)
+    assert "\n" not in str(error.value)
 
 
 def test_psnr_rgb_sees_eight_bits_only():

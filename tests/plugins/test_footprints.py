@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from _helpers.texture import at, gaussians, in_front, mi, texture
-from eigengs_dr.plugins import properties
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -32,18 +31,12 @@ def pixel():
     return np.diag(ANGLE * DISTANCE / np.array(STRETCH))
 
 
-@pytest.fixture
-def new(monkeypatch):
-    """A renderer with footprints."""
-    monkeypatch.setattr(properties, "has_footprints", lambda: True)
-
-
 def seen(tex, si):
     return np.array(tex.eval(si)).ravel()
 
 
 @pytest.mark.parametrize("angle", [0.0, 30.0])
-def test_it_sees_what_the_cone_sees(new, angle):
+def test_it_sees_what_the_cone_sees(angle):
     turn = mi.ScalarTransform4f().rotate([0, 0, 1], angle) @ mi.ScalarTransform4f().scale(0.7)
     si = interaction()
     own = texture(gaussians("linear"), prefilter=True, to_uv=turn)
@@ -61,7 +54,7 @@ def test_the_footprint_goes_before_the_angle():
     np.testing.assert_allclose(wide, seen(wider, si), rtol=1e-4)
 
 
-def test_any_two_conjugate_diameters_say_the_same(new):
+def test_any_two_conjugate_diameters_say_the_same():
     """The ellipse decides, and not the pair of diameters that span it."""
     tex, si, turn = texture(gaussians("linear"), prefilter=True), interaction(), np.radians(35)
     turned = pixel() @ [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
@@ -70,14 +63,14 @@ def test_any_two_conjugate_diameters_say_the_same(new):
 
 
 @pytest.mark.parametrize(("prefilter", "instead"), [(ANGLE, ANGLE), (True, 0.0)])
-def test_without_a_cone_the_angle_decides(new, prefilter, instead):
+def test_without_a_cone_the_angle_decides(prefilter, instead):
     """And without an angle, lookups at points."""
     own, other = (texture(gaussians("linear"), prefilter=p) for p in (prefilter, instead))
     found = seen(own, with_footprint(interaction(), np.zeros((2, 2))))
     np.testing.assert_allclose(found, seen(other, interaction()), atol=1e-4)
 
 
-def test_it_tells_the_scene(new):
+def test_it_tells_the_scene():
     g = gaussians()
     assert texture(g, prefilter=True).filtered() and texture(g, prefilter=0.1).filtered()
     assert not texture(g).filtered()

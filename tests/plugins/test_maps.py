@@ -22,6 +22,7 @@ from _helpers.texture import (
     texture,
 )
 from eigengs_dr.backend.recording import collector_off
+from eigengs_dr.image.color import to_linear
 from eigengs_dr.plugins import gaussian_texture, texture_of
 from eigengs_dr.plugins import lookup as reuse
 from eigengs_dr.plugins import parameters as files
@@ -57,6 +58,39 @@ def test_values_are_those_of_the_map_alone(file, prefilter):
             np.testing.assert_array_equal(picture(found.eval_3(si)), picture(alone.eval_3(si)))
     normals = picture(map_texture(file, "normal").eval_3(texel_centres()))
     np.testing.assert_allclose(np.linalg.norm(2 * normals - 1, axis=2), 1, atol=1e-5)
+
+
+def test_opacity_is_a_map_of_a_material(tmp_path):
+    """A leaf with a soft edge: one file gives its colour and its mask, and both have gradients."""
+    y, x = np.mgrid[:32, :32] / 32
+    albedo = np.float32(np.stack([0.3 + 0.2 * np.sin(9 * x), 0.4 + 0.3 * y, 0.2 + 0 * x], axis=2))
+    opacity = np.float32(np.clip(4 - 10 * np.hypot(x - 0.5, y - 0.5), 0, 1))
+    settings = {"gaussians": 200, "iterations": 60, "progress": False}
+    leaf = eg.fit({"albedo": albedo, "opacity": opacity}, **settings).gaussians
+    assert {m.name: m.space for m in leaf.maps} == {"albedo": "linear", "opacity": "data"}
+    leaf.save(tmp_path / "leaf.npz")
+    file = {"type": "gaussian_texture", "filename": str(tmp_path / "leaf.npz")}
+
+    def masked(albedo, opacity):
+        sided = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": albedo}}
+        return small_scene({"type": "mask", "opacity": opacity, "inner": sided}, "direct", side=24)
+
+    def bitmap(pixels):
+        data = mi.TensorXf(pixels.reshape(32, 32, -1))
+        return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
+
+    scene = masked({**file, "map": "albedo"}, {**file, "map": "opacity"})
+    seen = np.array(mi.render(scene, spp=64, seed=1))
+    shown = masked(bitmap(to_linear(albedo)), bitmap(opacity))
+    assert eg.psnr(seen.clip(0, 1), np.array(mi.render(shown, spp=64, seed=1)).clip(0, 1)) > 35
+    parameters = mi.traverse(scene)
+    keys = [key for key, _ in parameters if key.endswith(".color")]
+    assert len(keys) == 2
+    for key in keys:
+        dr.enable_grad(parameters[key])
+    parameters.update()
+    dr.backward(dr.mean(dr.square(mi.render(scene, parameters, spp=4))))
+    assert all(np.abs(np.array(dr.grad(parameters[key]))).max() > 0 for key in keys)
 
 
 def test_textures_of_a_file_share_memory_until_one_changes(file):

@@ -32,23 +32,27 @@ class TestMistakes:
             ({"wrap_mode": "bounce"}, "wrap_mode 'bounce' is unknown; use one of repeat, mirror"),
             ({"cutoff": 0.0}, "cutoff is 0.0; it must be above 0 and at most 12"),
             ({"prefilter": -1.0}, "prefilter is -1.0; it is the angle of a pixel"),
-            ({"prefiltre": 1.0}, "prefiltre"),
+            ({"prefiltre": 1.0}, "it has no property prefiltre"),
             ({"space": "cmyk"}, "space 'cmyk'"),
             ({"raw": "false"}, "raw is 'false'; it must be a boolean"),
             ({"cutoff": "wide"}, "cutoff is 'wide'; it must be a number"),
-            ({"prefilter": True}, "prefilter = true needs Mitsuba 3.10, and this is 3.9"),
-            ({"prefilter": False}, "prefilter is False; it must be a number"),
+            ({"prefilter": False}, "prefilter is False; it must be true, or the angle of a pixel"),
             ({"width": 31.5}, "width is 31.5; it must be an integer"),
         ],
     )
     def test_of_properties(self, properties, message):
-        with pytest.raises(RuntimeError, match=message):
+        with pytest.raises(RuntimeError) as caught:
             texture(gaussians(), **properties)
+        first_line = str(caught.value).splitlines()[0]
+        assert message in first_line
 
-    @pytest.mark.parametrize("channels", [2, 4])
-    def test_a_set_of_other_channels(self, channels):
-        with pytest.raises(RuntimeError, match=f"has {channels} channels; use a set of 1 or 3"):
-            texture(gaussians("data", channels=channels))
+    def test_a_set_of_other_channels(self):
+        with pytest.raises(RuntimeError, match="has 4 channels; use a set of 1 to 3"):
+            texture(gaussians("data", channels=4))
+
+    def test_heights_of_a_set_of_normals(self):
+        with pytest.raises(ValueError, match="a bump map needs heights; this set has x and y"):
+            texture(gaussians("data", channels=2)).eval_1_grad(at(0.5, 0.5))
 
     def test_an_array_that_is_missing(self):
         properties = texture_of(gaussians())

@@ -18,27 +18,48 @@ others = [
     pytest.param(name, marks=pytest.mark.slow) for name in ("llvm_ad_mono", "llvm_ad_spectral")
 ]
 
-SLOTS = ["principled", "roughplastic", "mask", "normalmap", "bumpmap", "light"]
-"""Places of a colour, a number, an average, a cut-out, a vector, slopes and a sampled light."""
+NESTED = ["principled", "roughplastic", "mask", "blend", "glass", "normals", "two", "bump"]
+"""Places of a colour, a number, an average, a cut-out, a share, a roughness, vectors and slopes."""
+
+SLOTS = [*NESTED, "light"]
+"""And a sampled light."""
 
 
-def slots(g):
-    """BSDFs with a texture in each kind of place that asks for something else, by name."""
-    colour, number = texture_of(g), texture_of(gaussians("data", channels=1))
-    normal, diffuse = texture_of(gaussians("data")), {"type": "diffuse"}
+def slots(show):
+    """BSDFs with a texture in each kind of place that asks for something else, by name.
+
+    `show` makes the texture of a set.
+    """
+    colour, number = show(gaussians("linear")), show(gaussians("data", channels=1))
+    normal, two = (show(gaussians("data", channels=channels)) for channels in (3, 2))
+    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+    both = {"first": grey, "second": {"type": "roughconductor"}}
     return {
         "principled": {"type": "principled", "base_color": colour, "roughness": number},
         "roughplastic": {"type": "roughplastic", "diffuse_reflectance": colour},
-        "mask": {"type": "mask", "opacity": number, "inner": diffuse},
-        "normalmap": {"type": "normalmap", "normalmap": normal, "inner": diffuse},
-        "bumpmap": {"type": "bumpmap", "bump": number, "scale": 3.0, "inner": diffuse},
+        "mask": {"type": "mask", "opacity": number, "inner": grey},
+        "blend": {"type": "blendbsdf", "weight": number, **both},
+        "glass": {"type": "roughdielectric", "alpha": number},
+        "normals": {"type": "normalmap", "normalmap": normal, "inner": grey},
+        "two": {"type": "normalmap", "normalmap": two, "inner": grey},
+        "bump": {"type": "bumpmap", "bump": number, "scale": 3.0, "inner": grey},
     }
 
 
-def scene_with(slot):
+def fine_bitmap(g, times=16):
+    """A bitmap of many texels that shows a set; z follows from x and y of normals."""
+    shown = eg.render(g, g.width * times, g.height * times).numpy()
+    if shown.shape[2] == 2:
+        x, y = 2 * shown[..., 0] - 1, 2 * shown[..., 1] - 1
+        z = 0.5 + 0.5 * np.sqrt(np.maximum(1 - x * x - y * y, 0))
+        shown = np.concatenate([shown, z[..., None]], axis=2)
+    return {"type": "bitmap", "data": mi.TensorXf(np.float32(shown)), "raw": True}
+
+
+def scene_with(slot, show=texture_of):
     """A scene with a texture in one kind of place."""
     if slot != "light":
-        return small_scene(slots(gaussians())[slot], "direct")
+        return small_scene(slots(show)[slot], "direct")
     radiance = texture_of(gaussians("linear"))
     if mi.is_spectral:
         radiance = {"type": "d65", "of": radiance}  # else it glows at equal energy
@@ -64,6 +85,16 @@ class TestSlots:
             gradient = np.array(dr.grad(parameters[key]))
             assert np.isfinite(gradient).all()
             assert np.abs(gradient).max() > 0, key
+
+    @pytest.mark.parametrize("name", NESTED)
+    def test_shows_what_a_bitmap_of_the_same_picture_shows(self, variant, name):
+        """Slopes of a bitmap are those of its texels, and random normals point behind a surface."""
+        seen, expected = (
+            np.array(mi.render(scene_with(name, show), spp=64, seed=1))
+            for show in (texture_of, fine_bitmap)
+        )
+        apart = np.sqrt(np.mean((seen - expected) ** 2)) / expected.mean()
+        assert apart < {"bump": 0.02, "normals": 0.02}.get(name, 5e-4)
 
     @in_all
     def test_particles_leave_it_as_paths_find_it(self, variant):

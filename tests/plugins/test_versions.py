@@ -31,7 +31,7 @@ class LaterMitsuba:
         """Register a texture that asks as C++ asks a field: for what it says to be."""
         kinds = self.FieldValueType
 
-        class Asked(create):
+        class Asked(create.made):
             def eval(self, si, active=True):
                 if self.out_type() is kinds.Float:
                     return mi.UnpolarizedSpectrum(super().eval_1(si, [], active))

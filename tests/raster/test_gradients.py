@@ -118,6 +118,15 @@ def test_reverse(backend, bits, rtol, asked, channels):
 
 
 @precisions
+def test_reverse_of_gaussians_in_thousands_of_tiles(backend, bits, rtol):
+    """A GPU adds pieces in blocks: one Gaussian has 122 pieces of 16 tiles."""
+    scene, asked = random_scene(1, 3), {"width": 200}
+    delta = upstream(image_of(scene, WIDE, asked).shape)
+    exact = numeric_gradient(lambda s: (delta * image_of(s, WIDE, asked)).sum(), scene)
+    check(reverse(scene.on(backend, bits), delta, cutoff=WIDE, **asked), exact, rtol)
+
+
+@precisions
 @asked_sizes
 def test_forward(backend, bits, rtol, asked):
     scene, direction = random_scene(2, COUNT), random_scene(3, COUNT)

@@ -9,12 +9,17 @@ import pytest
 import eigengs_dr as eg
 from _helpers.bitmap_scenes import cornell, room, save_images, sky, wall
 from _helpers.poster import mi
+from _helpers.texture import gaussians
+from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.io import load_image
+from eigengs_dr.plugins import texture_of
+from eigengs_dr.scene import costs
+from eigengs_dr.scene.rendering import pictures
 from eigengs_dr.storage.locks import lock_output
 
 pytestmark = pytest.mark.mitsuba
 
-QUICK = {"target_psnr": 30, "iterations": 20}
+QUICK = {"target_psnr": 30, "iterations": 20, "replace_all": True}
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +43,7 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
         "rough.npz": ("rough.png (principled.roughness)",),
     }
     for texture in found.textures:
-        assert texture.psnr >= 30 and texture.gaussian_bytes < texture.bytes
+        assert texture.psnr >= 30 and texture.lookup_ns > 0 and texture.gaussian_lookup_ns > 0
         saved = eg.Gaussians.load(tmp_path / "new" / texture.file)
         assert len(saved) == texture.gaussians
         assert saved.space == ("linear" if texture.file == "photo.npz" else "data")
@@ -49,6 +54,54 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
     assert pictures == {f"{k}-{n}.png" for k in ("before", "after", "difference") for n in (1, 2)}
     before, after = (load_image(tmp_path / "new" / f"{k}-1.png") for k in ("before", "after"))
     assert eg.psnr(before, after) == pytest.approx(found.psnr[0], abs=0.1)
+
+
+def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
+    """A small photo takes less memory than its Gaussians, a large gradient takes more."""
+    monkeypatch.setattr(costs, "SLOWEST", np.inf)  # a busy machine times anything
+    monkeypatch.setattr(costs, "NEGLIGIBLE", 0)  # the photo is small
+    y, x = np.mgrid[:512, :512] / 512
+    eg.save_image(folder / "soft.png", np.stack([0.2 + 0.5 * x, y * x, 0.5 + 0 * x], axis=2))
+    text = wall(folder).read_text()
+    scene = folder / "mixed.xml"
+    scene.write_text(text.replace("photo.png", "soft.png", 1))
+    settings = {"target_psnr": 34, "iterations": 20}
+    found = eg.convert_scene(scene, tmp_path / "new", **settings)
+    by_name = {t.names[0]: t for t in found.textures}
+    assert by_name["soft.png (paint.reflectance)"].bytes == 512 * 512 * 3
+    assert all(t.gaussian_bytes <= t.bytes for t in found.textures)
+    assert "photo.png (principled.base_color)" in {t.names[0] for t in found.better}
+    assert found.left == []
+    for texture in found.better:
+        assert texture.file == "" and texture.gaussian_bytes > texture.bytes
+        assert texture.psnr >= 34 and texture.gaussians > 0
+    files = {path.name for path in (tmp_path / "new").glob("*.npz")}
+    assert files == {t.file for t in found.textures}
+    assert bitmaps_in(found.scene) == len(found.better)
+
+
+def test_which_bitmap_is_better():
+    """One that takes less memory, or an eighth of the time."""
+    small, large = costs.Cost(100_000, 10.0), costs.Cost(200_000, 10.0)
+    assert small.is_better_than(large) and not small.is_better_than(small)
+    assert not small.is_better_than(small._replace(bytes=101_000))
+    assert not large.is_better_than(small._replace(nanoseconds=79.0))
+    assert large.is_better_than(small._replace(nanoseconds=81.0))
+
+
+@pytest.mark.parametrize("kind", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_costs_of_data_and_colours_in_other_variants(folder, kind):
+    mi.set_variant(kind)
+    eg.register_plugins()
+    for file, raw, channels, space in (
+        ("photo.png", False, 3, "linear"),
+        ("rough.png", True, 1, "data"),
+        ("normals.png", True, 3, "data"),
+    ):
+        bitmap = mi.load_dict({"type": "bitmap", "filename": str(folder / file), "raw": raw})
+        set_of = mi.load_dict(texture_of(gaussians(space, channels)))
+        for cost in costs.costs_of([[bitmap], [set_of, set_of]], raw, channels):
+            assert cost.bytes > 0 and 0 < cost.nanoseconds < 1e9
 
 
 def test_what_stays_and_why(folder, tmp_path):
@@ -79,13 +132,47 @@ def test_renderings_that_miss_the_goal_are_named(folder, tmp_path):
 
 
 def test_a_dictionary_with_a_mesh_and_a_bump_map_that_stays(folder, tmp_path):
-    """Cameras see its slopes: Gaussians of 40 dB in heights left 26 dB between the renderings."""
+    """A cube shows the facets of 32 x 32 texels, which no Gaussians have."""
     found = eg.convert_scene(room(mi, folder), tmp_path / "new", spp=2, **QUICK)
     assert {t.file for t in found.textures} == {"photo.npz"}
-    assert any("slopes" in reason for _, reason in found.left)
+    assert dict(found.left)["rough.png (bsdf.arbitrary)"].startswith(
+        "heights of a bump map: the renderings keep "
+    )
     scene = mi.load_file(str(found.scene))
     assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
     assert "cube.ply" in found.scene.read_text()
+    assert not (tmp_path / "new" / "rough.npz").exists()
+
+
+def bumpy(folder, name, **settings):
+    """A wall with soft waves of 128 x 128 texels, which a camera sees at 24 x 24 pixels."""
+    y, x = np.mgrid[:128, :128] / 128
+    waves = 0.5 + 0.3 * np.sin(20 * x + 3 * np.sin(9 * y))
+    eg.save_image(folder / name, waves)
+    bump = {"type": "bitmap", "filename": str(folder / name), "wrap_mode": "clamp", **settings}
+    bump = {"type": "bumpmap", "arbitrary": bump, "bsdf": {"type": "diffuse"}}
+    light = {"type": "point", "position": [2, 2, 2], "intensity": 8.0}
+    wall = {"type": "rectangle", "bsdf": bump}
+    return {**room(mi, folder), "cube": wall, "lamp": light}
+
+
+@pytest.mark.parametrize("raw", [True, False])
+def test_a_bump_map_that_keeps_the_renderings_alike(folder, tmp_path, raw):
+    scene = bumpy(folder, "waves.png", raw=raw)
+    settings = {"target_psnr": 36, "iterations": 40, "spp": 64, "replace_all": True}
+    found = eg.convert_scene(scene, tmp_path / "new", **settings)
+    [waves] = found.textures
+    assert found.left == [] and waves.names == ("waves.png (bsdf.arbitrary)",)
+    assert 36 <= waves.psnr == pytest.approx(found.psnr[0], abs=0.5) and waves.gaussians < 1000
+    flat = {**scene, "cube": {"type": "rectangle", "bsdf": {"type": "diffuse"}}}
+    seen, smooth = (pictures(mi.load_dict(s), 64)[0] for s in (scene, flat))
+    assert eg.psnr(seen, smooth) < 26  # without its bumps
+
+
+def test_a_bump_map_without_renderings_stays(folder, tmp_path):
+    found = eg.convert_scene(bumpy(folder, "waves.png"), tmp_path / "new", spp=0, **QUICK)
+    [(_, reason)] = found.left
+    assert found.textures == [] and "renderings decide, and none is wanted" in reason
 
 
 def test_nothing_is_rendered_on_request(folder, tmp_path):
@@ -166,7 +253,7 @@ def test_pixels_in_memory(folder, tmp_path, kind):
     photo = {"type": "bitmap", "raw": True, "wrap_mode": "clamp", **given}
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.8, np.float32))}
     scene = plain(mi, folder, photo, lamp=sky)
-    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=30, iterations=20)
+    found = eg.convert_scene(scene, tmp_path / "new", **QUICK)
     [texture] = found.textures
     assert texture.names == ("a bitmap in memory (bsdf.reflectance)",)
     assert eg.Gaussians.load(tmp_path / "new" / texture.file).space == "linear"
@@ -185,7 +272,7 @@ def test_a_lamp_above_1_also_lights_by_what_is_hidden(folder, tmp_path):
     lamp = {"type": "rectangle", "emitter": {"type": "area", "radiance": picture}}
     board = {"type": "rectangle", "to_world": at.translate([1, 0, 0.5])}
     scene = plain(mi, folder, {"type": "rgb", "value": 0.5}, lamp=lamp, cube=board)
-    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=32, iterations=20, spp=256)
+    found = eg.convert_scene(scene, tmp_path / "new", spp=256, **QUICK)
     [texture] = found.textures
     assert found.left == [] and min(found.psnr) > 30
     saved = eg.Gaussians.load(tmp_path / "new" / texture.file)
@@ -207,7 +294,7 @@ def test_a_soft_mask_and_what_shows_through_it(folder, tmp_path):
         "bsdf": {"type": "mask", "opacity": veil, "bsdf": grey},
     }
     scene = plain(mi, folder, photo, curtain=curtain)
-    found = eg.convert_scene(scene, tmp_path / "new", target_psnr=32, iterations=20)
+    found = eg.convert_scene(scene, tmp_path / "new", **QUICK)
     assert found.left == []
     assert {t.file for t in found.textures} == {"photo.npz", "veil.npz"}
     assert min(found.psnr) > 31
@@ -221,6 +308,72 @@ def test_meshes_in_memory_are_refused(folder, tmp_path):
         "type": "rectangle",
         "bsdf": {"type": "mask", "opacity": veil, "bsdf": {"type": "diffuse"}},
     }
-    with pytest.raises(ValueError, match=r"cannot be written as XML .*; give meshes by files"):
+    with pytest.raises(
+        ValueError, match=r"cannot be written as XML .*; give meshes and volumes by files"
+    ):
         eg.convert_scene(scene, tmp_path / "new", spp=0, **QUICK)
     assert not list(tmp_path.iterdir())
+
+
+def test_files_are_found_as_mitsuba_finds_them(folder, tmp_path):
+    """In the folders of <path>, beside the scene, and beside the file that a link names."""
+    parts = tmp_path / "scenes" / "parts"
+    parts.mkdir(parents=True)
+    for name in ("photo.png", "normals.png", "rough.png"):
+        shutil.copy(folder / name, parts)
+    shutil.copy(folder / "normals.png", tmp_path / "scenes" / "photo.png")  # the path goes first
+    text = wall(folder).read_text().replace("<integrator", '<path value="parts"/><integrator')
+    scene = tmp_path / "scenes" / "wall.xml"
+    scene.write_text(text)
+    before = list(mi.file_resolver())
+    found = eg.convert_scene(scene, tmp_path / "new", spp=1, **QUICK)
+    assert list(mi.file_resolver()) == before
+    [photo] = [t for t in found.textures if t.file == "photo.npz"]
+    seen = eg.render(eg.Gaussians.load(tmp_path / "new" / photo.file)).numpy().mean(axis=(0, 1))
+    expected = np.array(mi.Bitmap(str(folder / "photo.png")).convert(srgb_gamma=False))
+    assert seen == pytest.approx((expected / 255).mean(axis=(0, 1)), abs=0.1)
+    assert np.array(mi.render(mi.load_file(str(found.scene)), spp=1)).mean() > 0
+    link = tmp_path / "link.xml"
+    link.symlink_to(scene)
+    eg.convert_scene(link, tmp_path / "other", spp=0, target_psnr=20, iterations=1)
+
+
+def test_a_dictionary_with_resources_and_no_integrator(folder, tmp_path):
+    scene = plain(mi, folder, {"type": "bitmap", "filename": "photo.png"})
+    scene = {"parts": {"type": "resources", "path": str(folder)}, **scene}
+    del scene["integrator"]
+    found = eg.convert_scene(scene, tmp_path / "new", **QUICK)
+    assert len(found.textures) == 1 and min(found.psnr) > 25
+
+
+@pytest.mark.parametrize("name", ["wood.<UDIM>.png", "wood.%(UDIM)d.png"])
+def test_tiles_are_named(folder, tmp_path, name):
+    scene = plain(mi, folder, {"type": "bitmap", "filename": name})
+    with pytest.raises(ValueError, match="stands for UDIM tiles, and Mitsuba reads one image"):
+        eg.convert_scene(scene, tmp_path / "new")
+
+
+def sets_in_memory():
+    """Textures that a dictionary may hold: a set, one of one channel, and a model."""
+    model = {"type": "gaussian_texture", "model": str(SHIPPED["natural"])}
+    some = np.random.default_rng(1).normal(0, 2, (3, 230)).astype(np.float32)
+    turned = mi.Transform4f().rotate([0, 0, 1], 20)
+    return [
+        texture_of(gaussians("linear"), wrap_mode="mirror", to_uv=turned),
+        texture_of(gaussians("data", channels=1)),
+        {**model, "coefficients": mi.TensorXf(some)},
+        model,
+    ]
+
+
+@pytest.mark.parametrize("kind", range(4))
+def test_sets_that_are_there_already_stay(folder, tmp_path, kind):
+    """Beside bitmaps that become sets; the scene of the caller still works."""
+    scene = plain(mi, folder, sets_in_memory()[kind])
+    found = eg.convert_scene(scene, tmp_path / "new", spp=4)
+    assert found.textures == [] and found.psnr[0] > 80
+    moved = (tmp_path / "new").rename(tmp_path / "moved")
+    if "filename" in (moved / "scene.xml").read_text():
+        again = mi.render(mi.load_file(str(moved / "scene.xml")), spp=4)
+        assert np.isfinite(np.array(again)).all()
+    mi.load_dict(scene)

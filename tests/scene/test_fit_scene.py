@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.ndimage import gaussian_filter, laplace
+from scipy.ndimage import gaussian_filter, laplace, zoom
 from scipy.sparse import csr_array
 
 import eigengs_dr as eg
@@ -86,10 +86,10 @@ class TestTarget:
         assert target.min() >= 0 and target.max() <= 1
 
 
-def seen_by_a_renderer(found, place, image):
+def seen_by_a_renderer(found, place, image, target=(0, 0, 0)):
     """PSNR of the albedo, as Mitsuba renders it, of the set against the image."""
     textures = texture_of(found.gaussians, wrap_mode="clamp"), bitmap(to_linear(image))
-    a, b = (albedo(scene_of(camera(place), texture=t)) for t in textures)
+    a, b = (albedo(scene_of(camera(place, target=target), texture=t)) for t in textures)
     return eg.psnr(to_coded(a.clip(0, 1)), to_coded(b.clip(0, 1)))
 
 
@@ -131,7 +131,7 @@ class TestFit:
 
     def test_texels_beyond_what_cameras_resolve_change_nothing(self):
         more = np.kron(photo(), np.ones((4, 4, 1), np.float32))
-        cameras = [camera([0, 0, distance]) for distance in (6.0, 6.5, 7.0)]
+        cameras = [camera([0, 0, distance]) for distance in np.linspace(6, 7.5, 7)]
         few, many = ([fitted(c, image=x) for c in cameras] for x in (photo(), more))
         assert {(found.gaussians.width, found.gaussians.height) for found in many} == {(192, 192)}
         # With few Gaussians a fit is a matter of rounding, so of several the mean counts.
@@ -148,6 +148,23 @@ class TestFit:
         assert len(half.gaussians) < 0.75 * len(whole.gaussians)
         assert half.gaussians.to_arrays()["mean"][:, 0].max() < 30
         assert half.visibility.seen.shape == (48, 48)
+
+    def test_only_what_is_seen_is_enlarged(self, monkeypatch):
+        """A camera so close to a corner that a pixel is less than two texels."""
+        enlarged = []
+
+        def counted(values, factors, **settings):
+            enlarged.append(values.shape[:2])
+            return zoom(values, factors, **settings)
+
+        monkeypatch.setattr(scenefit, "zoom", counted)
+        close = camera([0.7, 0.6, 0.4], target=[0.7, 0.6, 0])
+        found = fitted(close)
+        [(height, width)] = enlarged
+        rows, columns = np.nonzero(found.visibility.seen)
+        assert height <= np.ptp(rows) + 3 < 24 and width <= np.ptp(columns) + 3 < 24
+        assert min(found.psnr) >= BOUND
+        assert seen_by_a_renderer(found, [0.7, 0.6, 0.4], photo(), [0.7, 0.6, 0]) > BOUND - 1
 
     def test_every_camera_is_content(self):
         found = fitted(camera([0, 0, 5.0]), camera([3, 0, 4.0]))

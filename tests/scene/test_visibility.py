@@ -20,7 +20,7 @@ from _helpers.poster import (
 from _helpers.sets import random_scene
 from eigengs_dr.plugins import texture_of
 from eigengs_dr.plugins.cone import PIXEL
-from eigengs_dr.scene.visibility import visibility
+from eigengs_dr.scene.visibility import Box, visibility
 
 pytestmark = pytest.mark.mitsuba
 
@@ -67,6 +67,18 @@ class TestSeen:
         found = seen_by(camera([0, 0, 4.0]), board=board(0.0, 1.5))
         assert found.seen[:, :15].all()
         assert not found.seen[:, 18:].any()
+
+    def test_of_a_part_it_is_that_of_the_whole_there(self):
+        scene = scene_of(camera([0.6, 0.5, 0.8], target=[0.6, 0.5, 0]))
+        whole = visibility(scene, NAME, TEXELS, TEXELS)
+        row, column = np.nonzero(whole.seen)
+        box = Box(column.min(), row.min(), np.ptp(column) + 1, np.ptp(row) + 1)
+        assert box.width < TEXELS and box.height < TEXELS
+        part = visibility(scene, NAME, TEXELS, TEXELS, part=box)
+        np.testing.assert_array_equal(part.footprint, box.of(whole.footprint))
+        texels = box.of(np.arange(TEXELS**2).reshape(TEXELS, TEXELS)).ravel()
+        both = (part.pixel_to_texel[0], whole.pixel_to_texel[0][:, texels])
+        assert abs(both[0] - both[1]).max() < 1e-5
 
     def test_a_crop_is_all_of_a_film(self):
         crop = {"crop_width": SIDE // 2, "crop_height": SIDE, "crop_offset_y": 0}

@@ -24,7 +24,16 @@ from ...backend.detail import sorting_index
 from ...backend.recording import record
 from ...backend.types import Bool, FloatLike, UInt
 from ..evaluate import is_steep
-from .tiles import TILE, Grid, GridArrays, for_each_row, for_each_tile, granularity_of
+from .tiles import (
+    TILE,
+    Grid,
+    GridArrays,
+    for_each_row,
+    for_each_tile,
+    granularity_of,
+    tile_columns,
+    tile_rows,
+)
 
 MAX_LIST_ENTRIES = 1 << 28
 """Largest number of entries in the lists of all tiles; they take 4 GiB while they are built."""
@@ -171,8 +180,8 @@ def build_lists(
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
     share = granularity_of(types)
     touched, totals = _count_tiles(shape, radius, wide, sizes, pad)
-    entries, steep = int(totals[0]) % (1 << 40), int(totals[0]) >= 1 << 40
-    steep = steep or not share.products or grid.tile[0] != TILE[0]
+    narrow, entries = divmod(int(totals[0]), 1 << 40)  # one copy to the host
+    steep = narrow > 0 or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
         raise ValueError(
             f"{dr.width(touched)} Gaussians touch {entries} tiles, the limit is "
@@ -283,9 +292,12 @@ def _list_tiles(
     start, first = types.UInt(before), types.UInt(before >> 32)
     last = start + touched
     dr.schedule(first, last)
-    tile = _emit_tiles(types, shape, radius, grid, pad, image, (start, last), capacity[0])
-    cut = _cut(types, (start, last), (first, number), capacity[1]) if capacity[1] else None
-    return tile, last, cut
+    by_entry = granularity_of(types).block > 0
+    emit, cut = (_find_tiles, _find_cut) if by_entry else (_emit_tiles, _cut)
+    tile = emit(types, shape, radius, grid, pad, image, (start, last), capacity[0])
+    dr.schedule(tile)
+    pieces = cut(types, (start, last), (first, number), capacity[1]) if capacity[1] else None
+    return tile, last, pieces
 
 
 def _emit_tiles(
@@ -312,6 +324,52 @@ def _emit_tiles(
 
     dr.schedule(for_each_tile(shape, radius, grid, emit, start, pad=pad, label="list tiles"), tiles)
     return tiles
+
+
+def _find_tiles(
+    types: ArrayTypes,
+    shape: list,
+    radius: FloatLike,
+    grid: GridArrays,
+    pad: FloatLike,
+    image: UInt | None,
+    slots: tuple[UInt, UInt],
+    capacity: int,
+) -> UInt:
+    """Return the tiles of `_emit_tiles` with a lane for each, which walks the rows of its Gaussian.
+
+    With a lane for each Gaussian, and one that adds all of its pieces, a GPU waits for the largest
+    one: a fit of 2048x2048 pixels and 320,000 Gaussians took 5.7 s instead of 1.1 s (H200).
+    """
+    start, last = slots
+    i, count = dr.arange(types.UInt, capacity), dr.opaque(types.UInt, dr.width(last))
+    dr.eval(start, last)
+    owner = _search(count, last, i + 1)
+    real = owner < count
+    own = [dr.gather(types.Float, row, owner, real) for row in shape]
+    pad = pad if dr.width(pad) == 1 else dr.gather(types.Float, pad, owner, real)
+    row, stop = tile_rows(own, radius, grid, pad)
+
+    def visit(row: UInt, left: UInt, tile: UInt) -> tuple:
+        first, last = tile_columns(own, radius, grid, row, pad)
+        inside = dr.maximum(last - first, 0)
+        here = left < inside
+        tile = dr.select(here, row * grid.nx + first + left, tile)
+        return dr.select(here, stop, row + 1), left - inside, tile
+
+    left = types.Int(i - dr.gather(types.UInt, start, owner, real))
+    tile = dr.while_loop(
+        (dr.select(real, row, stop), left, types.Int(-1)),
+        lambda row, left, tile: row < stop,
+        visit,
+        label="find tiles",
+        max_iterations=-1,
+    )[-1]
+    # Rounding could let the two walks differ by a tile in different programs.
+    first = types.UInt(0)
+    if grid.image is not None and image is not None:
+        first = dr.gather(types.UInt, image, owner, real) * grid.image.divisor
+    return dr.select(tile < 0, types.UInt(0), types.UInt(tile) + first)
 
 
 def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[UInt, UInt, UInt]:
@@ -362,6 +420,25 @@ def _cut(types: ArrayTypes, tiles: tuple, slots: tuple, capacity: int) -> tuple:
 
     done = dr.while_loop((first, start), lambda i, at: i < stop, write, label="cut pieces")
     dr.eval(done, splat, begin, end)
+    return splat, begin, end, first, number
+
+
+def _find_cut(types: ArrayTypes, tiles: tuple, slots: tuple, capacity: int) -> tuple:
+    """Return the pieces of `_cut` with a lane for each."""
+    (start, last), (first, number) = tiles, slots
+    i, count = dr.arange(types.UInt, capacity), dr.opaque(types.UInt, dr.width(number))
+    stop = first + number
+    length = (last - start + number - 1) // dr.maximum(number, 1)
+    dr.eval(stop, length, first)
+    owner = _search(count, stop, i + 1)
+    real = owner < count
+    at, size, end, before = (
+        dr.gather(types.UInt, v, owner, real) for v in (start, length, last, first)
+    )
+    begin = dr.fma(i - before, size, at)
+    splat = dr.select(real, owner, 0)
+    begin, end = dr.select(real, begin, 0), dr.select(real, dr.minimum(begin + size, end), 0)
+    dr.eval(splat, begin, end)
     return splat, begin, end, first, number
 
 
@@ -466,11 +543,11 @@ def _sort_stably(key: UInt, value: UInt, bits: int) -> tuple[UInt, UInt]:
 def _search(size: UInt, values: UInt, bound: UInt) -> UInt:
     """Return how many of the first `size` values, which ascend, are below each bound.
 
-    The steps depend on the number of bits of the width only, so that few programs serve all sizes;
-    `drjit.binary_search` has the size in its program.
+    The steps depend on the number of bits of the width only, rounded up, so that few programs serve
+    all sizes; `drjit.binary_search` has the size in its program.
     """
     UInt, found = type(values), dr.zeros(type(values), dr.width(bound))
-    for bit in reversed(range(dr.width(values).bit_length())):
+    for bit in reversed(range(-(-dr.width(values).bit_length() // 4) * 4)):
         index = found + (1 << bit)
         valid = index <= size
         below = dr.gather(UInt, values, index - 1, valid) < bound

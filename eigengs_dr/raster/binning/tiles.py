@@ -36,6 +36,10 @@ class Granularity(NamedTuple):
     products : bool
         Whether weights along a row continue one exponential by products, where that is accurate. On
         a GPU an exponential is one instruction, and products would cost more.
+    block : int
+        Where a Gaussian that covers the image would keep one lane busy while all others wait, as on
+        a GPU: the number of pieces whose results one lane adds, before another adds these blocks.
+        Lists then have a lane for each entry. With 0, one lane lists and adds all of a Gaussian.
     """
 
     rows: int
@@ -43,6 +47,7 @@ class Granularity(NamedTuple):
     long_visits: int
     ordered: bool
     products: bool
+    block: int
 
     def visits_for(self, entries: int, tiles: int) -> int:
         """Return the largest number of tiles of a lane, for the lists of an image of some tiles."""
@@ -57,10 +62,10 @@ SMALL = 1 << 12
 """Most tiles of an image, 256x256 pixels, that takes `Granularity.visits` whatever its lists. In a
 batch the number may not depend on the lists of other images: it decides in which order sums run."""
 
-ON_CPU = Granularity(rows=4, visits=16, long_visits=64, ordered=True, products=True)
+ON_CPU = Granularity(rows=4, visits=16, long_visits=64, ordered=True, products=True, block=0)
 """On llvm a lane shares the parameters of a Gaussian among 16 pixels."""
 
-ON_GPU = Granularity(rows=1, visits=16, long_visits=16, ordered=False, products=False)
+ON_GPU = Granularity(rows=1, visits=16, long_visits=16, ordered=False, products=False, block=64)
 """On a GPU more lanes with fewer registers hide the latency of memory."""
 
 

@@ -1,0 +1,167 @@
+"""Renderings of a scene by its cameras: in passes, with the names of their channels, compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..image.color import to_coded
+from ..image.io import save_image
+from ..image.metrics import psnr
+from ..plugins.follow import follow_where_asked
+
+Progress = Callable[[str, int, int], None]
+"""``progress(label, done, total)``."""
+
+SAMPLES_PER_PASS = 1 << 24
+"""Most samples in one pass. The state of a sample takes some 20 bytes; progress and Ctrl-C wait
+for the end of a pass."""
+
+
+class Rendering(NamedTuple):
+    """What a camera sees.
+
+    Attributes
+    ----------
+    pixels : ndarray of float32, shape (H, W, C)
+        Linear light, and the channels of AOVs.
+    channels : tuple of C str
+        Their names, as in an EXR file: R, G, B and A or Y and A, then those of layers and AOVs,
+        such as "direct.R" and "distance.T".
+    spp : int
+        Samples per pixel.
+    """
+
+    pixels: NDArray[np.float32]
+    channels: tuple[str, ...]
+    spp: int
+
+    def picture(self, names: str = "RGBA") -> NDArray[np.float32]:
+        """Return colours, shape (H, W, 1 to 4): those of the names, or Y for R, G and B.
+
+        A depth is no alpha: a channel counts by its name, not by its place.
+        """
+        wanted = [*names] if "R" in self.channels else ["Y", *names[3:]]
+        kept = [self.channels.index(name) for name in wanted if name in self.channels]
+        return np.ascontiguousarray(self.pixels[..., kept])
+
+
+def render_in_passes(
+    scene: mi.Scene,
+    camera: int,
+    spp: int | None,
+    show: Callable[[int, int], None] = lambda *_: None,
+    integrator: mi.Integrator | None = None,
+) -> Rendering:
+    """Render a scene by one of its cameras; each pass has its own seed.
+
+    Textures whose prefilter is ``true`` follow the camera.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+    camera : int
+    spp : int or None
+        Samples per pixel, by default those of the camera.
+    show : callable, optional
+        ``show(done, total)`` after each pass, in samples per pixel.
+    integrator : mitsuba.Integrator, optional
+        By default that of the scene.
+
+    Warns
+    -----
+    UserWarning
+        If the prefilter of a texture is a number that does not fit the camera.
+    """
+    sensor = scene.sensors()[camera]
+    follow_where_asked(scene, sensor)
+    width, height = sensor.film().crop_size()
+    total = spp or sensor.sampler().sample_count()
+    most = max(1, SAMPLES_PER_PASS // (width * height))
+    pixels: NDArray[np.float64] = np.zeros(())
+    done = 0
+    while done < total:
+        count = min(most, total - done)
+        part = mi.render(scene, sensor=camera, integrator=integrator, spp=count, seed=done)
+        pixels = pixels + count * np.array(part, np.float64)
+        done += count
+        show(done, total)
+    names = _channels(sensor.film(), integrator or scene.integrator(), pixels.shape[-1])
+    return Rendering((pixels / total).astype(np.float32), tuple(names), total)
+
+
+def _channels(film: mi.Film, integrator: mi.Integrator, count: int) -> list[str]:
+    """Name the channels of a rendering.
+
+    Mitsuba's integrator ``aov`` returns the channels of the film once for each integrator inside,
+    then the AOVs; its names have four channels for each, after those of the film. The first layer
+    is the picture, and has the names of the film.
+    """
+    names, aovs = [field.name for field in film.bitmap().struct_()], integrator.aov_names()
+    if len(names) == count:
+        return names
+    plain = names[: len(names) - len(aovs)]
+    inside = {name[:-2]: None for name in aovs if name.endswith(".A")}
+    layers = [f"{layer}.{name}" for layer in inside for name in plain]
+    others = [name for name in aovs if name[:-2] not in inside]
+    found = [*(plain if inside else []), *layers[len(plain) :], *others]
+    return found if len(found) == count else [f"channel.{k}" for k in range(count)]
+
+
+LOUDER = 8.0
+"""Factor of the differences in their pictures."""
+
+
+def compare(
+    before: Sequence[NDArray[np.float32]], after: Sequence[NDArray[np.float32]], folder: Path
+) -> list[float]:
+    """Compare the pictures of each camera, from `pictures`, and write them.
+
+    Parameters
+    ----------
+    before, after : sequence of ndarray of float32, shape (H, W, 3) or (H, W, 1)
+    folder : Path
+        Gets before-1.png, after-1.png and difference-1.png, 8 times louder, and so on.
+
+    Returns
+    -------
+    list of float
+        psnr_rgb in dB for each camera.
+    """
+    for number, pair in enumerate(zip(before, after, strict=True), 1):
+        loud = np.clip(LOUDER * np.abs(pair[0] - pair[1]), 0, 1)
+        for name, picture in zip(("before", "after", "difference"), (*pair, loud), strict=True):
+            save_image(folder / f"{name}-{number}.png", picture)
+    return [psnr(*pair) for pair in zip(before, after, strict=True)]
+
+
+def pictures(scene: mi.Scene, spp: int | None) -> list[NDArray[np.float32]]:
+    """Render a scene by each camera in sRGB; equal scenes have the same random numbers.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+        Without an integrator, "path" renders it.
+    spp : int or None
+        Samples per pixel, by default those of the camera.
+
+    Returns
+    -------
+    list of ndarray of float32, shape (H, W, 3) or (H, W, 1)
+    """
+    return [_picture(scene, number, spp) for number in range(len(scene.sensors()))]
+
+
+def _picture(scene: mi.Scene, camera: int, spp: int | None) -> NDArray[np.float32]:
+    """Render a scene by a camera in sRGB."""
+    renderer = scene.integrator() or mi.load_dict({"type": "path"})
+    rendering = render_in_passes(scene, camera, spp, integrator=renderer)
+    light = rendering.picture("RGB")
+    if not light.size:  # a renderer of AOVs alone
+        light = rendering.pixels[..., :1]
+    return np.clip(to_coded(np.maximum(light, 0)), 0, 1).astype(np.float32)

@@ -1,0 +1,78 @@
+"""Textures that follow a sensor: footprints of its pixels, whatever its film and field of view."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from eigengs_dr.backend.messages import warn
+
+from .cone import pixel_angle
+from .versions import Texture, texture_class
+
+CLOSE = 1.25
+"""Ratio of a prefilter to the angle of a pixel that nobody sees."""
+
+
+def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
+    """Set the prefilter of all Gaussian textures of a scene to the pixels of a sensor.
+
+    The textures follow the sensor: each rendering reads its field of view and the size of its film,
+    so that a change of either changes the prefilter. A number that is written to the parameter
+    ``prefilter`` of a texture ends that.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+    sensor : mitsuba.Sensor or int, optional
+        A ``perspective`` or ``thinlens`` sensor, or its number in the scene. Call the function
+        again before another sensor renders.
+
+    Raises
+    ------
+    ValueError
+        If the sensor has no field of view.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg, mitsuba as mi
+    >>> from eigengs_dr.plugins import follow, texture_of
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> bsdf = {"type": "diffuse", "reflectance": texture_of(g)}
+    >>> wall = {"type": "rectangle", "bsdf": bsdf}
+    >>> scene = mi.load_dict({"type": "scene", "wall": wall, "sensor": {"type": "perspective"}})
+    >>> follow(scene)
+    """
+    for texture in gaussian_textures(scene):
+        texture.follow(sensor_of(scene, sensor))
+
+
+def follow_where_asked(scene: mi.Scene, sensor: mi.Sensor | int) -> None:
+    """Let the textures whose prefilter is ``true`` follow a sensor, as `follow` does.
+
+    Warns
+    -----
+    UserWarning
+        If the prefilter of another texture is a number that is not the angle of a pixel.
+    """
+    sensor = sensor_of(scene, sensor)
+    for texture in gaussian_textures(scene):
+        if texture.follows:
+            texture.follow(sensor)
+        elif texture.angle and "x_fov" in mi.traverse(sensor):
+            angle = pixel_angle(sensor)
+            if not 1 / CLOSE < texture.angle / angle < CLOSE:
+                warn(
+                    f"prefilter is {texture.angle:.3g} and a pixel of the camera {angle:.3g}; "
+                    "say true, and the texture follows the camera"
+                )
+
+
+def sensor_of(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
+    """Return a sensor, or that of a number in the scene."""
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def gaussian_textures(scene: mi.Scene) -> list[Texture]:
+    """Return the Gaussian textures of a scene."""
+    nodes = mi.traverse(scene).hierarchy
+    return [n for n in nodes if isinstance(n, texture_class()) and hasattr(n, "follow")]

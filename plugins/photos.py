@@ -1,0 +1,200 @@
+"""Photos of a scene as a loss: which textures of the scene look like them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from eigengs_dr.fitting.loss import Loss
+
+JUDGED = 4
+"""Photos with held-out pixels, spread over all."""
+
+MANY_PHOTOS = 12
+"""Photos from which on some pixels are held out by default. With three, a held-out pixel leaves a
+hole in the texture that no other photo sees, and the number that suits holes is far too small."""
+
+HELD_OUT = 0.2
+"""Share of the pixels of a judged photo that are held out by default."""
+
+JUDGE_SAMPLES = 2
+"""Samples of a held-out pixel in each of two renderings, as a multiple of those of a step. The
+product of the differences of two independent renderings to a photo has the squared error of their
+mean as its mean, without the noise of renderings."""
+
+
+def photo_loss(
+    scene: mi.Scene,
+    pictures: str | Mapping[str, str],
+    photos: Sequence[ArrayLike],
+    *,
+    sensors: Sequence[mi.Sensor | int] | None = None,
+    integrator: mi.Integrator | None = None,
+    spp: int = 4,
+    held_out: float | None = None,
+    bounds: tuple[float, float] | None = (0.0, 1.0),
+    parameters: Any = None,
+    seed: int = 0,
+) -> Loss:
+    """Return the squared error of renderings against photos, for `eigengs_dr.fit`.
+
+    A step puts the picture into the scene as texels, and renders one photo after another. So it
+    costs what a step of texels costs. With many photos, some pixels are held out: their error is
+    the ``loss`` of the trace, and says how many Gaussians the scene needs.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+        Its bitmaps get the pictures, of any size; the last one stays in the scene.
+    pictures : str or mapping of str to str
+        The bitmap that is looked for, as `mitsuba.traverse` names it, such as
+        ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
+        are those of ``space`` of `eigengs_dr.fit`. Bitmaps need ``raw: true`` for linear light.
+    photos : sequence of array_like, shape (H, W, 3)
+        Linear light, each of the size of the film of its sensor.
+    sensors : sequence of sensors or numbers, optional
+        One for each photo, by default the first ones of the scene.
+    integrator : mitsuba.Integrator, optional
+        By default that of the scene.
+    spp : int, optional
+        Samples a pixel of a step.
+    held_out : float, optional
+        Share of the pixels of four photos that no step sees, in [0, 1). With 0, the trace has the
+        error of the first photo, and the number of Gaussians is not chosen. By default 0.2 with 12
+        photos or more, and 0 with fewer.
+    bounds : (float, float), optional
+        See `eigengs_dr.Loss`.
+    parameters : optimiser, optional
+        Of other parameters of the scene, by their names there, see `eigengs_dr.Loss`. A
+        `mitsuba.ad.Adam` with the key ``"lamp.emitter.radiance.value"`` looks for a light, say.
+    seed : int, optional
+        Seed of the renderings and of the choice of the pixels.
+
+    Returns
+    -------
+    Loss
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown, or photos and sensors do not fit together.
+
+    Notes
+    -----
+    Renderings of few samples are noisy. `mitsuba.render` gives the derivatives other random numbers
+    than the picture, so that their product has the right mean.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg, mitsuba as mi, numpy as np
+    >>> from eigengs_dr.plugins import photo_loss
+    >>> grey = {"type": "bitmap", "data": mi.TensorXf(np.full((8, 8, 3), 0.5)), "raw": True}
+    >>> scene = mi.load_dict({
+    ...     "type": "scene", "integrator": {"type": "direct"}, "light": {"type": "constant"},
+    ...     "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 16, "height": 16,
+    ...         "pixel_format": "rgb", "rfilter": {"type": "box"}},
+    ...         "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])},
+    ...     "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": grey}}})
+    >>> photo = 1.2 * mi.render(scene, spp=64).numpy()
+    >>> loss = photo_loss(scene, "wall.bsdf.reflectance", [photo])
+    >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40, space="linear")
+    """
+    known = mi.traverse(scene)
+    keys = dict(pictures) if isinstance(pictures, Mapping) else {"": pictures}
+    keys = {name: _data_of(known, key) for name, key in keys.items()}
+    chosen = list(range(len(photos)) if sensors is None else sensors)
+    if len(chosen) != len(photos) or not photos:
+        raise ValueError(f"photo_loss: {len(photos)} photos, but {len(chosen)} sensors")
+    if sensors is None and len(photos) > len(scene.sensors()):
+        raise ValueError(
+            f"photo_loss: {len(photos)} photos, but the scene has {len(scene.sensors())} sensors"
+        )
+    targets = [
+        _check_photo(scene, number, photo, sensor)
+        for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
+    ]
+    generator, first = np.random.default_rng(seed), seed * STEPS_OF_A_SEED
+    if held_out is None:
+        held_out = HELD_OUT if len(targets) >= MANY_PHOTOS else 0.0
+    number_judged = min(JUDGED, len(targets))
+    judged = [k * len(targets) // number_judged for k in range(number_judged)]
+    hidden = [
+        mi.TensorXf(
+            np.float32(generator.random((*target.shape[:2], 1)) < held_out * (number in judged))
+        )
+        for number, target in enumerate(targets)
+    ]
+
+    def show(picture: Any) -> None:
+        named = picture if isinstance(picture, Mapping) else {"": picture}
+        known.update({key: mi.TensorXf(named[name]) for name, key in keys.items()})
+        if parameters is not None:
+            known.update(parameters)
+
+    def difference(number: int, seed: int, samples: int) -> Any:
+        rendered = mi.render(
+            scene, known, sensor=chosen[number], integrator=integrator, spp=samples, seed=seed
+        )
+        return rendered[..., :3] - targets[number]
+
+    def function(picture: Any, step: int) -> Any:
+        show(picture)
+        number = step % len(targets)
+        return _mean(dr.square(difference(number, first + step, spp)), 1 - hidden[number])
+
+    def judge(picture: Any) -> Any:
+        show(picture)
+        products = [
+            difference(number, first, JUDGE_SAMPLES * spp)
+            * difference(number, first + 1, JUDGE_SAMPLES * spp)
+            for number in judged
+        ]
+        means = [_mean(p, hidden[n]) for p, n in zip(products, judged, strict=True)]
+        return sum(means) / len(means)
+
+    return Loss(function, bounds, parameters, judge if held_out else None)
+
+
+def _mean(values: Any, weight: Any) -> Any:
+    """Return the mean of pixels (H, W, 3) by weights (H, W, 1)."""
+    return dr.sum(values * weight, axis=None) / (3 * dr.sum(weight, axis=None))
+
+
+STEPS_OF_A_SEED = 1 << 16
+"""Random numbers of two seeds differ if steps are fewer."""
+
+
+def _data_of(known: mi.SceneParameters, key: str) -> str:
+    """Return the name of the texels of a bitmap among the parameters of a scene."""
+    name = key if key.endswith(".data") else f"{key}.data"
+    if name in known:
+        return name
+    bitmaps = [k.removesuffix(".data") for k in known if k.endswith(".data")]
+    close = get_close_matches(key, bitmaps, 1) or bitmaps
+    raise ValueError(
+        f"photo_loss: the scene has no bitmap {key!r}; "
+        + (f"it has {', '.join(close)}" if close else "it has none")
+    )
+
+
+def _check_photo(
+    scene: mi.Scene, number: int, photo: ArrayLike, sensor: mi.Sensor | int
+) -> mi.TensorXf:
+    """Return a photo as a tensor, of the size of its film."""
+    pixels = np.asarray(photo, np.float32)
+    film = (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
+    width, height = film.crop_size()
+    if pixels.shape != (height, width, 3):
+        raise ValueError(
+            f"photo_loss: photo {number} has shape {pixels.shape}, but its film has "
+            f"{width}x{height} pixels; give ({height}, {width}, 3)"
+        )
+    if not np.isfinite(pixels).all():
+        raise ValueError(f"photo_loss: photo {number} has values that are not finite")
+    return mi.TensorXf(pixels)

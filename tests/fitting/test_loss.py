@@ -1,0 +1,371 @@
+"""Fits of losses: an image places as in a fit of it; without an image, texels come first."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit.opt import Adam
+
+import eigengs_dr as eg
+from eigengs_dr.backend.arrays import _types, types_in
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.coarse import enlarge, levels_of, shrink
+from eigengs_dr.fitting.loss import LossObjective, View
+from eigengs_dr.fitting.objective import Data, Pixels
+
+SIDE = 48
+IMAGE = eg.sample("coffee")[100 : 100 + SIDE, 200 : 200 + SIDE]
+
+
+def squares(picture, step=0):
+    return dr.mean(dr.square(picture - type(picture)(IMAGE)), axis=None)
+
+
+def absolute(picture, step=0):
+    return dr.mean(dr.abs(picture - type(picture)(IMAGE)), axis=None)
+
+
+def test_the_squared_error_is_that_of_a_fit():
+    """At default settings: other roundings lead elsewhere, but no worse."""
+    fit = eg.fit(IMAGE, 200, space="rgb")
+    found = eg.fit(IMAGE, 200, space="rgb", loss=squares)
+    assert found.psnr_rgb == pytest.approx(fit.psnr_rgb, abs=0.25)
+    assert found.loss == pytest.approx(float(np.mean((found.image - IMAGE) ** 2)), rel=1e-3)
+    assert [row["iteration"] for row in found.trace] == [row["iteration"] for row in fit.trace]
+    assert f"loss={found.loss:.4g}" in repr(found)
+
+
+def test_another_loss_is_lower_than_after_a_fit():
+    fit = eg.fit(IMAGE, 200, 400, space="rgb")
+    found = eg.fit(IMAGE, 200, 400, space="rgb", loss=absolute)
+    assert found.loss < np.abs(fit.image - IMAGE).mean() < found.trace[0]["loss"]
+
+
+def test_ssim_is_higher_than_after_a_fit():
+    def loss(picture, step):
+        return absolute(picture) + 0.2 * (1 - eg.ssim(picture, IMAGE))
+
+    fit = eg.fit(IMAGE, 100, 200)
+    found = eg.fit(IMAGE, 100, 200, loss=loss)
+    assert eg.ssim(found.image, IMAGE) > eg.ssim(fit.image, IMAGE)
+    assert found.psnr_rgb > fit.psnr_rgb - 1.5
+
+
+def test_its_unit_does_not_matter():
+    one, other = (
+        eg.fit(IMAGE, 100, 150, space="rgb", loss=lambda p, s, f=f: f * squares(p)).psnr_rgb
+        for f in (1e-3, 1e3)
+    )
+    assert one == pytest.approx(other, abs=0.5)
+
+
+def test_one_seed_gives_one_result():
+    one, other = (eg.fit(IMAGE, 100, 150, loss=absolute).image for _ in range(2))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_mask_frees_gaussians_for_the_rest():
+    mask = np.zeros((SIDE, SIDE, 1), np.float32)
+    mask[:, : SIDE // 2] = 1
+
+    def loss(picture, step):
+        weight = type(picture)(mask)
+        error = dr.square(picture - type(picture)(IMAGE)) * weight
+        return dr.sum(error, axis=None) / (3 * dr.sum(weight, axis=None))
+
+    found = eg.fit(IMAGE, 100, 300, loss=loss)
+    plain = eg.fit(IMAGE, 100, 300)
+    half = np.s_[:, : SIDE // 2]
+    assert eg.psnr(found.image[half], IMAGE[half]) > eg.psnr(plain.image[half], IMAGE[half]) + 1
+
+
+def test_a_target_takes_fewer_for_a_higher_loss():
+    few, many = (
+        eg.fit(IMAGE, iterations=100, space="rgb", loss=eg.Loss(squares, target=t))
+        for t in (1e-3, 3e-4)
+    )
+    assert (few.stopped, many.stopped) == ("met", "met")
+    assert len(few.gaussians) < len(many.gaussians)
+    assert few.loss <= 1e-3 and many.loss <= 3e-4
+
+
+def test_maps_are_given_by_name():
+    rough = IMAGE[..., :1]
+
+    def loss(pictures, step):
+        light, data = pictures["albedo"], pictures["rough"]
+        assert light.shape == (SIDE, SIDE, 3) and data.shape == (SIDE, SIDE, 1)
+        return dr.mean(dr.square(data - type(data)(rough)), axis=None) + dr.mean(
+            dr.square(light - type(light)(IMAGE)), axis=None
+        )
+
+    maps = {"albedo": eg.Map(IMAGE, "linear"), "rough": rough}
+    found = eg.fit(maps, 150, 150, loss=loss)
+    assert found.loss < found.trace[0]["loss"] and found.maps["rough"]["psnr_rgb"] > 25
+    found = eg.fit(
+        loss=eg.Loss(loss, bounds=(0, 1)),
+        size=(SIDE, SIDE),
+        gaussians=150,
+        iterations=150,
+        space={"albedo": "linear", "rough": "data"},
+    )
+    assert [m.name for m in found.gaussians.maps] == ["albedo", "rough"]
+    assert found.image["rough"].shape == (SIDE, SIDE, 1)
+    assert np.mean((found.image["rough"] - rough) ** 2) < 1e-3
+
+
+@pytest.mark.parametrize("space", ["rgb", "ycbcr", "linear", "log"])
+def test_no_image_is_needed(space):
+    """In every space the picture is what `render` gives."""
+    found = eg.fit(loss=squares, size=(SIDE, SIDE), gaussians=200, iterations=200, space=space)
+    drawn = eg.render(found.gaussians).numpy()
+    assert np.mean((drawn - IMAGE) ** 2) == pytest.approx(found.loss, rel=1e-3)
+    assert found.loss < 2e-4 and np.isnan(found.psnr_rgb)
+    assert found.gaussians.space == space and found.iterations == 200
+    assert [row["iteration"] for row in found.trace][:2] == [100, 100]
+
+
+def test_a_start_takes_the_place_of_texels():
+    first = eg.fit(loss=squares, size=(SIDE, SIDE), gaussians=100, iterations=60, space="rgb")
+    then = eg.fit(loss=squares, size=(SIDE, SIDE), start=first, iterations=60)
+    assert len(then.gaussians) == 100 and then.gaussians.space == "rgb"
+    assert then.loss < first.loss and then.trace[0]["loss"] == pytest.approx(first.loss, rel=1e-3)
+
+
+def test_double_precision_by_a_double_start():
+    rows = eg.fit(IMAGE, 100, 0, space="rgb").gaussians.to_arrays()
+    kinds = []
+
+    def loss(picture, step):
+        kinds.append(dr.type_v(picture))
+        return squares(picture)
+
+    start = eg.Gaussians.from_arrays(**rows, size=(SIDE, SIDE), space="rgb", dtype=np.float64)
+    found = eg.fit(loss=loss, size=(SIDE, SIDE), start=start, iterations=30)
+    assert set(kinds) == {dr.VarType.Float64} and found.loss < found.trace[0]["loss"]
+
+
+def test_a_judge_chooses_the_number():
+    """The texels are noisy; a judge without noise sees how many Gaussians keep it out."""
+
+    def noisy(picture, step):
+        noise = np.random.default_rng(step).normal(0, 0.3, IMAGE.shape).astype(np.float32)
+        return dr.mean(dr.square(picture - type(picture)(IMAGE + noise)), axis=None)
+
+    loss = eg.Loss(noisy, judge=squares)
+    found = eg.fit(loss=loss, size=(SIDE, SIDE), iterations=150, space="rgb")
+    tried = [(row["gaussians"], row["loss"]) for row in found.trace if "gaussians" in row]
+    counts, losses = zip(*tried, strict=True)
+    assert list(counts) == [18 * 2**k for k in range(len(counts))] and len(counts) > 1
+    assert len(found.gaussians) == min(tried, key=lambda pair: pair[1])[0]
+    assert found.loss <= min(losses)
+
+
+def test_the_last_set_counts_without_a_judge():
+    """The loss of the first step does not compare with that of another one."""
+
+    def loss(picture, step):
+        return (1 if step else 0.1) * squares(picture)
+
+    found = eg.fit(loss=loss, size=(SIDE, SIDE), gaussians=50, iterations=40, space="rgb")
+    assert found.loss == found.trace[-1]["loss"]
+
+
+def test_bounds_keep_sums_inside():
+    """Twice the photo would be best; what the loss sees is clipped."""
+    seen = []
+
+    def loss(picture, step):
+        seen.extend([dr.min(picture, axis=None).array[0], dr.max(picture, axis=None).array[0]])
+        return squares(0.5 * picture)
+
+    options = {"size": (SIDE, SIDE), "gaussians": 100, "iterations": 200, "space": "rgb"}
+    free = eg.fit(loss=loss, **options).image
+    assert free.max() > 1.5 and max(seen) > 1.5
+    seen.clear()
+    held = eg.fit(loss=eg.Loss(loss, bounds=(0, 1)), **options).image
+    assert min(seen) >= 0 and max(seen) <= 1
+    assert held.min() > -0.05 and 0.9 < held.max() < 1.1
+
+
+def test_parameters_of_the_user_step_along():
+    """A gain of which the picture knows nothing; other gradients and arrays stay as they are."""
+    kind = types_in(select("llvm")).Float
+    gain = Adam(lr=0.02, params={"gain": kind(0.5)})
+    other, held = kind(2), kind(3)
+    dr.enable_grad(other)
+    dr.set_grad(other, 7)
+    image = IMAGE.copy()
+
+    def loss(picture, step):
+        fixed = dr.mean(dr.square(held * 0.2 - other * gain["gain"] * 0.3))
+        return squares(picture) + fixed
+
+    eg.fit(image, 50, 100, space="rgb", loss=eg.Loss(loss, parameters=gain))
+    assert gain["gain"][0] == pytest.approx(1, abs=0.02)
+    assert dr.grad(other)[0] == 7 and dr.grad_enabled(other) and held[0] == 3
+    np.testing.assert_array_equal(image, IMAGE)
+
+
+def test_pytorch():
+    torch = pytest.importorskip("torch")
+
+    @dr.wrap(source="drjit", target="torch")
+    def loss(picture):
+        return ((picture - torch.from_numpy(IMAGE)) ** 2).mean()
+
+    found = eg.fit(IMAGE, 50, 30, space="rgb", loss=lambda picture, step: loss(picture))
+    assert found.loss < found.trace[0]["loss"]
+
+
+@pytest.mark.parametrize(
+    ("loss", "message"),
+    [
+        (lambda p, s: dr.square(p), "array of shape .* dr.mean"),
+        (lambda p, s: float(np.mean(p.numpy())), "does not depend on the picture"),
+        (lambda p, s: None, "returned NoneType"),
+        (lambda p, s: np.float32(1), "does not depend on the picture|returned float32"),
+        (lambda p, s: squares(p) * (np.nan if s == 3 else 1), "nan at steps 1-9"),
+        (lambda p, s: squares(p) / 0, "at step 0|inf at step 0"),
+    ],
+)
+def test_what_is_no_loss_ends_in_one_line(loss, message):
+    with pytest.raises(ValueError, match=message) as error:
+        eg.fit(IMAGE, 50, 30, space="rgb", loss=loss)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "needs an image, or a loss and the size"),
+        ({"loss": squares}, "needs an image, or a loss and the size"),
+        ({"loss": squares, "size": (8, 8), "target_psnr": 30}, "no PSNR"),
+        ({"loss": squares, "size": (8, 8), "gaussians": 65}, "takes 1 to 64"),
+        ({"loss": squares, "size": (8, 8), "space": {"a": "hsv"}}, "'hsv' is unknown"),
+        ({"loss": squares, "size": (8, 8), "space": {"1a": "rgb"}}, "starts with a letter"),
+        ({"image": IMAGE, "size": (8, 8)}, "size is for a loss without an image"),
+        ({"image": IMAGE, "gaussians": [10, 20], "loss": squares}, "levels are for the squared"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        eg.fit(**options)
+    for arguments, text in (({"bounds": (1, 0)}, "smaller"), ({"target": 0}, "above 0")):
+        with pytest.raises(ValueError, match=text):
+            eg.Loss(squares, **arguments)
+    with pytest.raises(TypeError, match="no function"):
+        eg.Loss(3)
+
+
+@pytest.mark.parametrize("last", [20, 80])
+def test_an_interrupted_fit_keeps_its_set(last):
+    """Of texels, to which Gaussians are fitted yet; and of Gaussians."""
+
+    def stop(step, steps, row):
+        assert steps == 100
+        if step >= last:
+            raise KeyboardInterrupt
+
+    options = {"loss": squares, "size": (SIDE, SIDE), "gaussians": 50, "space": "rgb"}
+    with pytest.raises(eg.FitInterrupted) as error:
+        eg.fit(**options, iterations=100, progress=stop)
+    result = error.value.result
+    assert len(result.gaussians) == 50 and result.iterations == last
+    assert result.stopped == "interrupted" and result.loss < 0.05
+
+
+@pytest.mark.parametrize("space", ["rgb", "ycbcr", "log", "normal"])
+def test_the_slope_is_a_finite_difference(backend, space):
+    """Of sums in tile layout, through what the picture shows."""
+    double = _types(select(backend).__name__, 64)
+    random = np.random.default_rng(5)
+    values = random.uniform(0.2, 0.8, (9, 11, 3))
+    target = double.Tensor(random.uniform(0.2, 0.8, (9, 11, 3)))
+
+    def loss(picture, step):
+        return dr.sum(dr.square(picture - target) * (1 + picture), axis=None)
+
+    base = Pixels.of(Data(values.astype(np.float32), values.astype(np.float32)), space, double)
+    view = View("", space, range(3), 0.9, 0.05)
+    objective = LossObjective.of_loss(eg.Loss(loss), [view], base)
+    rows = double.Float(values.ravel())
+    value, slopes = objective.derivative(objective.seen(rows))
+    slope = objective.pull_back(rows, slopes).numpy()
+    for place in random.integers(0, values.size, 12):
+        ends = []
+        for step in (-1e-6, 1e-6):
+            moved = values.ravel().copy()
+            moved[place] += step
+            ends.append(objective.judge(objective.seen(double.Float(moved))))
+        assert slope[place] == pytest.approx((ends[1] - ends[0]) / 2e-6, rel=1e-4, abs=1e-6)
+    assert value[0] > 0
+
+
+def test_the_curvature_of_the_squared_error_is_its_weight():
+    """The secant of each tile is exact, up to the unit."""
+    gaussians = eg.fit(IMAGE, 60, 20, space="rgb").gaussians
+    base = Pixels.plain(IMAGE, gaussians)
+    weight = np.ones((SIDE, SIDE, 1), np.float32)
+    weight[:, SIDE // 2 :] = 4
+
+    def loss(picture, step):
+        error = picture - type(picture)(IMAGE)
+        return dr.sum(dr.square(error) * type(picture)(weight), axis=None)
+
+    objective = LossObjective.of_loss(eg.Loss(loss), [View("", "rgb", range(3))], base)
+    near = objective.around(gaussians)
+    curvature = near.model.curvature.numpy().reshape(-1, base.grid.pixels)
+    assert (curvature.max(axis=1) - curvature.min(axis=1) <= 1e-6).all()
+    left, right = np.split(curvature.mean(axis=1).reshape(base.grid.ny, base.grid.nx), 2, axis=1)
+    assert 2.5 < np.median(right) / np.median(left) < 4.05  # tiles with little error take the usual
+
+
+@pytest.mark.parametrize("size", [(16, 16), (21, 13), (9, 40)])
+def test_levels_of_a_pyramid(backend, size):
+    """The transpose is one, a constant stays one, and a ramp a ramp but at its ends."""
+    levels = levels_of(*size, 2)
+    assert min(levels[-1].width, levels[-1].height) >= 4 and levels[0].values == 2 * np.prod(size)
+    types, random = types_in(select(backend)), np.random.default_rng(3)
+    fine, coarse = levels[0], levels[1]
+    x, y = (random.normal(size=level.values).astype(np.float32) for level in (coarse, fine))
+    up = enlarge(types.Float(x), coarse, fine).numpy()
+    down = shrink(types.Float(y), fine, coarse).numpy()
+    assert np.dot(up, y) == pytest.approx(np.dot(x, down), rel=1e-4, abs=1e-3)
+    ones = enlarge(types.Float(np.ones(coarse.values)), coarse, fine).numpy()
+    np.testing.assert_allclose(ones, 1, rtol=1e-6)
+    ramp = np.tile(np.arange(coarse.width, dtype=np.float32)[None, :, None], (coarse.height, 1, 2))
+    shown = enlarge(types.Float(ramp.ravel()), coarse, fine).numpy()
+    row = shown.reshape(fine.height, fine.width, 2)[0, 1:-1, 0]
+    inner = row[: 2 * (coarse.width - 1)][: len(row)]
+    np.testing.assert_allclose(np.diff(inner[: 2 * coarse.width - 3]), 0.5, rtol=1e-5)
+
+
+def test_the_average_of_sets_is_quieter_than_the_last():
+    """With noisy derivatives, at equal rates."""
+
+    def noisy(picture, step):
+        noise = np.random.default_rng(step).normal(0, 0.5, IMAGE.shape).astype(np.float32)
+        return dr.mean(dr.square(picture - type(picture)(IMAGE + noise)), axis=None)
+
+    start = eg.fit(IMAGE, 100, 50, space="rgb").gaussians
+    options = {"loss": noisy, "size": (SIDE, SIDE), "start": start, "iterations": 100}
+    method = eg.COARSE_TO_FINE.at_rates(3)
+    mean, last = (eg.fit(**options, method=m).image for m in (method, replace(method, average=0.0)))
+    assert np.mean((mean - IMAGE) ** 2) < 0.8 * np.mean((last - IMAGE) ** 2)
+    with pytest.raises(ValueError, match="average is"):
+        replace(eg.DEFAULT, average=0.5)
+
+
+def test_a_loss_sees_what_is_rendered():
+    """The picture of a step is that of `render` for the same set."""
+    seen = []
+
+    def loss(picture, step):
+        seen.append(picture.numpy())
+        return squares(picture)
+
+    start = eg.fit(IMAGE, 80, 0).gaussians
+    eg.fit(loss=loss, size=(SIDE, SIDE), start=start, iterations=1)
+    np.testing.assert_allclose(seen[0], eg.render(start).numpy(), atol=2e-6)
