@@ -105,6 +105,7 @@ def gaussian_texture() -> type:
             self.space, self.channels = start.space, start.channels
             self.spectra = upload_table() if mi.is_spectral else None
             properties.check_known(props)
+            self.changed = False
             self.parameters_changed([])
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -120,17 +121,18 @@ def gaussian_texture() -> type:
                 properties.check_invertible(self.to_uv)
                 self.transform = mi.Transform3f(self.to_uv)
                 dr.make_opaque(self.transform)  # another transform compiles no other programs
+            self.changed |= bool(set(keys) - {"to_uv", "prefilter"})
             if "prefilter" in keys:
                 self._set_prefilter()
             if not keys or set(keys) - {"to_uv", "prefilter"}:
-                self._take_over(not keys or any(key in SHAPES for key in keys), not keys)
+                self._take_over(not keys or any(key in SHAPES for key in keys))
             sampled = getattr(self, "emission", None) is not None
             self.survey: Survey | None = None
             self.emission: Emission | None = None
             if sampled:  # a frozen rendering cannot make it
                 self._emission()
 
-        def _take_over(self, moved: bool, start: bool) -> None:
+        def _take_over(self, moved: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
             source, settings = self.source, (self.cutoff, self.wrap, self.filtered())
             if source.file and source.is_that_of_file():
@@ -140,13 +142,13 @@ def gaussian_texture() -> type:
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved or not self.table.lists.cells.packs:
                 shape = source.decode(dr.detach(source.tensors)).shape
-                size, side = (self.width, self.height), SIDE if start else NARROW
+                size, side = (self.width, self.height), NARROW if self.changed else SIDE
                 lists = list_gaussians(shape, size, *settings, side)
             else:
                 lists = self.table.lists
             table = make_table(lists, self.cutoff, source.tensors, source.decode)
             # Who has changed parameters once may change colours next, and needs all lists again.
-            self.table = replace(table, lists=lists) if start else table
+            self.table = table if self.changed else replace(table, lists=lists)
             self.part = slice(None)
 
         def follow(self, sensor: mi.Sensor) -> None:
@@ -154,14 +156,14 @@ def gaussian_texture() -> type:
             current_angle(sensor)  # it raises where there is none
             filtered, self.sensor = self.filtered(), sensor
             if not filtered:
-                self._take_over(True, True)
+                self._take_over(True)
 
         def _set_prefilter(self) -> None:
             """Take over the parameter ``prefilter``, which may switch footprints on or off."""
             angle = properties.check_angle(float(dr.slice(self.prefilter)))
             filtered, self.angle, self.sensor, self.follows = self.filtered(), angle, None, False
             if filtered != self.filtered():
-                self._take_over(True, True)
+                self._take_over(True)
 
         def _pixel(self) -> Float | None:
             """Return the angle of a pixel; None if rays alone know it."""

@@ -85,7 +85,7 @@ def list_gaussians(
     return Lists(list_cells([level], *size, kernel_radius(cutoff)), None)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
     """What lookups read.
 
@@ -152,14 +152,15 @@ def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) ->
     While Dr.Jit computes it, its thread may make another texture, which then is the first.
     """
     key = (cutoff, wrap, filtered)
-    if key not in file.tables:
+    table: Table | None = file.tables.get(key)
+    if table is None:
         parameters, size = file.parameters(), (file.like.width, file.like.height)
         lists = list_gaussians(parameters.shape, size, *key)
         table = make_table(lists, cutoff, {}, lambda _: parameters)
         cells = lists.cells.once_packed()
         sizes = replace(lists.sizes, cells=cells) if lists.sizes else None
-        file.tables.setdefault(key, replace(table, lists=Lists(cells, sizes)))
-    return file.tables[key]
+        table = file.tables.setdefault(key, replace(table, lists=Lists(cells, sizes)))
+    return table
 
 
 class _Lookups(threading.local):

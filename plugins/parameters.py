@@ -134,8 +134,8 @@ class SharedFile:
     maps : dict
         For each map by its name, or for the whole set by None: a set like that of the map, and its
         tensors.
-    tables : dict
-        What lookups of all channels read, by the properties that it depends on.
+    tables : WeakValueDictionary
+        What lookups of all channels read, by the properties that it depends on; textures hold it.
     """
 
     def __init__(self, path: str, backend: str | None, first: int | None) -> None:
@@ -147,7 +147,7 @@ class SharedFile:
             )
         whole = whole if first is None else whole[:first]
         self.like = without_arrays(whole)
-        self.tables: dict[tuple, Any] = {}
+        self.tables: WeakValueDictionary[tuple, Any] = WeakValueDictionary()
         parts: dict[str | None, Gaussians] = {m.name: whole[m.name] for m in whole.maps}
         parts = parts or {None: whole}
         tensors = {name: to_tensors(part) for name, part in parts.items()}

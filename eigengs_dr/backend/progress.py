@@ -51,7 +51,8 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
     ------
     callable or None
         ``show(done, total, row)``, or with a label before these; a new label restarts the bar. The
-        bar shows ``psnr_rgb`` of the row, which may be left out. None if nobody sees a bar.
+        bar shows ``psnr_rgb`` of the row, or its loss; the row may be left out. None if nobody sees
+        a bar.
     """
     if callable(progress):
         yield progress
@@ -72,9 +73,11 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
                         bar.reset()
             done, bar.total, *rest = values
             row = rest[0] if rest else None
-            psnr = row.get("psnr_rgb") if isinstance(row, dict) else getattr(row, "psnr_rgb", None)
-            if psnr is not None:
-                bar.set_postfix_str(f"psnr_rgb {psnr:.2f} dB", refresh=False)
+            figures = row if isinstance(row, dict) else {"psnr_rgb": getattr(row, "psnr_rgb", None)}
+            if figures.get("psnr_rgb") is not None:
+                bar.set_postfix_str(f"psnr_rgb {figures['psnr_rgb']:.2f} dB", refresh=False)
+            elif "loss" in figures:
+                bar.set_postfix_str(f"loss {figures['loss']:.4g}", refresh=False)
             bar.update(done - bar.n)
 
         yield show

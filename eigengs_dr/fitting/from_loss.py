@@ -14,11 +14,8 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes
 from ..backend.types import Float
 from ..gaussian.channels import TextureMap, check_maps, slices
-from ..gaussian.gaussians import Gaussians, whole
+from ..gaussian.gaussians import Gaussians
 from ..image.color import LIGHT, SPACES, to_coded, to_log
-from ..raster.kernels import forward
-from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
-from ..raster.render import bin_gaussians, to_tensor
 from ..storage.npz import BadValue
 from .coarse import Coarse, coarse_picture
 from .descent import begin
@@ -114,7 +111,9 @@ def refine_loss(
         start, numbers = _start(objective, options, coarse, ended)
         trace = [timed({"iteration": taken, **row}) for row in trace + numbers]
     else:
-        objective = _near(loss, size, views, types, _sums(start))
+        objective = _near(loss, size, views, types, np.zeros(size[0] * size[1] * start.channels))
+        sums = objective.picture(objective.draw_set(start)[0])
+        objective = _near(loss, size, views, types, sums.numpy())
     seconds_init = time.perf_counter() - started
     refined = refine(
         objective,
@@ -180,16 +179,6 @@ def _grey(space: str, channels: int, low: float, high: float) -> NDArray[np.floa
     return np.full(channels, to_log(np.float32(GREY)) if space == "log" else (low + high) / 2)
 
 
-def _sums(gaussians: Gaussians) -> NDArray[np.floating]:
-    """Return the sums of a set as rows of pixels."""
-    lists = bin_gaussians(gaussians, adjoint=False)
-    packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
-    radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
-    with dr.suspend_grad():
-        drawn = forward(packed, background, lists, radius)
-        return np.ravel(to_tensor(drawn, lists.grid, gaussians.channels).numpy())
-
-
 def _start(
     objective: LossObjective,
     options: FitOptions,
@@ -198,7 +187,7 @@ def _start(
 ) -> tuple[Gaussians, list[Row]]:
     """Fit Gaussians to the image of an objective; return rows of the numbers that were tried."""
     width, height = objective.size
-    image = Pixels(**{name: getattr(objective, name) for name in Pixels.__dataclass_fields__})
+    image = objective.image()
     method = replace(DEFAULT, cutoff=options.method.cutoff)
 
     def fitted(count: int) -> Gaussians:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import drjit as dr
@@ -238,6 +238,14 @@ class LossObjective(Pixels):
         dr.eval(sums)
         return sums, self.seen(to_tensor(sums, self.grid, self.channels).array)
 
+    def draw_set(self, gaussians: Gaussians) -> tuple[Float, list[Float]]:
+        """Return the sums of a set and what the loss sees, see `draw`; with new tile lists."""
+        lists = bin_gaussians(gaussians, adjoint=False)
+        packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
+        radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
+        with dr.suspend_grad():
+            return self.draw(packed, background, lists, radius)
+
     def seen(self, sums: Float) -> list[Float]:
         """Return the pictures that the loss sees of sums, both as rows of pixels."""
         shown = show(self.views, sums, self.channels)
@@ -299,12 +307,7 @@ class LossObjective(Pixels):
     def judged(self, gaussians: Gaussians) -> dict[str, float]:
         """Return the loss of a set for its row, see `Loss.judge`; and its margin to a target."""
         self.calls.check()
-        lists = bin_gaussians(gaussians, adjoint=False)
-        packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
-        with dr.suspend_grad():
-            radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
-            _, shown = self.draw(packed, background, lists, radius)
-            loss = self.judge(shown)
+        loss = self.judge(self.draw_set(gaussians)[1])
         if self.loss.target is None:
             return {"loss": loss}
         return {"loss": loss, "margin": 10 * math.log10(self.loss.target / max(loss, TINY))}
@@ -370,10 +373,7 @@ class LossObjective(Pixels):
         """
         grid, target = self.grid, self.model.target
         assert target is not None
-        lists = bin_gaussians(gaussians, adjoint=False)
-        packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
-        radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
-        sums, shown = self.draw(packed, background, lists, radius)
+        sums, shown = self.draw_set(gaussians)
         slope = self.pull_back(sums, self.derivative(shown)[1], in_tiles=True)
         block, inside = grid.pixels * self.channels, pixels_inside(self.types, grid)
         each = dr.arange(self.types.UInt, dr.width(sums)) // self.channels
@@ -389,5 +389,8 @@ class LossObjective(Pixels):
         tile = dr.arange(self.types.UInt, dr.width(inside)) // grid.pixels
         curvature = dr.gather(self.types.Float, secant, tile) * inside
         dr.eval(curvature)
-        fields = {name: getattr(self, name) for name in Pixels.__dataclass_fields__}
-        return Pixels(**fields | {"model": Quadratic(target, curvature)})
+        return replace(self.image(), model=Quadratic(target, curvature))
+
+    def image(self) -> Pixels:
+        """Return the squared error of the image alone."""
+        return Pixels(**{name: getattr(self, name) for name in Pixels.__dataclass_fields__})
