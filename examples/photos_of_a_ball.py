@@ -34,6 +34,12 @@ mi.set_variant("llvm_ad_rgb")
 CAMERAS, SIDE, TEXELS, STEPS = 6, 128, 128, 240
 
 
+def save(name, *pictures):
+    """Write pictures side by side, at twice the size unless they are large already."""
+    large = [p if len(p) > SIDE else p.repeat(2, axis=0).repeat(2, axis=1) for p in pictures]
+    eg.save_image(folder / name, np.concatenate(large, axis=1).clip(0, 1))
+
+
 def room(paint):
     """Make the scene with other paint, an array (H, W, 3) of linear light."""
     at = mi.ScalarTransform4f()
@@ -73,7 +79,7 @@ photo = photo.reshape(TEXELS, 2, TEXELS, 2, 3).mean(axis=(1, 3))  # half the siz
 known = room(np.float32(to_linear(photo)))
 photos = [mi.render(known, sensor=k, spp=4, seed=1000 + k).numpy() for k in range(CAMERAS)]
 view = to_coded(mi.render(known, sensor=CAMERAS, spp=512).numpy())
-eg.save_image(folder / "photos.png", np.concatenate([to_coded(p) for p in photos[::2]], axis=1))
+save("photos.png", *(to_coded(photo) for photo in photos[::2]))
 
 # %%
 # Texels
@@ -125,8 +131,8 @@ print(f"{numbers:,} numbers as Gaussians: {eg.psnr(view, by_gaussians):.1f} dB i
 # seen by many pixels of the photos, so that their noise averages out.
 
 found = result.image.clip(0, 1).astype(np.float32)
-outlines = overlay(result.gaussians, found)
-eg.save_image(folder / "paint.png", np.concatenate([photo, texels, found, outlines], axis=1))
+large = eg.picture_of(result.gaussians, width=2 * SIDE)
+save("paint.png", photo, texels, found, overlay(result.gaussians, large))
 
 # %%
 # Errors
@@ -139,4 +145,4 @@ eg.save_image(folder / "paint.png", np.concatenate([photo, texels, found, outlin
 
 errors = [np.abs(photo - paint) for paint in (texels, found)]
 errors += [np.abs(view - shown) for shown in (by_texels, by_gaussians)]
-eg.save_image(folder / "errors.png", (4 * np.concatenate(errors, axis=1)).clip(0, 1))
+save("errors.png", *(4 * error for error in errors))

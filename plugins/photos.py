@@ -55,7 +55,8 @@ def photo_loss(
     pictures : str or mapping of str to str
         The bitmap that is looked for, as `mitsuba.traverse` names it, such as
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
-        are those of ``space`` of `eigengs_dr.fit`. Bitmaps need ``raw: true`` for linear light.
+        are those of ``space`` of `eigengs_dr.fit`. Bitmaps need ``raw: true``; their texels are
+        then light, so fit colours with ``space="linear"``, and roughness with ``"data"``.
     photos : sequence of array_like, shape (H, W, 3)
         Linear light, each of the size of the film of its sensor.
     sensors : sequence of sensors or numbers, optional
