@@ -160,6 +160,8 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
 
 UNKNOWNS = (texels, pyramid, lookups, coefficients)
 SINGLE = ("lookups", "coefficients")  # of one map
+MOST_LOOKUPS = 240  # steps of these, which are slow
+COMPARED = ("pyramid", "fit")  # with other numbers of samples
 
 
 def run(task: Task) -> list[Row]:
@@ -183,7 +185,9 @@ def _jobs(task: Task) -> Iterator[Job]:
             settings += [(NOISY_STEPS, spp) for spp in NOISES]
             for steps, spp in settings:
                 for method in methods:
-                    if method in SINGLE and (len(maps) > 1 or spp != SPP):
+                    if method in SINGLE and (len(maps) > 1 or steps > MOST_LOOKUPS):
+                        continue
+                    if method not in COMPARED and spp != SPP:
                         continue
                     job = {"scene": kind, "cameras": count, "method": method, "steps": steps}
                     scene = Scene(kind, count, maps, photos, seen, spp)
