@@ -50,7 +50,7 @@ class Scene(NamedTuple):
     """What is to be recovered: maps in linear light or data, by photos of some cameras."""
 
     kind: str
-    count: int
+    cameras: int
     maps: Maps
     photos: Sequence[Image]  # of the cameras, and of the judges
     seen: Image  # how much the photos depend on each texel
@@ -141,8 +141,8 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
     spaces = {name: SPACES[name] for name in names}
     for _ in range(2):
         textures = {name: bitmap(mi, grey(name)) for name in names}
-        loaded = scene_of(mi, scene.kind, textures, scene.count)
-        loss = photo_loss(loaded, names, scene.photos[: scene.count], spp=scene.spp)
+        loaded = scene_of(mi, scene.kind, textures, scene.cameras)
+        loss = photo_loss(loaded, names, scene.photos[: scene.cameras], spp=scene.spp)
         size = (TEXELS, TEXELS)
         result = eg.fit(loss=loss, size=size, space=spaces, iterations=steps, progress=False)
         dr.sync_thread()
@@ -204,12 +204,12 @@ def recover(mi: Any, scene: Scene, method: str, steps: int) -> Row:
 
 def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int) -> Row:
     """Descend by Adam; the seconds are without the first step, which compiles."""
-    loaded = scene_of(mi, scene.kind, unknown.textures, scene.count)
+    loaded = scene_of(mi, scene.kind, unknown.textures, scene.cameras)
     parameters, values = mi.traverse(loaded), mi.ad.Adam(1.0, unknown.start, beta_1=MOMENTUM)
-    photos = [mi.TensorXf(photo) for photo in scene.photos[: scene.count]]
+    photos = [mi.TensorXf(photo) for photo in scene.photos[: scene.cameras]]
     started = 0.0
     for step in range(steps):
-        camera = step % scene.count
+        camera = step % scene.cameras
         rate = LAST_RATE + (1 - LAST_RATE) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
         parameters.update(unknown.shown(values))
         values.set_learning_rate({key: rate * r for key, r in unknown.rates.items()})
@@ -225,7 +225,7 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int) -> Row:
     last = unknown.shown(values)
     parameters.update(last)
     row = {"seconds": seconds, "parameters": sum(dr.width(v) for v in unknown.start.values())}
-    row["psnr_rgb"] = _psnr(_photos(mi, loaded, scene.count), scene.photos[scene.count :])
+    row["psnr_rgb"] = _psnr(_photos(mi, loaded, scene.cameras), scene.photos[scene.cameras :])
     if len(scene.maps) > 1:
         found = {n: last[f"{key}.data"].numpy() for n, key in NAMES[scene.kind].items()}
         row |= _judge_maps(scene, found)
@@ -234,9 +234,9 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int) -> Row:
 
 def judge(mi: Any, scene: Scene, found: Maps) -> Row:
     """Return psnr_rgb of the cameras that took no photo, and the PSNRs of several maps."""
-    loaded = scene_of(mi, scene.kind, _bitmaps(mi, found), scene.count)
-    views = _photos(mi, loaded, scene.count)
-    row = {"psnr_rgb": _psnr(views, scene.photos[scene.count :])}
+    loaded = scene_of(mi, scene.kind, _bitmaps(mi, found), scene.cameras)
+    views = _photos(mi, loaded, scene.cameras)
+    row = {"psnr_rgb": _psnr(views, scene.photos[scene.cameras :])}
     return row | (_judge_maps(scene, found) if len(scene.maps) > 1 else {})
 
 
