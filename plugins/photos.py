@@ -12,16 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from eigengs_dr.fitting.loss import Loss
+from eigengs_dr.image.color import to_linear
+from eigengs_dr.image.io import read_floats
 
 JUDGED = 4
 """Photos with held-out pixels, spread over all."""
-
-MANY_PHOTOS = 12
-"""Photos from which on some pixels are held out by default. With three, a held-out pixel leaves a
-hole in the texture that no other photo sees, and the number that suits holes is far too small."""
-
-HELD_OUT = 0.2
-"""Share of the pixels of a judged photo that are held out by default."""
 
 JUDGE_SAMPLES = 2
 """Samples of a held-out pixel in each of two renderings, as a multiple of those of a step. The
@@ -37,7 +32,7 @@ def photo_loss(
     sensors: Sequence[mi.Sensor | int] | None = None,
     integrator: mi.Integrator | None = None,
     spp: int = 4,
-    held_out: float | None = None,
+    held_out: float = 0.0,
     bounds: tuple[float, float] | None = (0.0, 1.0),
     parameters: Any = None,
     seed: int = 0,
@@ -45,8 +40,7 @@ def photo_loss(
     """Return the squared error of renderings against photos, for `eigengs_dr.fit`.
 
     A step puts the picture into the scene as texels, and renders one photo after another. So it
-    costs what a step of texels costs. With many photos, some pixels are held out: their error is
-    the ``loss`` of the trace, and says how many Gaussians the scene needs.
+    costs little more than a step of texels.
 
     Parameters
     ----------
@@ -57,8 +51,9 @@ def photo_loss(
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
         are those of ``space`` of `eigengs_dr.fit`. Bitmaps need ``raw: true``; their texels are
         then light, so fit colours with ``space="linear"``, and roughness with ``"data"``.
-    photos : sequence of array_like, shape (H, W, 3)
-        Linear light, each of the size of the film of its sensor.
+    photos : sequence of array_like, shape (H, W, 3), path-like or mitsuba.Bitmap
+        Of the size of the film of its sensor each. Arrays of floats are linear light; codes of 8
+        bits are sRGB, and files what they say.
     sensors : sequence of sensors or numbers, optional
         One for each photo, by default the first ones of the scene.
     integrator : mitsuba.Integrator, optional
@@ -66,9 +61,10 @@ def photo_loss(
     spp : int, optional
         Samples a pixel of a step.
     held_out : float, optional
-        Share of the pixels of four photos that no step sees, in [0, 1). With 0, the trace has the
-        error of the first photo, and the number of Gaussians is not chosen. By default 0.2 with 12
-        photos or more, and 0 with fewer.
+        Share of the pixels of four photos that no step sees, in [0, 1). Their error is then the
+        ``loss`` of the trace, and the number of Gaussians doubles while it falls; by default there
+        is one for 16 texels. It takes many photos: with few, a held-out pixel leaves a hole in the
+        texture that no other photo sees, and the number that suits holes is far too small.
     bounds : (float, float), optional
         See `eigengs_dr.Loss`.
     parameters : optimiser, optional
@@ -109,8 +105,17 @@ def photo_loss(
     known = mi.traverse(scene)
     keys = dict(pictures) if isinstance(pictures, Mapping) else {"": pictures}
     keys = {name: _data_of(known, key) for name, key in keys.items()}
+    channels = {name: known[key].shape[2] for name, key in keys.items()}
+    for key in parameters.keys() if parameters is not None else ():
+        _check_known(known, key)
+    if not 0 <= held_out < 1:
+        raise ValueError(f"photo_loss: held_out is {held_out}; it must be in [0, 1)")
+    if spp < 1:
+        raise ValueError(f"photo_loss: spp is {spp}; it must be at least 1")
+    if len(photos) == 0:
+        raise ValueError("photo_loss: there are no photos; give one for each sensor")
     chosen = list(range(len(photos)) if sensors is None else sensors)
-    if len(chosen) != len(photos) or not photos:
+    if len(chosen) != len(photos):
         raise ValueError(f"photo_loss: {len(photos)} photos, but {len(chosen)} sensors")
     if sensors is None and len(photos) > len(scene.sensors()):
         raise ValueError(
@@ -121,8 +126,6 @@ def photo_loss(
         for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
     ]
     generator, first = np.random.default_rng(seed), seed * STEPS_OF_A_SEED
-    if held_out is None:
-        held_out = HELD_OUT if len(targets) >= MANY_PHOTOS else 0.0
     number_judged = min(JUDGED, len(targets))
     judged = [k * len(targets) // number_judged for k in range(number_judged)]
     hidden = [
@@ -134,6 +137,12 @@ def photo_loss(
 
     def show(picture: Any) -> None:
         named = picture if isinstance(picture, Mapping) else {"": picture}
+        found = {name: p.shape[2] for name, p in named.items()}
+        if found != channels:
+            raise ValueError(
+                f"photo_loss: the bitmaps have the channels {_listed(channels)}, the pictures of "
+                f"the fit {_listed(found)}; the names and spaces of eigengs_dr.fit say them"
+            )
         known.update({key: mi.TensorXf(named[name]) for name, key in keys.items()})
         if parameters is not None:
             known.update(parameters)
@@ -171,6 +180,18 @@ STEPS_OF_A_SEED = 1 << 16
 """Random numbers of two seeds differ if steps are fewer."""
 
 
+def _listed(channels: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {number}".strip() for name, number in channels.items())
+
+
+def _check_known(known: mi.SceneParameters, key: str) -> None:
+    """Raise ValueError if a scene has no parameter of this name."""
+    if key not in known:
+        close = get_close_matches(key, [name for name, _ in known], 1)
+        advice = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"photo_loss: the scene has no parameter {key!r}{advice}")
+
+
 def _data_of(known: mi.SceneParameters, key: str) -> str:
     """Return the name of the texels of a bitmap among the parameters of a scene."""
     name = key if key.endswith(".data") else f"{key}.data"
@@ -187,8 +208,11 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
 def _check_photo(
     scene: mi.Scene, number: int, photo: ArrayLike, sensor: mi.Sensor | int
 ) -> mi.TensorXf:
-    """Return a photo as a tensor, of the size of its film."""
-    pixels = np.asarray(photo, np.float32)
+    """Return a photo as a tensor of linear light, of the size of its film."""
+    floats = np.issubdtype(getattr(photo, "dtype", np.uint8), np.floating)
+    image = read_floats(photo, encoding="linear" if floats else None)
+    pixels = to_linear(image.pixels) if image.encoding == "srgb" else np.asarray(image.pixels)
+    pixels = pixels[..., :3]
     film = (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
     width, height = film.crop_size()
     if pixels.shape != (height, width, 3):

@@ -120,7 +120,8 @@ def fit_many(
     [('000000', 'done', 200), ('000001', 'done', 200)]
     """
     own = ("images", "output", "overwrite", "progress", "client")
-    refuse_unknown(options, [*(field.name for field in fields(FitOptions)), *own])
+    known = [field.name for field in fields(FitOptions) if field.name != "loss"]
+    refuse_unknown(options, [*known, *own])
     settings = FitOptions(**options)
     if settings.start is not None:
         start = load_start(settings.start, settings.backend)

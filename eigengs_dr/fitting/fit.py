@@ -259,6 +259,8 @@ def fit(
     """
     started = time.perf_counter()
     spaces, space = space, space if isinstance(space, str) else None
+    if image is None:
+        _check_loss(loss, size, target_psnr, gaussians, weight)
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
@@ -358,6 +360,23 @@ def fit_images(
     return _finished(found, affines, mean_image, started, seconds_init)
 
 
+def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any, weight: Any) -> None:
+    """Raise ValueError unless there is a loss with a size, and nothing that needs an image."""
+    if loss is None or size is None:
+        raise ValueError(
+            "fit needs an image, or a loss and the size of its picture: "
+            "fit(loss=f, size=(width, height))"
+        )
+    if np.shape(size) != (2,):
+        raise ValueError(f"size is {size!r}; give (width, height)")
+    if target_psnr is not None or np.ndim(gaussians) > 0:
+        raise ValueError(
+            "without an image there is no PSNR and there are no levels; give the loss a target"
+        )
+    if weight is not None:
+        raise ValueError("without an image there are no errors to weigh; weigh them in the loss")
+
+
 def fit_loss(
     size: tuple[int, int] | None,
     spaces: Spaces,
@@ -366,15 +385,7 @@ def fit_loss(
     progress: FitProgress | None = None,
 ) -> Fit:
     """Fit a loss without an image; see `fit` for results and errors."""
-    if options.loss is None or size is None:
-        raise ValueError(
-            "fit needs an image, or a loss and the size of its picture: "
-            "fit(loss=f, size=(width, height))"
-        )
-    if options.goal is not None or options.levels:
-        raise ValueError(
-            "without an image there is no PSNR and there are no levels; give the loss a target"
-        )
+    assert options.loss is not None and size is not None
     start = None if options.start is None else load_start(options.start, options.backend)
     if start is not None and not isinstance(start, Gaussians):
         raise ValueError("a model needs an image to start from; give a set")

@@ -85,6 +85,11 @@ class Loss:
     def __post_init__(self) -> None:
         if not callable(self.function):
             raise TypeError(f"Loss: {self.function!r} is no function of (picture, step)")
+        if self.parameters is not None and not hasattr(self.parameters, "step"):
+            raise TypeError(
+                f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser, such "
+                "as drjit.opt.Adam"
+            )
         if self.bounds is not None and not self.bounds[0] < self.bounds[1]:
             raise ValueError(f"Loss: bounds are {self.bounds}; the first must be the smaller")
         if self.target is not None and not 0 < self.target < math.inf:
@@ -329,7 +334,11 @@ class LossObjective(Pixels):
             picture = self._named([self._tensor(k, rows) for k, rows in enumerate(shown)])
             judge = self.loss.judge
             value = self.loss.function(picture, 0) if judge is None else judge(picture)
-            return float(np.asarray(self._number(value)).reshape(-1)[0])
+            number = float(np.asarray(self._number(value)).reshape(-1)[0])
+        if not math.isfinite(number):
+            name = "its value" if judge is None else "the judge"
+            raise ValueError(f"loss: {name} is {number:g} for a picture; it must be finite")
+        return number
 
     def _number(self, value: Any) -> Float:
         """Return the value of a loss as an array of one entry.

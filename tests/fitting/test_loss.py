@@ -245,6 +245,9 @@ def test_what_is_no_loss_ends_in_one_line(loss, message):
         ({"loss": squares, "size": (8, 8), "gaussians": 65}, "takes 1 to 64"),
         ({"loss": squares, "size": (8, 8), "space": {"a": "hsv"}}, "'hsv' is unknown"),
         ({"loss": squares, "size": (8, 8), "space": {"1a": "rgb"}}, "starts with a letter"),
+        ({"loss": squares, "size": 8}, r"give \(width, height\)"),
+        ({"loss": squares, "size": (8, 8), "gaussians": [2, 4]}, "no levels"),
+        ({"loss": squares, "size": (8, 8), "weight": np.ones((8, 8))}, "weigh them in the loss"),
         ({"image": IMAGE, "size": (8, 8)}, "size is for a loss without an image"),
         ({"image": IMAGE, "gaussians": [10, 20], "loss": squares}, "levels are for the squared"),
     ],
@@ -257,6 +260,12 @@ def test_options_that_do_not_fit_are_refused(options, message):
             eg.Loss(squares, **arguments)
     with pytest.raises(TypeError, match="no function"):
         eg.Loss(3)
+    with pytest.raises(TypeError, match="give an optimiser"):
+        eg.Loss(squares, parameters={"gain": 1})
+    with pytest.raises(TypeError, match="unknown option 'loss'"):
+        eg.fit_many([IMAGE], loss=squares)
+    with pytest.raises(ValueError, match="the judge is nan"):
+        eg.fit(IMAGE, 20, 10, loss=eg.Loss(squares, judge=lambda p: p.array[0] * np.nan))
 
 
 @pytest.mark.parametrize("last", [20, 80])

@@ -118,11 +118,37 @@ def test_photos_that_do_not_fit_are_refused():
             "no bitmap 'wall.bsdf.reflektance'; it has wall.bsdf.ref",
         ),
         (NAME, photos + photos, "6 photos, but the scene has 3 sensors"),
-        (NAME, [], "0 photos"),
+        (NAME, [], "there are no photos"),
         (NAME, [GREY], r"photo 0 has shape \(32, 32, 3\), but its film has 24x24"),
         (NAME, [np.full_like(photos[0], np.nan)], "not finite"),
     ):
         with pytest.raises(ValueError, match=message):
             photo_loss(scene, name, given)
-    with pytest.raises(ValueError, match="3 photos, but 2 sensors"):
-        photo_loss(scene, NAME, photos, sensors=[0, 1])
+    light = mi.ad.Adam(lr=0.1, params={"sky.radiance": mi.Float(1)})
+    for options, message in (
+        ({"sensors": [0, 1]}, "3 photos, but 2 sensors"),
+        ({"held_out": 1}, "held_out is 1"),
+        ({"spp": 0}, "spp is 0"),
+        ({"parameters": light}, "no parameter 'sky.radiance'; did you mean 'sky.radiance.value'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            photo_loss(scene, NAME, photos, **options)
+    loss = photo_loss(scene, NAME, photos)
+    for space, message in (("data", "channels 3, .* fit 1"), ({"a": "linear"}, "fit a 3")):
+        with pytest.raises(ValueError, match=message):
+            eg.fit(loss=loss, size=(8, 8), gaussians=5, iterations=4, space=space)
+
+
+def test_photos_are_light_or_codes():
+    """Of floats, of 8 bits, or of a file: the derivative of the first step is the same."""
+    from eigengs_dr.plugins import photo_loss
+
+    scene = wall(GREY)
+    codes = np.full((SIDE, SIDE, 3), 128, np.uint8)
+    light = eg.image.color.to_linear(codes.astype(np.float32) / 255)
+    picture = mi.TensorXf(GREY)
+    values = [
+        float(np.ravel(photo_loss(scene, NAME, [photo]).function(picture, 0).numpy())[0])
+        for photo in (light, codes, mi.Bitmap(light))
+    ]
+    np.testing.assert_allclose(values, values[0], rtol=1e-4)
