@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, TypeGuard, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,9 @@ from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear
 from .io import pixels_of, to_8bit
 from .pixels import check_weight, peak_of
 from .strips import Pixels, map_threads, strips
-from .structure import C1, C2, is_tensor, similarity
+
+C1, C2 = 0.01**2, 0.03**2
+"""Constants of SSIM for pictures whose white is 1."""
 
 MAX_PSNR = 100.0
 """Upper bound of reported PSNRs, in dB: above it, only rounding errors differ."""
@@ -216,6 +218,8 @@ def ssim(a: Any, b: Any, weight: Any = None) -> Any:
     (16, 16, 1)
     """
     if is_tensor(a) or is_tensor(b):
+        from .structure import similarity  # the command line reads this file without Dr.Jit
+
         x, y = (v if is_tensor(v) else _scaled(np.asarray(pixels_of(v))) for v in (a, b))
         _check_shapes(x.shape, y.shape)
         return similarity(x, y, _weight_of_windows(x.shape, weight), _window(x.shape))
@@ -358,6 +362,16 @@ Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 def _window(shape: tuple[int, ...]) -> Doubles:
     """Return one half of the window of SSIM along an axis of images of a shape (H, W, C)."""
     return gaussian_taps(SIGMA, min(WINDOW // 2, (min(shape[:2]) - 1) // 2) / SIGMA)
+
+
+def is_tensor(value: object) -> TypeGuard[Tensor]:
+    """Whether a value is a tensor of floats of Dr.Jit that may have derivatives."""
+    kind = type(value)
+    if not (kind.__module__.startswith("drjit.") and kind.__module__.endswith(".ad")):
+        return False
+    import drjit as dr
+
+    return dr.is_tensor_v(kind) and dr.is_float_v(kind)
 
 
 def _similarity(

@@ -18,13 +18,12 @@ neighbours of runs, so both axes are read in pieces. No two lanes write to one p
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeGuard
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
 
 from ..backend.arrays import (
-    MODULES,
     ArrayTypes,
     gather_run,
     make_divisor,
@@ -34,9 +33,7 @@ from ..backend.arrays import (
 )
 from ..backend.doors import door
 from ..backend.types import Bool, Doubles, Float, Tensor, UInt, Values
-
-C1, C2 = 0.01**2, 0.03**2
-"""Constants of SSIM for pictures whose white is 1."""
+from .metrics import C1, C2, is_tensor
 
 BLOCK = 8
 """Values of a line that a lane computes. With 16 it reads a quarter less, but the registers of a
@@ -44,12 +41,6 @@ CPU do not hold them: value and derivative took twice the time."""
 
 PLANES = 4
 """Planes that are blurred at once, at most."""
-
-
-def is_tensor(value: object) -> TypeGuard[Tensor]:
-    """Whether a value is a tensor of floats of Dr.Jit that may have derivatives."""
-    kind = type(value)
-    return kind.__module__ in MODULES and dr.is_tensor_v(kind) and dr.is_float_v(kind)
 
 
 @door

@@ -257,7 +257,7 @@ def test_convert(tmp_path, monkeypatch):
         assert words in told
     report = json.loads((tmp_path / "r").read_text())
     [texture] = report["textures"]
-    assert report["bytes"] == texture["gaussian_bytes"] > report["bytes_before"] == 2 * 32 * 32 * 3
+    assert report["bytes"] == texture["gaussian_bytes"] > report["bytes_before"] == 2 * 32 * 32 * 4
     assert report["better"] == [] and len(report["left"]) == 5
     assert (tmp_path / "new" / "scene.xml").exists()
     told = said("convert", scene, "-o", tmp_path / "other", *settings)
