@@ -20,6 +20,7 @@ from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians, one_image, scale_channels
 from ..image.metrics import float_space, target_key
+from ..image.pixels import check_weight
 from ..raster.render import picture_of
 from .coarse import COARSE_TO_FINE
 from .control import Redistribute, Surplus
@@ -34,7 +35,7 @@ from .measure import Row, psnrs
 from .method import DEFAULT, Method
 from .objective import Affine, Pixels, data_of, fitted, picture, restored
 from .options import FitOptions, Goal, Start, named_options
-from .pixels import Image, PixelsOrPath, check_channels, check_weight, read_pixels
+from .pixels import Image, PixelsOrPath, check_channels, read_pixels
 from .place import Adaptive
 from .start import check_start, load_start, set_in, start_from, types_for
 

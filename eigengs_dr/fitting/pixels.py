@@ -12,7 +12,6 @@ from ..backend.types import PathLike, Values
 from ..image.color import rendered_as
 from ..image.io import check_data, check_image, read_image
 from ..image.pixels import MAX_PIXEL, MIN_PIXEL, EncodedImage, ImageError
-from ..image.pixels import check_weight as check_weight
 
 PixelsOrPath: TypeAlias = ArrayLike | PathLike | EncodedImage
 """An image: array_like pixels, such as a ``mitsuba.Bitmap``; pixels that know their encoding; or

@@ -123,13 +123,13 @@ def test_each_image_of_a_batch_retreats_for_itself():
 
 
 def test_rates_that_are_too_high_are_lowered():
-    """What is gained is nearly that of good rates."""
+    """At default steps, half of what good rates gain is left, at least."""
     image = eg.sample("coffee")[100:148, 200:248]
     good, high = (
-        eg.fit(image, 100, 200, method=eg.DEFAULT.at_rates(factor)).psnr_ycbcr for factor in (1, 8)
+        eg.fit(image, 100, method=eg.DEFAULT.at_rates(factor)).psnr_ycbcr for factor in (1, 8)
     )
     start = eg.fit(image, 100, 0).psnr_ycbcr
-    assert high > start + 0.4 * (good - start)
+    assert high > start + 0.5 * (good - start)
 
 
 def test_relocation_lets_the_surplus_go_evenly():

@@ -5,8 +5,9 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.photos import coffee
-from eigengs_dr.fitting.pixels import check_weight, read_pixels
+from eigengs_dr.fitting.pixels import read_pixels
 from eigengs_dr.image.color import to_planes
+from eigengs_dr.image.pixels import check_weight
 
 SIDE = 48
 QUICK = {"gaussians": 80, "iterations": 110}
