@@ -20,6 +20,7 @@ from __future__ import annotations
 import atexit
 import gc
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -218,26 +219,61 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Pr
 
     @wraps(function)
     def call(*arguments: object) -> object:
-        global _calls
-        with exclusive(), collector_off():
+        with _calling():
             arrays: list[DrJitArray] = []
             shape = _flatten(arguments, arrays)
             program = programs.pop(shape, None) or freeze(shape)
             programs[shape] = program  # now the last one
             if limit is not None and len(programs) > limit:
                 _retire([programs.pop(next(iter(programs)))].clear)
-            _calls += 1
-            try:
-                flat = program(arrays)
-            except RuntimeError as error:
-                if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps what it meets
-                    raise KeyboardInterrupt from error
-                raise
-            finally:
-                _calls -= 1
+            flat = program(arrays)
             return _build(results[shape], iter(flat))
 
     return programs, call
+
+
+@contextmanager
+def _calling() -> Iterator[None]:
+    """Let no other thread use Dr.Jit, and nothing be freed, while a frozen program is called."""
+    global _calls
+    with exclusive(), collector_off():
+        _calls += 1
+        try:
+            yield
+        except RuntimeError as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps what it meets
+                raise KeyboardInterrupt from error
+            raise
+        finally:
+            _calls -= 1
+
+
+def freeze_rendering(function: Program) -> Program:
+    """Freeze a function that takes objects of Mitsuba, such as a scene, beside arrays.
+
+    Dr.Jit walks what the objects hold at every call, so a change of the scene is noticed. If one of
+    them is written in Python, a thread that drops arrays meanwhile may wait for ever, see above:
+    such a scene belongs to a program of one thread.
+
+    Parameters
+    ----------
+    function : callable
+        Of positional arguments; it uses nothing else that changes.
+
+    Returns
+    -------
+    callable
+        The frozen function; its recordings are freed after it.
+    """
+    frozen = dr.freeze(function, warn_after=MANY_RECORDINGS)
+
+    @wraps(function)
+    def call(*arguments: object) -> object:
+        with _calling():
+            return frozen(*arguments)
+
+    weakref.finalize(call, _retire, frozen.clear)
+    return call
 
 
 def _flatten(value: Any, arrays: list[DrJitArray]) -> Shape:

@@ -184,9 +184,10 @@ NO_ERROR = 1e-20
 FLAT = 0.02
 """Secant of a tile, relative to that of all tiles, below which the loss does not depend on it."""
 
-LITTLE = 0.01
+LITTLE = 0.1
 """Squared error of a tile, relative to the mean, that says as much as the secants of all tiles. For
-L1 + 0.2 (1 - SSIM), 400 steps and 4 training photos, 0.1 ends with a loss 2 % higher."""
+L1 + 0.2 (1 - SSIM), 1,000 steps and 8 training photos, 0.01 ends with a loss 0 to 1 % lower, and a
+PSNR 0.13 dB lower."""
 
 PULL = 10.0
 """How strongly sums outside the bounds are pulled back: a tenth of the range outside weighs as much
