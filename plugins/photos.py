@@ -51,8 +51,8 @@ def photo_loss(
     pictures : str or mapping of str to str
         The bitmap that is looked for, as `mitsuba.traverse` names it, such as
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
-        are those of ``space`` of `eigengs_dr.fit`. Bitmaps need ``raw: true``; their texels are
-        then light, so fit colours with ``space="linear"``, and roughness with ``"data"``.
+        are those of the set. Bitmaps need ``raw: true``; their texels are then light or data, so
+        the ``space`` of a fit is by default "linear" for three channels, and "data" for one.
     photos : sequence of array_like, shape (H, W, 3), path-like or mitsuba.Bitmap
         Of the size of the film of its sensor each. Arrays of floats are linear light; codes of 8
         bits are sRGB, and files what they say.
@@ -102,7 +102,7 @@ def photo_loss(
     ...     "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": grey}}})
     >>> photo = 1.2 * mi.render(scene, spp=64).numpy()
     >>> loss = photo_loss(scene, "wall.bsdf.reflectance", [photo])
-    >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40, space="linear")
+    >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40)
     """
     known = mi.traverse(scene)
     keys = dict(pictures) if isinstance(pictures, Mapping) else {"": pictures}
@@ -191,7 +191,9 @@ def photo_loss(
         means = [_mean(p, hidden[n]) for p, n in zip(products, judged, strict=True)]
         return sum(means) / len(means)
 
-    return Loss(function, bounds, parameters, judge if held_out else None)
+    spaces = {name: "linear" if number == 3 else "data" for name, number in channels.items()}
+    space = spaces if isinstance(pictures, Mapping) else spaces[""]
+    return Loss(function, bounds, parameters, judge if held_out else None, space=space)
 
 
 def _add_slopes(

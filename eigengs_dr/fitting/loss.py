@@ -8,7 +8,7 @@ they see the squared error of an image.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -58,6 +58,8 @@ class Loss:
         ``function(picture, 0)``.
     target : float, optional
         Value to reach with as few Gaussians as possible, instead of their number.
+    space : str or mapping of str to str, optional
+        Space of the sums without an image, if `eigengs_dr.fit` gets none.
 
     Raises
     ------
@@ -81,6 +83,7 @@ class Loss:
     parameters: Any = None
     judge: Callable[[Any], Any] | None = None
     target: float | None = None
+    space: str | Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
         if not callable(self.function):

@@ -133,6 +133,26 @@ def test_no_image_is_needed(space):
     assert [row["iteration"] for row in found.trace][:2] == [100, 100]
 
 
+def test_a_weight_says_where_the_picture_matters():
+    """Most of the loss lies in a quarter of the picture; the texels' picture does not say so."""
+    weight = np.full((SIDE, SIDE, 1), 0.001, np.float32)
+    weight[: SIDE // 2, : SIDE // 2] = 1
+
+    def loss(picture, step):
+        return dr.mean(dr.square(picture - type(picture)(IMAGE)) * type(picture)(weight), axis=None)
+
+    asked = {"loss": loss, "size": (SIDE, SIDE), "gaussians": 100, "iterations": 100}
+    plain, weighed = (eg.fit(**asked, space="rgb", weight=w).loss for w in (None, weight))
+    assert weighed < 0.85 * plain
+
+
+def test_the_space_of_a_loss_is_a_default():
+    loss = eg.Loss(squares, space="rgb")
+    asked = {"loss": loss, "size": (SIDE, SIDE), "gaussians": 50, "iterations": 4}
+    assert eg.fit(**asked).gaussians.space == "rgb"
+    assert eg.fit(**asked, space="linear").gaussians.space == "linear"
+
+
 def test_a_start_takes_the_place_of_texels():
     first = eg.fit(loss=squares, size=(SIDE, SIDE), gaussians=100, iterations=60, space="rgb")
     then = eg.fit(loss=squares, size=(SIDE, SIDE), start=first, iterations=60)
@@ -254,7 +274,8 @@ def test_what_is_no_loss_ends_in_one_line(loss, message):
         ({"loss": squares, "size": (8, 8), "space": {"1a": "rgb"}}, "starts with a letter"),
         ({"loss": squares, "size": 8}, r"give \(width, height\)"),
         ({"loss": squares, "size": (8, 8), "gaussians": [2, 4]}, "no levels"),
-        ({"loss": squares, "size": (8, 8), "weight": np.ones((8, 8))}, "weigh them in the loss"),
+        ({"loss": squares, "size": (8, 8), "weight": np.ones((8, 9))}, "9x8 pixels, but size is"),
+        ({"loss": squares, "size": (8, 8), "weight": np.ones((8, 8, 2))}, "2 channels, but the"),
         ({"image": IMAGE, "size": (8, 8)}, "size is for a loss without an image"),
         ({"image": IMAGE, "gaussians": [10, 20], "loss": squares}, "levels are for the squared"),
     ],

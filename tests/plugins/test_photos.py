@@ -56,7 +56,7 @@ def test_a_texture_is_recovered():
 
     scene, photos = wall(GREY), photos_of(wall(true_texture()))
     loss = photo_loss(scene, NAME, photos)
-    found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=120, space="linear")
+    found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=120)
     inner = np.s_[4:-4, 4:-4]
     error = np.mean((found.image[inner] - eg.image.color.to_coded(true_texture())[inner]) ** 2)
     assert error < 1e-3
