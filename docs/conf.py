@@ -93,7 +93,13 @@ def check_pages(app: Any) -> None:
 
 
 def show_hidden(app: Any, name: str, source: list[str]) -> None:
-    """Take what only the HTML can show out of its comment; link examples to their tutorials."""
+    """Take what only the HTML can show out of its comment; link examples to their tutorials.
+
+    The first page begins with README.md.
+    """
+    if name == "index":
+        readme = re.sub(r"\]\((?!https?:|#)", "](../", (ROOT / "README.md").read_text("utf-8"))
+        source[0] = readme.replace("](../docs/", "](") + source[0]
     shown = re.sub(r"<!-- manual:\n(.*?)-->", r"\1", source[0], flags=re.S)
     shown = re.sub(r"\((?:\.\./)+examples/README\.md\)", "(/tutorials/index.rst)", shown)
     source[0] = re.sub(r"\((?:\.\./)+examples/(\w+)\.py\)", r"(/tutorials/\1.rst)", shown)

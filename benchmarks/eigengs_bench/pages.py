@@ -20,6 +20,7 @@ from pathlib import Path
 
 from matplotlib import __version__ as drawn_with
 
+from eigengs_bench import overview
 from eigengs_bench.report import QUESTIONS, Table, as_text, drawn, sources_of, table
 from eigengs_bench.rows import Row, read
 from eigengs_dr.storage.atomic import atomic_write
@@ -76,6 +77,10 @@ def write(checkout: Path) -> list[Path]:
 def filled(text: str, parts: Mapping[str, str], name: str) -> str:
     """Return a page with its parts written between their marks; marks of other kinds stay."""
     kinds = {key.partition(":")[0] for key in parts}
+    if inside := re.search(r"^ *<!-- (figure: \S+|setting) -->", text, re.M):
+        raise ValueError(
+            f"{name}: a line begins with <!-- {inside[1]} -->, which ends the sentence"
+        )
 
     def part(mark: re.Match[str]) -> str:
         if mark[2] not in kinds:
@@ -90,21 +95,25 @@ def filled(text: str, parts: Mapping[str, str], name: str) -> str:
 
 def contents(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
     """Return what a page can name, in Markdown, by its mark; and the charts by their names."""
-    parts, charts = _tables_measured_once(path), dict[str, bytes]()
+    rows: dict[str, list[Row]] = {}
+    for row in read(path):
+        rows.setdefault(row["bench"], []).append(row)
+    parts = _tables_measured_once(rows.get("once", []))
+    charts = {name: drawn(figure) for name, figure in overview.charts(rows).items()}
     for bench in QUESTIONS:
-        if rows := read(path, bench):
-            section = import_module(f"eigengs_bench.{bench}").summarize(rows)
+        if made := rows.get(bench):
+            section = import_module(f"eigengs_bench.{bench}").summarize(made)
             known = [one for one in section.tables if not one.frame.empty]
-            parts |= {f"table: {bench}.{one.name}": _with_source(one, rows) for one in known}
+            parts |= {f"table: {bench}.{one.name}": _with_source(one, made) for one in known}
             parts |= {f"figure: {bench}.{name}": text for name, text in section.figures.items()}
             charts |= {name: drawn(figure) for name, figure in section.charts.items()}
     return parts, charts
 
 
-def _tables_measured_once(path: Path) -> dict[str, str]:
+def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
     """Lay out the rows of "once"; rows of one table are parts of it, of several runs."""
     groups: dict[str, list[Row]] = {}
-    for row in read(path, "once"):
+    for row in measured:
         groups.setdefault(row["job"]["table"], []).append(row)
     return {
         f"table: once.{name}": _with_source(
@@ -122,5 +131,8 @@ def _with_source(shown: Table, rows: Sequence[Row]) -> str:
     if not sources:
         return f"{cells}\n\n*{shown.caption}.*"
     lines = "\n".join(f"- {line}" for line in sources)
-    folded = f"<details><summary>How it was measured</summary>\n\n{lines}\n\n</details>"
-    return f"{cells}\n\n*{shown.caption}.*\n\n{folded}"
+    return f"{cells}\n\n*{shown.caption}.*\n\n{_folded('How it was measured', lines)}"
+
+
+def _folded(title: str, text: str) -> str:
+    return f"<details><summary>{title}</summary>\n\n{text}\n\n</details>"

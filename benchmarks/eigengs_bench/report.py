@@ -20,9 +20,10 @@ from eigengs_dr.storage.atomic import atomic_write
 TAG = re.compile(rb"<[^>]+>")  # of an SVG file
 MISSING = "-"  # cell of a figure that is not there
 
-# Lines of the methods, which differ in lightness too, for readers who confuse red and green.
-COLORS = {"default": "#0b6e99", "gaussianimage": "#b5442f", "eigengs": "#5a8f3c"}
-INK = "#222222"
+# Colours that readers tell apart who confuse red and green (Okabe and Ito, 2008).
+BLUE, RED, GREEN, ORANGE = "#0072b2", "#d55e00", "#009e73", "#e69f00"
+SKY, PINK, GREY, INK = "#56b4e9", "#cc79a7", "#888888", "#222222"
+COLORS = {"default": BLUE, "gaussianimage": RED, "eigengs": GREEN}
 
 # Titles, and the modules of this package that make tables and charts of their rows.
 QUESTIONS = {
@@ -131,9 +132,14 @@ def as_text(table: Table, style: str = "simple") -> str:
     """Lay a table out for a terminal, or for Markdown with the style "pipe"."""
     if table.frame.empty:
         return f"{table.caption}: none"
-    sides = ["left", *["right"] * (len(table.frame.columns) - 1)]
+    sides = ["right" if is_numeric(table.frame[name]) else "left" for name in table.frame]
     options: Any = {"tablefmt": style, "colalign": sides, "disable_numparse": True}
     return f"{table.caption}\n\n{table.frame.to_markdown(index=False, **options)}"
+
+
+def is_numeric(cells: pd.Series) -> bool:
+    """Tell whether the cells of a column begin like numbers, or are empty."""
+    return bool(cells.astype(str).str.fullmatch(r"[-+\d].*|").all())
 
 
 def number(value: float | None, decimals: int = 1) -> str:
@@ -230,3 +236,14 @@ def label_axes(
     axis.grid(alpha=0.3)
     if legend:
         axis.legend(fontsize=8, framealpha=0.6)
+
+
+def legend_beside(figure: Figure, axis: Axes) -> None:
+    """Name the lines of an axis once, to the right of all axes of a figure."""
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", fontsize=8)
+
+
+def legend_below(figure: Figure, axis: Axes, columns: int) -> None:
+    """Name the lines of an axis once, below all axes of a figure."""
+    named = axis.get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower center", fontsize=8, ncols=columns)
