@@ -411,7 +411,7 @@ def test_pages_and_charts_have_what_their_rows_give(checkout):
     charts = sorted((checkout / pages.CHARTS).iterdir())
     shown = {name for p in pages.pages_of(checkout) for name in pages.CHART.findall(p.read_text())}
     assert {chart.stem for chart in charts} == shown
-    assert max(chart.stat().st_size for chart in charts) < 75_000
+    assert max(chart.stat().st_size for chart in charts) < 60_000
 
     results, chart = checkout / "docs/results.md", charts[0]
     right = results.read_text(), chart.read_bytes()

@@ -51,8 +51,9 @@ def _methods(axis: Axes, fits: pd.DataFrame) -> None:
     for (method, color), marker in zip(fr.COLORS.items(), "osD", strict=True):
         points = fits[fits.value == method].groupby("iteration")[["seconds", "psnr_rgb"]]
         means = points.agg({"seconds": "median", "psnr_rgb": "mean"})
-        style = {"color": color, "marker": marker, "ms": 5}
-        axis.plot(means.seconds, means.psnr_rgb, label=NAMES[method], **style)
+        axis.plot(
+            means.seconds, means.psnr_rgb, f"{marker}-", ms=5, color=color, label=NAMES[method]
+        )
     shape = SETS[SAMPLES]
     size = f"{shape.width}x{shape.height} pixels, {shape.gaussians:,} Gaussians, 2 cores"
     axis.set_title(f"{fits.image.nunique()} photos of {size}", fontsize=9)
@@ -63,13 +64,9 @@ def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
     timed = fits[fits.timed & (fits.iterations > 0)]
     for (steps, part), alpha in zip(timed.groupby("iterations"), (1.0, 0.5), strict=False):
         points = part.groupby("gaussians").agg({"seconds": "median", "psnr_float": "mean"})
-        style = {"color": fr.BLUE, "marker": "o", "ms": 5, "alpha": alpha}
-        axis.plot(
-            points.seconds,
-            points.psnr_float,
-            label=f"eigengs_dr, {steps:,} steps, by Gaussians",
-            **style,
-        )
+        label = f"eigengs_dr, {steps:,} steps, by Gaussians"
+        x, y = points.seconds, points.psnr_float
+        axis.plot(x, y, "o-", ms=5, color=fr.BLUE, alpha=alpha, label=label)
         for count, point in points.iterrows() if alpha == 1 else ():
             words = f"{count:,} Gaussians" if count == points.index.min() else f"{count:,}"
             at = (point.seconds, point.psnr_float)
@@ -91,5 +88,4 @@ def _peers(axis: Axes, fits: pd.DataFrame) -> None:
     groups = fits.groupby("method", sort=False) if len(fits) else ()
     for (name, part), (color, marker) in zip(groups, PEERS, strict=False):
         points = part.groupby("iteration").agg({"seconds": "median", "psnr_rgb": "mean"})
-        style = {"color": color, "marker": marker, "ms": 6, "ls": "--"}
-        axis.plot(points.seconds, points.psnr_rgb, label=name, **style)
+        axis.plot(points.seconds, points.psnr_rgb, f"{marker}--", color=color, label=name)
