@@ -41,7 +41,7 @@ exclude_patterns = ["tutorials/*.ipynb"]  # sphinx-gallery offers them, beside t
 
 # --- Pages ---------------------------------------------------------------------------------------
 
-myst_enable_extensions = ["deflist", "dollarmath"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

@@ -432,6 +432,13 @@ def test_the_page_of_the_texture_has_its_parameters(monkeypatch):
     assert pages["outdated"]() == {}
 
 
+def test_readme_fits_a_screen():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    first = [line for line in lines if line.startswith("!")]
+    assert len(lines) <= 120 and "speed.svg" in first[1]
+    assert (FOLDER / "images/teaser.jpg").stat().st_size < 150_000
+
+
 def test_no_page_needs_a_build_to_be_read():
     """Nothing is filled in by Sphinx alone: no substitutions, roles, or pictures in directives."""
     for page in PAGES:
