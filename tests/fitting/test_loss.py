@@ -341,14 +341,16 @@ def test_the_slope_is_a_finite_difference(backend, space):
 
 
 def test_the_curvature_of_the_squared_error_is_its_weight():
-    """The secant of each tile is exact, up to the unit."""
+    """The secant of each tile is exact, up to the unit and what a tile of mean error is pulled."""
     gaussians = eg.fit(IMAGE, 60, 20, space="rgb").gaussians
-    base = Pixels.plain(IMAGE, gaussians)
+    noise = np.random.default_rng(5).normal(0, 0.1, IMAGE.shape).astype(np.float32)
+    image = eg.render(gaussians).numpy() + noise
+    base = Pixels.plain(image, gaussians)
     weight = np.ones((SIDE, SIDE, 1), np.float32)
     weight[:, SIDE // 2 :] = 4
 
     def loss(picture, step):
-        error = picture - type(picture)(IMAGE)
+        error = picture - type(picture)(image)
         return dr.sum(dr.square(error) * type(picture)(weight), axis=None)
 
     objective = LossObjective.of_loss(eg.Loss(loss), [View("", "rgb", range(3))], base)
@@ -356,7 +358,7 @@ def test_the_curvature_of_the_squared_error_is_its_weight():
     curvature = near.model.curvature.numpy().reshape(-1, base.grid.pixels)
     assert (curvature.max(axis=1) - curvature.min(axis=1) <= 1e-6).all()
     left, right = np.split(curvature.mean(axis=1).reshape(base.grid.ny, base.grid.nx), 2, axis=1)
-    assert 2.5 < np.median(right) / np.median(left) < 4.05  # tiles with little error take the usual
+    assert 3 < np.median(right) / np.median(left) < 4
 
 
 @pytest.mark.parametrize("size", [(16, 16), (21, 13), (9, 40)])
