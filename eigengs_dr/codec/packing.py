@@ -17,7 +17,7 @@ from ..backend.doors import door
 from ..fitting.fit import Fit
 from ..fitting.maps import Map, read_maps
 from ..fitting.objective import values_in
-from ..gaussian.channels import TextureMap, channel_weights, show_sums, slices
+from ..gaussian.channels import TextureMap, channel_weights, display_values, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
 from ..image.io import check_data, check_image
@@ -219,7 +219,7 @@ def _compare_maps(g: Gaussians, images: Images, encoding: str | None) -> Compare
     maps, cuts = g.maps, slices(g.maps)
 
     def show(sums: Array) -> list[Array]:
-        return [show_sums(m.space, sums[..., c]) for m, c in zip(g.maps, cuts, strict=True)]
+        return [display_values(m.space, sums[..., c]) for m, c in zip(g.maps, cuts, strict=True)]
 
     values = own = planes_of(g)
     shown = rendered = show(own)

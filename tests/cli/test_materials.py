@@ -103,12 +103,12 @@ MISTAKES = {
     "suffix": ([*FIT, "-o", "x.egs"], "the name must end in .npz"),
     "channels": (
         [*FIT, *(w for k in range(5) for w in ("--map", f"n{k}:normal={{0}}/normal.png"))],
-        "the maps have 18 channels, at most 16 share shapes",
+        "the maps have 18 channels, the limit is 16",
     ),
     "no output": (FIT[:3], "--map needs -o"),
     "nothing": (["fit"], "no image is given"),
     "no map": (["render", "{1}", "-o", "x.png"], "holds the maps albedo, roughness, normal"),
-    "unknown": (["render", "{1}", "-o", "x.png", "--map", "ao"], "map 'ao' is not in it; it"),
+    "unknown": (["render", "{1}", "-o", "x.png", "--map", "ao"], "no map is named 'ao'; it"),
     "image": (["pack", "{1}", "-o", "x.egs", "--image", "{0}/albedo.png"], "--map"),
     "one of three": (
         ["pack", "{1}", "-o", "x.egs", "--map", "albedo={0}/albedo.png"],

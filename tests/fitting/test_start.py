@@ -175,7 +175,7 @@ def test_fit_refuses_a_start(backend, options, words, others):
 
 
 def test_fit_refuses_what_is_no_start(others):
-    with pytest.raises(TypeError, match="list is no set of Gaussians"):
+    with pytest.raises(TypeError, match="list is not a set of Gaussians"):
         eg.fit(others[0], start=[1, 2])
     with pytest.raises(ValueError, match="100 Gaussians, more than an image of 8x8 has pixels"):
         eg.fit(others[0][:8, :8], start=small_model("llvm"), backend="llvm")
