@@ -139,7 +139,7 @@ def test_what_is_no_image(source, reason):
 
 
 def test_bad_files(tmp_path):
-    with pytest.raises(ImageError, match="is a folder; name an image file in it"):
+    with pytest.raises(ImageError, match="is a folder; give an image file in it"):
         open_source(tmp_path)
     with pytest.raises(ImageError, match=r"a\.tif: No such file"):
         open_source(tmp_path / "a.tif")

@@ -79,7 +79,7 @@ MISTAKES = {
     "twice": (["photos", "photos/00.png", "-o", "x"], "00.npz: two images have this name"),
     "one name": (["photos/00.png", "other/00.png", "-o", "x"], "00.npz: two images have this name"),
     "blocks": (["photos", "-o", "x", "--blocks", 64], "--blocks fits one image"),
-    "pattern": (["photos/*.jpg", "-o", "x"], "no file has such"),
+    "pattern": (["photos/*.jpg", "-o", "x"], "no file matches"),
     "empty": (["other/none", "-o", "x"], "other/none"),
     "a URL": (["photos", "-o", "memory://fits"], "results cannot be written to URLs"),
     "cluster": (["photos", "-o", "x", "--preview", "p", "--cluster", "local"], "no --preview"),

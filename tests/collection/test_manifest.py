@@ -175,7 +175,7 @@ def test_globs(photos, tmp_path):
     (photos / "02.png").rename(photos / "deep" / "03.png")
     names = [source.name for source in list_sources(str(tmp_path / "**" / "*.png"))]
     assert names == ["00", "01", "03"]
-    with pytest.raises(ValueError, match=r"\*\.jpg: no file has such a name; check the pattern"):
+    with pytest.raises(ValueError, match=r"\*\.jpg: no file matches; check the pattern"):
         list_sources(str(photos / "*.jpg"))
 
 

@@ -209,7 +209,7 @@ def test_check_image_keeps_rows_columns_and_channels():
         ([[1, 2], [3]], "not an array"),
         (
             np.full((2, 2), 255.0),
-            "from 255 to 255, not 0 to 1; divide by 255 first, or say encoding=",
+            "from 255 to 255, not 0 to 1; divide by 255 first, or pass encoding=",
         ),
         (np.full((2, 2), 1e300), "scale it first"),
         (np.array([[-1.0, 1.0]]), "from -1 to 1, not 0 to 1; scale it"),
