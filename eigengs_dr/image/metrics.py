@@ -418,10 +418,12 @@ def _similarity_sums(
     covariance, variances = blur(x * y, taps) - product, blur(x * x + y * y, taps) - squares
     structure = (2 * covariance + C2) / (variances + C2)
     luminance = (2 * product + C1) / (squares + C1)
-    terms = luminance * structure, structure
+    similarity = luminance * structure
     if weight is not None:
-        terms = tuple(np.where(weight > 0, weight * term, 0) for term in terms)
-    return float(terms[0].sum()), float(terms[1].sum())
+        similarity, structure = (
+            np.where(weight > 0, weight * term, 0) for term in (similarity, structure)
+        )
+    return float(similarity.sum()), float(structure.sum())
 
 
 def halve(image: NDArray[np.floating]) -> NDArray[np.float64]:

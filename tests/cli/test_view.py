@@ -64,7 +64,7 @@ def test_shows_a_model(photo):
     said("view", "model.npz", "--image", "photo.png")
     assert "Random image" in page_of(photo.with_name("model.npz"))
     assert_refused(
-        run("view", "model.npz", "--levels", 2), "model.npz", "leave --levels and --map out"
+        run("view", "model.npz", "--levels", 2), "model.npz", "leave out --levels and --map"
     )
 
 

@@ -86,7 +86,7 @@ HOSTILE = {
     "a name": ({"names": np.array(["albedo", "../x", "normal"])}, "a name starts with a letter"),
     "lengths": ({"weights": np.ones(2)}, "differ in length"),
     "too many": ({"names": np.array(["a"] * 99)}, "claims shape"),
-    "long": ({"names": np.array(["a" * 70, "b", "c"])}, "over 64 characters"),
+    "long": ({"names": np.array(["a" * 70, "b", "c"])}, "longer than 64 characters"),
     "missing": ({"names": None}, "key 'names' is missing"),
     "values": ({"color": np.full((24, 7), np.nan, np.float32)}, "color holds values that are not"),
 }

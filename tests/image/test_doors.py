@@ -63,7 +63,7 @@ def test_a_transparent_pil_image_is_shown_over_white(mode):
     np.testing.assert_allclose(found, 1 - 0.2 * (1 - straight), atol=0.02)
 
 
-@pytest.mark.parametrize(("mode", "words"), [("I", "32 bits"), ("LAB", "CIELab")])
+@pytest.mark.parametrize(("mode", "words"), [("I", "32-bit integers"), ("LAB", "CIELab")])
 def test_a_pil_image_without_a_meaning_is_refused(mode, words):
     with pytest.raises(ImageError, match=f"image: holds .*{words}") as error:
         eg.fit(Image.new(mode, (8, 8)), 4, iterations=0)
