@@ -75,7 +75,7 @@ class Executor(Protocol):
         ClusterError
             If the cluster is lost.
         Exception
-            Any exception that the function raises.
+            The exception of the function, if it raises one.
         """
 
 

@@ -120,7 +120,7 @@ def test_a_file_without_its_row_says_its_figures(photos, output):
 def test_another_file_of_this_name_is_kept(photos, output, text):
     output.mkdir()
     (output / NAME).write_text(text)
-    with pytest.raises(ValueError, match="is no row of a manifest; move the file"):
+    with pytest.raises(ValueError, match="is not a row of a manifest; move the file"):
         eg.fit_many(photos, output, **QUICK)
     assert (output / NAME).read_text() == text
     assert [path.name for path in output.iterdir()] == [NAME]
