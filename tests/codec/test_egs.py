@@ -19,7 +19,7 @@ from _helpers.packed import STEPS, peak
 from _helpers.sets import COUNT, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec.quantization import Steps, Symbols, quantize
-from eigengs_dr.codec.weights import SMALL
+from eigengs_dr.codec.weights import MIN_RICH_COUNT
 
 FILES = Path(__file__).parent / "files"
 
@@ -78,7 +78,7 @@ def test_equal_splats_take_few_bits():
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
-@pytest.mark.parametrize("count", [1, 2, 9, 16, 17, 100, SMALL + 100])
+@pytest.mark.parametrize("count", [1, 2, 9, 16, 17, 100, MIN_RICH_COUNT + 100])
 def test_files_of_many_and_of_few_gaussians_come_back(path, count, channels):
     """They differ in what the model of the probabilities may use."""
     before = content(random_scene(0, count, (200, 200), channels), sections=(count,))
