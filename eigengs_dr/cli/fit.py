@@ -163,11 +163,11 @@ def fit(
             records = [_fit_by_blocks(run, files[0], outputs[0], blocks, settings, client)]
         else:
             records = [_fit_at_once(run, maps or files[0], outputs[0], pictures[0], settings)]
-    used = choices | {"block": blocks}
+    used = dict(choices)
     if settings.start is not None:
         used["basis"] = basis or DEFAULT_BASIS
     figures = {"images": records} if several else records[0]
-    run.write_report(used | figures)
+    run.write_report(used | {"block": blocks} | figures)
     run.context.exit(_exit_code(records, len(inputs), settings))
 
 

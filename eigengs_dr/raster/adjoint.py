@@ -80,14 +80,13 @@ def adjoint_pieces(
     sizes, pieces, tile_size = lists.sizes, lists.pieces, lists.grid.tile
     assert pieces is not None
     rows, shares = shares_of(types, lists.grid)
-    index, begin, end, slot = pieces.splat, pieces.begin, pieces.end, pieces.slot
+    fields = [pieces.splat, pieces.begin, pieces.end, pieces.slot]
     part = types.UInt(0)
     if shares > 1:  # neighbouring lanes visit the same tiles, and together read a contiguous run
-        lane = dr.arange(types.UInt, dr.width(slot) * shares)
+        lane = dr.arange(types.UInt, dr.width(pieces.slot) * shares)
         part, owner = lane % shares, lane // shares
-        index, begin, end, slot = (
-            dr.gather(types.UInt, v, owner) for v in (index, begin, end, slot)
-        )
+        fields = [dr.gather(types.UInt, v, owner) for v in fields]
+    index, begin, end, slot = fields
     splat = unpack_parameters(packed, index, NUM_SHAPE_PARAMS + channels)
     shape, block = splat[:NUM_SHAPE_PARAMS], (tile_size[0], rows)
     length, images = block[0] * rows, _images_in(factors, lists)
