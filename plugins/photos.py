@@ -53,9 +53,9 @@ def photo_loss(
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
         are those of the set. Bitmaps need ``raw: true``; their texels are then light or data, so
         the ``space`` of a fit is by default "linear" for three channels, and "data" for one.
-    photos : sequence of array_like, shape (H, W, 3), path-like or mitsuba.Bitmap
-        Of the size of the film of its sensor each. Arrays of floats are linear light; codes of 8
-        bits are sRGB, and files what they say.
+    photos : sequence of array_like or tensor, shape (H, W, 3), path-like or mitsuba.Bitmap
+        Of the size of the film of its sensor each. Floats, such as those of `mitsuba.render`, are
+        linear light; codes of 8 bits are sRGB, and files what they say.
     sensors : sequence of sensors or numbers, optional
         One for each photo, by default the first ones of the scene.
     integrator : mitsuba.Integrator, optional
@@ -121,8 +121,8 @@ def photo_loss(
         raise ValueError(
             f"photo_loss: {len(photos)} photos, but the scene has {len(scene.sensors())} sensors"
         )
-    chosen = list(range(len(photos)) if sensors is None else sensors)
-    chosen = [scene.sensors()[sensor] if isinstance(sensor, int) else sensor for sensor in chosen]
+    named = range(len(photos)) if sensors is None else sensors
+    chosen = [scene.sensors()[s] if isinstance(s, int) else s for s in named]
     targets = [
         _check_photo(number, photo, sensor.film().crop_size())
         for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
@@ -270,6 +270,7 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
 
 def _check_photo(number: int, photo: ArrayLike, size: Sequence[int]) -> mi.TensorXf:
     """Return a photo as a tensor of linear light, of the size of its film."""
+    photo = photo.numpy() if dr.is_array_v(photo) else photo
     floats = np.issubdtype(getattr(photo, "dtype", np.uint8), np.floating)
     image = read_floats(photo, encoding="linear" if floats else None)
     pixels = to_linear(image.pixels) if image.encoding == "srgb" else np.asarray(image.pixels)

@@ -357,11 +357,11 @@ def test_inverse(monkeypatch, tmp_path):
     for name, value in (small | {"PHOTOS": photos}).items():
         monkeypatch.setattr(inverse, name, value)
     rows, text = answered(tmp_path / "out", "inverse", "--backend", "llvm")
-    ball, material = rows[:10], rows[10:]
-    for first, then in zip(ball[:5], ball[5:], strict=True):
+    ball, material = rows[:12], rows[12:]
+    for first, then in zip(ball[:6], ball[6:], strict=True):
         assert first["job"]["method"] == then["job"]["method"] in inverse.METHODS
         assert first["seconds"] > 0 and 5 < first["psnr_rgb"] < then["psnr_rgb"]
-    assert [row["job"]["method"] for row in material] == ["texels", "pyramid", "fit"] * 2
+    assert [row["job"]["method"] for row in material] == ["texels", "pyramid", "frozen", "fit"] * 2
     assert all(row["albedo"] > 5 and row["roughness_constant"] > 5 for row in material)
     assert "ball, 2 cameras" in text and "at equal seconds" in text
 

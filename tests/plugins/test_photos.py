@@ -80,7 +80,7 @@ def test_the_derivative_is_a_forward_difference():
     from eigengs_dr.plugins import photo_loss
 
     scene, photos = wall(GREY), photos_of(wall(true_texture()))
-    loss = photo_loss(scene, NAME, photos, spp=256)
+    loss = photo_loss(scene, NAME, [mi.TensorXf(photo) for photo in photos], spp=256)
     random = np.random.default_rng(1)
     texture, along = random.uniform(0.3, 0.7, (2, 32, 32, 3)).astype(np.float32)
     picture = mi.TensorXf(texture)
