@@ -23,7 +23,7 @@ from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.resize import center_crop, resample
 
 TEXELS, PIXELS, SPP = 1024, 512, 16
-GOAL, TRIES = 40.0, 3  # dB; searches for Gaussians, each closer than the last one
+GOAL, TRIES, ITERATIONS = 40.0, 3, 400  # dB; searches for Gaussians, and the steps of a fit
 FINE = 1.03  # ratio of the sides of two bitmaps at which a search ends
 SKY = 1.0  # radiance; a diffuse poster then shows its texture, without noise
 PHOTOS = ("astronaut", "chelsea", "coffee", "retina", "rocket")
@@ -97,10 +97,10 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
     inside = 1.0 * (picture(mi, {"type": "rgb", "value": SKY / 2})[..., 0] < 0.75 * SKY)
 
     def psnr(texture: dict[str, Any]) -> float:
-        shown, compared = picture(mi, texture), "data"
-        if poster.space == "linear":
-            return eg.psnr(to_coded(shown), to_coded(goal), "rgb", weight=inside)
-        return eg.psnr(shown, goal, compared, weight=inside)
+        shown = picture(mi, texture)
+        if poster.space == "data":
+            return eg.psnr(shown, goal, "data", weight=inside)
+        return eg.psnr(to_coded(shown), to_coded(goal), "rgb", weight=inside)
 
     side = _smallest_side(lambda n: psnr(bitmap(mi, resample(poster.image, n, n))))
     small = bitmap(mi, resample(poster.image, side, side))
@@ -111,7 +111,9 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
     with TemporaryDirectory() as folder:
         file = {"type": "gaussian_texture", "filename": f"{folder}/poster.npz"}
         for _ in range(TRIES):
-            fit = eg.fit_for_scene(scene, SLOT, poster.image, wanted, poster.space)
+            fit = eg.fit_for_scene(
+                scene, SLOT, poster.image, wanted, poster.space, iterations=ITERATIONS
+            )
             fit.gaussians.save(file["filename"])
             found |= {"gaussians": len(fit.gaussians), "psnr": psnr(file)}
             if found["psnr"] >= GOAL:
@@ -139,7 +141,7 @@ def bitmap(mi: Any, image: Image) -> dict[str, Any]:
 
 
 def scene_of(mi: Any, texture: dict[str, Any]) -> Any:
-    """Load the poster, which lies on the ground, and a camera above one of its sides."""
+    """Load the poster, which lies on the ground, and a camera above one side."""
     camera = mi.ScalarTransform4f().look_at([0, -2.75, 2.35], [0, -0.12, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
     sampler = {"type": "stratified", "sample_count": SPP}

@@ -1,4 +1,4 @@
-"""How fast a texture of Gaussians is in Mitsuba: against a bitmap on the same ball."""
+"""How fast a texture of Gaussians is in Mitsuba, and what it holds: against a bitmap."""
 
 import math
 import time
@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 
 import eigengs_dr as eg
+from eigengs_bench import poster
 from eigengs_bench.clock import interleaved
 from eigengs_bench.report import Section, Table, table
 from eigengs_bench.rows import Row, Task
@@ -39,14 +40,18 @@ def run(task: Task, variant: str) -> list[Row]:
     `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
     `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
     memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
+    For the other rows see `eigengs_bench.poster`.
     """
+    rows = task.measure("texture", poster.jobs(variant, task.data), "posters")
     job: Row = {"variant": variant, "at": time.time()}  # each call measures anew
-    return task.measure("texture", [(job, partial(measure, variant, task.progress))])
+    return rows + task.measure("texture", [(job, partial(measure, variant, task.progress))])
 
 
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay out the figures of the last row, and what a user of the texture pays."""
-    row = rows[-1]
+    """Lay out the figures of the last row of a ball, and what a user of the texture pays."""
+    balls = [row for row in rows if "poster" not in row["job"]]
+    posters = [row for row in rows if "poster" in row["job"]]
+    row = balls[-1]
     lines = [(k, f"{v:.4g}") for k, v in row.items() if isinstance(v, float)]
     costs = [(f"{n:,} Gaussians", f"{row[f'ratio_{n}']:.2f}") for n in COUNTS]
     costs.append((f"{SETTLED:,} Gaussians, prefilter", f"{row['ratio_prefiltered']:.2f}"))
