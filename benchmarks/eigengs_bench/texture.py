@@ -51,10 +51,18 @@ def summarize(rows: Sequence[Row]) -> Section:
     """Lay out the figures of the last row of a ball, and what a user of the texture pays."""
     balls = [row for row in rows if "poster" not in row["job"]]
     posters = [row for row in rows if "poster" in row["job"]]
+    parts = [_posters(posters), _losses(balls, posters)] if posters else []
+    return Section([*_costs(balls), *parts], figures=_figures(posters))
+
+
+def _costs(balls: Sequence[Row]) -> list[Table]:
+    """Lay out the time of pictures, of changes, and memory, of the last row."""
     row = balls[-1]
     lines = [(k, f"{v:.4g}") for k, v in row.items() if isinstance(v, float)]
     costs = [(f"{n:,} Gaussians", f"{row[f'ratio_{n}']:.2f}") for n in COUNTS]
-    costs.append((f"{SETTLED:,} Gaussians, prefilter", f"{row['ratio_prefiltered']:.2f}"))
+    costs += [
+        (f"{n:,} Gaussians, prefilter", f"{row[f'ratio_filtered_{n}']:.2f}") for n in CHANGED
+    ]
     costs.append((f"a step of prb, {SETTLED:,} Gaussians", f"{row['ratio_step']:.2f}"))
     changes = [
         (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
@@ -63,14 +71,72 @@ def summarize(rows: Sequence[Row]) -> Section:
     over = f"Time of a picture over that with a bitmap of {TEXELS:,} x {TEXELS:,} texels"
     after = "Time to take over a change of all shapes, or of all colours"
     columns = ("lookup", *(f"{n:,} Gaussians" for n in CHANGED))
-    return Section(
-        [
-            table("Texture", ("figure", "value"), lines),
-            table(over, ("texture", "over a bitmap"), costs, name="costs"),
-            table(after, columns, changes, name="changes"),
-            _memory(row),
-        ]
+    tables = [
+        table("Texture", ("figure", "value"), lines),
+        table(over, ("texture", "over a bitmap"), costs, name="costs"),
+        table(after, columns, changes, name="changes"),
+        _memory(row),
+    ]
+    return [one._replace(rows=balls) for one in tables]
+
+
+def _posters(posters: Sequence[Row]) -> Table:
+    """Lay out the bitmaps and the Gaussians whose pictures of posters are equally good."""
+    caption = (
+        f"Memory of the smallest bitmap of 8 bits, and of the fewest Gaussians, with which a poster "
+        f"of {poster.TEXELS:,} x {poster.TEXELS:,} texels, seen aslant on a film of "
+        f"{poster.PIXELS} x {poster.PIXELS} pixels, keeps 40 dB; the text 30 dB"
     )
+    columns = ("poster", "bitmap, texels", "Gaussians", "bitmap", "points", "prefilter")
+    columns += ("points over bitmap", "over a bitmap of floats")
+    lines = [
+        (
+            row["job"]["poster"],
+            f"{row['side']} x {row['side']}",
+            f"{row['gaussians']:,}",
+            *(f"{row[k] / 1e3:.0f} kB" for k in ("bitmap_bytes", "bytes", "filtered_bytes")),
+            f"{row['ratio']:.2f}",
+            f"{row['ratio_floats']:.2f}",
+        )
+        for row in posters
+    ]
+    return table(caption, columns, lines, name="posters")._replace(rows=posters)
+
+
+def _figures(posters: Sequence[Row]) -> dict[str, str]:
+    """Return medians over the posters but the text, for sentences."""
+    pictures = [row for row in posters if row["kind"] != "text"]
+    if not pictures:
+        return {}
+    return {k: f"{median(row[k] for row in pictures):.2f}" for k in ("ratio", "ratio_floats")}
+
+
+def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
+    """Lay out where Gaussians lose: figures over those of a bitmap, and what to use instead."""
+    row, kinds = balls[-1], ("photo", "material", "text")
+    ratio = {k: [r["ratio"] for r in posters if r["kind"] == k] for k in kinds}
+    floats = median(r["ratio_floats"] for r in posters if r["kind"] != "text")
+    bitmap, bake = "a bitmap of 8 bits", "`eigengs-dr render`, then a bitmap"
+    memory = [
+        ("memory, photos", ratio["photo"], bitmap),
+        ("memory, materials", ratio["material"], bitmap),
+        ("memory, sharp text", ratio["text"], bitmap),
+    ]
+    lines = [(what, f"{median(n):.2f}", other) for what, n, other in memory if n]
+    lines.append(("memory, where texels are floats", f"{floats:.2f}", "Gaussians"))
+    for what, name in (
+        ("time of a picture", f"ratio_{SETTLED}"),
+        ("time of a picture, prefilter", f"ratio_filtered_{SETTLED}"),
+        (f"time of a picture, {CHANGED[-1]:,} Gaussians, prefilter", f"ratio_filtered_{CHANGED[-1]}"),
+        ("time of a step of `prb`", "ratio_step"),
+    ):
+        lines.append((what, f"{row[name]:.2f}", bake))
+    caption = (
+        "Gaussians over bitmaps, medians; memory for equally good pictures of posters, time with "
+        f"{SETTLED:,} Gaussians"
+    )
+    columns = ("figure", "Gaussians over a bitmap", "what is better")
+    return table(caption, columns, lines, name="losses")._replace(rows=[*balls, *posters])
 
 
 LOOKUPS = {
