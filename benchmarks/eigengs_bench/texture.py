@@ -52,7 +52,7 @@ def summarize(rows: Sequence[Row]) -> Section:
     balls = [row for row in rows if "poster" not in row["job"]]
     posters = [row for row in rows if "poster" in row["job"]]
     parts = [_posters(posters), _losses(balls, posters)] if posters else []
-    return Section([*_costs(balls), *parts], figures=_figures(posters))
+    return Section([*_costs(balls), *parts], figures=_figures(balls[-1], posters))
 
 
 def _costs(balls: Sequence[Row]) -> list[Table]:
@@ -103,12 +103,11 @@ def _posters(posters: Sequence[Row]) -> Table:
     return table(caption, columns, lines, name="posters")._replace(rows=posters)
 
 
-def _figures(posters: Sequence[Row]) -> dict[str, str]:
-    """Return medians over the posters but the text, for sentences."""
-    pictures = [row for row in posters if row["kind"] != "text"]
-    if not pictures:
-        return {}
-    return {k: f"{median(row[k] for row in pictures):.2f}" for k in ("ratio", "ratio_floats")}
+def _figures(row: Row, posters: Sequence[Row]) -> dict[str, str]:
+    """Return figures of a ball, and medians over the posters but the text, for sentences."""
+    pictures = [one for one in posters if one["kind"] != "text"]
+    medians = {k: median(one[k] for one in pictures) for k in ("ratio", "ratio_floats") if pictures}
+    return {k: f"{value:.2f}" for k, value in (medians | {"step": row["ratio_step"]}).items()}
 
 
 def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
