@@ -57,19 +57,15 @@ def _show_components(source: EigenGS | Eigenbasis) -> str:
 def _images(
     pictures: NDArray[np.float32] | Mapping[str, NDArray[np.float32]], most: int = MAX_SHOWN_SIDE
 ) -> list[str]:
-    """Return a picture, or pictures with their names, as HTML.
-
-    Of data with 2 or more than 3 channels, the first is shown.
-    """
+    """Return a picture, or pictures with their names, as HTML."""
     if isinstance(pictures, Mapping):
         return [
             f'<figure style="margin: 0; text-align: center">{_images(picture, most)[0]}'
             f"<figcaption>{escape(name)}</figcaption></figure>"
             for name, picture in pictures.items()
         ]
-    shown = pictures if pictures.shape[2] in (1, 3) else pictures[..., :1]
     style = f"max-width: min(100%, {most}px)"
-    return [f'<img src="{photo_uri(np.asarray(shown, np.float32))}" style="{style}" alt="">']
+    return [f'<img src="{photo_uri(np.asarray(pictures, np.float32))}" style="{style}" alt="">']
 
 
 def _block(text: str, *parts: str) -> str:
