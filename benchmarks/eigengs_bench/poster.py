@@ -24,7 +24,7 @@ from eigengs_dr.image.resize import center_crop, resample
 
 TEXELS, PIXELS, SPP = 1024, 512, 16
 GOAL, TEXT_GOAL = 40.0, 30.0  # dB; sharp letters take too many Gaussians for 40
-TRIES, ITERATIONS = 3, 400  # searches for Gaussians, each closer than the last; steps of a fit
+TRIES = 3  # searches for Gaussians, each closer than the last one
 FINE = 1.03  # ratio of the sides of two bitmaps at which a search ends
 SKY = 1.0  # radiance; a diffuse poster then shows its texture, without noise
 PHOTOS = ("astronaut", "chelsea", "coffee", "retina", "rocket")
@@ -115,9 +115,7 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
     with TemporaryDirectory() as folder:
         file = {"type": "gaussian_texture", "filename": f"{folder}/poster.npz"}
         for _ in range(TRIES):
-            fit = eg.fit_for_scene(
-                scene, SLOT, poster.image, wanted, poster.space, iterations=ITERATIONS
-            )
+            fit = eg.fit_for_scene(scene, SLOT, poster.image, wanted, poster.space)
             fit.gaussians.save(file["filename"])
             found |= {"gaussians": len(fit.gaussians), "psnr": psnr(file)}
             if found["psnr"] >= poster.goal:

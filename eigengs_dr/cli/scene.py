@@ -224,7 +224,7 @@ def explained(path: Path) -> Iterator[None]:
 @click.option(
     "--target-psnr", "--psnr", "target_psnr", metavar="DB", default=40.0, help="As cameras see it."
 )
-@options.number("--iterations", "Steps of optimisation for each number of Gaussians.", 100, 0)
+@options.number("--iterations", "Steps of optimisation for each number of Gaussians.", 400, 0)
 @options.number("--spp", "Samples a pixel; 0 renders nothing.  [default: from the scene]", least=0)
 @click.option("--replace-all", is_flag=True, help="Also bitmaps that are smaller or faster.")
 @variant_option
