@@ -38,24 +38,26 @@ class Poster(NamedTuple):
 
     kind: str
     image: Image
-    space: str = "linear"
-    goal: float = GOAL
+    space: str
+    goal: float
 
 
 def posters(data: Path | None) -> Iterator[tuple[str, Callable[[], Poster]]]:
     """Yield the names of the posters, and what loads them: photos, materials, and a text."""
     for name in PHOTOS:
-        yield name, lambda name=name: Poster("photo", _square(eg.sample(name)))
+        yield name, partial(_poster, "photo", partial(eg.sample, name), "linear")
     for name in MAPS:
-        yield name, lambda name=name: Poster("material", _square(eg.sample(name)[..., :1]), "data")
+        yield name, partial(_poster, "material", partial(eg.sample, name), "data")
     for name in SCANS if data else ():
         file = Path(data or "") / "textures" / name / "albedo.jpg"
-        yield name, lambda file=file: Poster("material", _square(eg.load_image(file)))
+        yield name, partial(_poster, "material", partial(eg.load_image, file), "linear")
     yield "text", lambda: Poster("text", letters(TEXELS), "data", TEXT_GOAL)
 
 
-def _square(image: Image) -> Image:
-    return np.clip(center_crop(image, TEXELS, TEXELS), 0, 1)
+def _poster(kind: str, load: Callable[[], Image], space: str) -> Poster:
+    """Load an image for a poster, of maps the first channel."""
+    image = center_crop(load(), TEXELS, TEXELS).clip(0, 1)
+    return Poster(kind, image[..., :1] if space == "data" else image, space, GOAL)
 
 
 def letters(side: int) -> Image:
@@ -104,9 +106,7 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
             return eg.psnr(shown, goal, "data", weight=inside)
         return eg.psnr(to_coded(shown), to_coded(goal), "rgb", weight=inside)
 
-    side = _smallest_side(
-        lambda n: psnr(bitmap(mi, resample(poster.image, n, n))) >= poster.goal
-    )
+    side = _smallest_side(lambda n: psnr(bitmap(mi, resample(poster.image, n, n))) >= poster.goal)
     small = bitmap(mi, resample(poster.image, side, side))
     found: Row = {"kind": poster.kind, "side": side, "psnr_bitmap": psnr(small)}
     small = bitmap(mi, resample(poster.image, side, side))

@@ -60,9 +60,7 @@ def _costs(balls: Sequence[Row]) -> list[Table]:
     row = balls[-1]
     lines = [(k, f"{v:.4g}") for k, v in row.items() if isinstance(v, float)]
     costs = [(f"{n:,} Gaussians", f"{row[f'ratio_{n}']:.2f}") for n in COUNTS]
-    costs += [
-        (f"{n:,} Gaussians, prefilter", f"{row[f'ratio_filtered_{n}']:.2f}") for n in CHANGED
-    ]
+    costs += [(f"{n:,} Gaussians, prefilter", f"{row[f'ratio_filtered_{n}']:.2f}") for n in CHANGED]
     costs.append((f"a step of prb, {SETTLED:,} Gaussians", f"{row['ratio_step']:.2f}"))
     changes = [
         (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
@@ -83,7 +81,7 @@ def _costs(balls: Sequence[Row]) -> list[Table]:
 def _posters(posters: Sequence[Row]) -> Table:
     """Lay out the bitmaps and the Gaussians whose pictures of posters are equally good."""
     caption = (
-        f"Memory of the smallest bitmap of 8 bits, and of the fewest Gaussians, with which a poster "
+        "Memory of the smallest bitmap of 8 bits, and of the fewest Gaussians, with which a poster "
         f"of {poster.TEXELS:,} x {poster.TEXELS:,} texels, seen aslant on a film of "
         f"{poster.PIXELS} x {poster.PIXELS} pixels, keeps 40 dB; the text 30 dB"
     )
@@ -123,13 +121,15 @@ def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
     ]
     lines = [(what, f"{median(n):.2f}", other) for what, n, other in memory if n]
     lines.append(("memory, where texels are floats", f"{floats:.2f}", "Gaussians"))
-    for what, name in (
-        ("time of a picture", f"ratio_{SETTLED}"),
-        ("time of a picture, prefilter", f"ratio_filtered_{SETTLED}"),
-        (f"time of a picture, {CHANGED[-1]:,} Gaussians, prefilter", f"ratio_filtered_{CHANGED[-1]}"),
-        ("time of a step of `prb`", "ratio_step"),
-    ):
-        lines.append((what, f"{row[name]:.2f}", bake))
+    lines += [
+        (what, f"{row[name]:.2f}", bake)
+        for what, name in (
+            ("time of a picture", f"ratio_{SETTLED}"),
+            ("time of a picture, prefilter", f"ratio_filtered_{SETTLED}"),
+            (f"the same, {CHANGED[-1]:,} Gaussians", f"ratio_filtered_{CHANGED[-1]}"),
+            ("time of a step of `prb`", "ratio_step"),
+        )
+    ]
     caption = (
         "Gaussians over bitmaps, medians; memory for equally good pictures of posters, time with "
         f"{SETTLED:,} Gaussians"
