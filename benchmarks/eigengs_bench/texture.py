@@ -85,8 +85,8 @@ def _posters(posters: Sequence[Row]) -> Table:
         f"of {poster.TEXELS:,} x {poster.TEXELS:,} texels, seen aslant on a film of "
         f"{poster.PIXELS} x {poster.PIXELS} pixels, keeps 40 dB; the text 30 dB"
     )
-    columns = ("poster", "bitmap, texels", "Gaussians", "bitmap", "points", "prefilter")
-    columns += ("points over bitmap", "over a bitmap of floats")
+    columns = ["poster", "bitmap, texels", "Gaussians", "bitmap", "points", "prefilter"]
+    columns += ["points over bitmap", "over a bitmap of floats"]
     lines = [
         (
             row["job"]["poster"],
