@@ -242,7 +242,7 @@ def scene_errors(path: Path) -> Iterator[None]:
     default=40.0,
     help="PSNR of the renderings.",
 )
-@options.number("--iterations", "Optimisation steps for each number of Gaussians.", 100, 0)
+@options.number("--iterations", "Optimisation steps for each number of Gaussians.", 400, 0)
 @options.number(
     "--spp", "Samples per pixel; 0 renders nothing.  [default: from the scene]", minimum=0
 )
