@@ -268,7 +268,7 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
     )
 
 
-def _check_photo(number: int, photo: ArrayLike, size: Sequence[int]) -> mi.TensorXf:
+def _check_photo(number: int, photo: Any, size: Sequence[int]) -> mi.TensorXf:
     """Return a photo as a tensor of linear light, of the size of its film."""
     photo = photo.numpy() if dr.is_array_v(photo) else photo
     floats = np.issubdtype(getattr(photo, "dtype", np.uint8), np.floating)
