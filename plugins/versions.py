@@ -58,11 +58,16 @@ def register_texture(name: str, create: Callable[[Properties], Texture]) -> None
         mi.register_field(name, reason_first(field))
 
 
+def register_emitter(name: str, create: Callable[[Properties], Any]) -> None:
+    """Register an emitter with the current variant, by the type of the plugin in scenes."""
+    mi.register_emitter(name, reason_first(create))
+
+
 _ended: Generator[None] = (_ for _ in ())
 _ended.close()  # its method `throw` raises an error, and adds no traceback
 
 
-def reason_first(create: Callable[[Properties], Texture]) -> type:
+def reason_first(create: Callable[[Properties], Any]) -> type:
     """Return what calls `create` and raises its errors without a traceback.
 
     Mitsuba prints an error of a plugin as nanobind does: the traceback, then what went wrong. Every
