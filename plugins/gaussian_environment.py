@@ -124,7 +124,7 @@ def gaussian_environment() -> type:
             return light_at(self, uv).numpy().reshape(u.shape)
 
         def set_scene(self, scene: mi.Scene) -> None:
-            """Take the bounds of a scene, which rays from the light need.
+            """Take the bounds of a scene, which rays from the light need: they are NaN without.
 
             Mitsuba 3.9 does not call this method of a plugin in Python.
             """
@@ -141,13 +141,13 @@ def gaussian_environment() -> type:
 
         @collector_off()
         def eval(self, si: Interaction, active: Mask = True) -> mi.Spectrum:
-            return self._light(self._uv(-si.wi), si.wavelengths, active)
+            return _emitted(self._light(self._uv(-si.wi), si.wavelengths, active))
 
         @collector_off()
         def eval_direction(
             self, it: Interaction, ds: mi.DirectionSample3f, active: Mask = True
         ) -> mi.Spectrum:
-            return self._light(self._uv(ds.d), it.wavelengths, active)
+            return _emitted(self._light(self._uv(ds.d), it.wavelengths, active))
 
         def _uv(self, d: mi.Vector3f) -> mi.Point2f:
             """Return the point of the picture that lies in a direction of the world."""
@@ -190,26 +190,23 @@ def gaussian_environment() -> type:
             down = (dr.pi * self.height / (self.height - 1)) * sharp
             return [along * along, mi.Float(0), down * down], mi.Bool(True)
 
-        def _light(self, uv: mi.Point2f, wavelengths: object, active: Mask, white: bool = True):
-            """Return the light from a point of the picture; `white` is that of spectra."""
+        def _light(
+            self, uv: mi.Point2f, wavelengths: object, active: Mask, white: bool = True
+        ) -> mi.UnpolarizedSpectrum:
+            """Return the light from a point of the picture; spectra times that of day if `white`."""
             column, row, inside = self.point(uv)
             where = inside & active
             sums = self.sums_at(column, row, where, self._footprint(uv))
             color = [dr.select(where, self.scale * c, 0) for c in self.shown(sums)]
             if mi.is_monochromatic:
-                light = mi.UnpolarizedSpectrum(luminance(color))
-            elif mi.is_spectral:
-                rgb = mi.Color3f(*color)
-                light = upsample(rgb, wavelengths, self.spectra)
-                light = light * self._daylight(wavelengths) if white else light
-            else:
-                light = mi.UnpolarizedSpectrum(mi.Color3f(*color))
-            return mi.depolarizer(mi.Spectrum(light)) if mi.is_polarized else light
-
-        def _daylight(self, wavelengths: object) -> mi.Spectrum:
+                return mi.UnpolarizedSpectrum(luminance(color))
+            rgb = mi.Color3f(*color)
+            if not mi.is_spectral:
+                return mi.UnpolarizedSpectrum(rgb)
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.wavelengths = wavelengths
-            return self.daylight.eval(si)
+            spectrum = upsample(rgb, wavelengths, self.spectra)
+            return spectrum * self.daylight.eval(si) if white else spectrum
 
         # --- Sampling ----------------------------------------------------------------------------
 
@@ -225,7 +222,7 @@ def gaussian_environment() -> type:
             ds.delta, ds.emitter, ds.d, ds.dist = False, mi.EmitterPtr(self), d, FAR
             active = active & (ds.pdf > 0)
             light = self._light(uv, it.wavelengths, active)
-            return ds, light * dr.select(active, 1 / ds.pdf, 0)
+            return ds, _emitted(light * dr.select(active, 1 / ds.pdf, 0))
 
         @collector_off()
         def pdf_direction(
@@ -244,13 +241,8 @@ def gaussian_environment() -> type:
             sample3: mi.Point2f,
             active: Mask = True,
         ) -> tuple:
-            if self.bounds is None:
-                raise ValueError(
-                    f"{self.label()}: rays from the light need the bounds of the scene, which "
-                    f"Mitsuba {mi.__version__} does not tell plugins in Python; call "
-                    "scene.environment().set_scene(scene) once"
-                )
-            center, radius = self.bounds
+            # Not known without `set_scene`. No error: programs record the emitters of all scenes.
+            center, radius = self.bounds or (mi.Point3f(math.nan), mi.Float(math.nan))
             uv, density = self.importance.sample(sample3, active)
             d, jacobian = self._direction(uv)
             pdf = density * jacobian
@@ -267,13 +259,13 @@ def gaussian_environment() -> type:
             self, si: Interaction, sample: Float, active: Mask = True
         ) -> tuple:
             if not mi.is_spectral:
-                return mi.Color0f(), self._light(si.uv, si.wavelengths, active)
+                return mi.Color0f(), _emitted(self._light(si.uv, si.wavelengths, active))
             count = dr.size_v(mi.UnpolarizedSpectrum)
             shifted = [sample + k / count for k in range(count)]
             shifted = type(si.wavelengths)([dr.select(s >= 1, s - 1, s) for s in shifted])
             wavelengths, weight = self.daylight.sample_spectrum(si, shifted, active)
             light = self._light(si.uv, wavelengths, active, white=False)
-            return wavelengths, light * weight
+            return wavelengths, _emitted(light * weight)
 
         def sample_position(self, time: Float, sample: mi.Point2f, active: Mask = True) -> tuple:
             return dr.zeros(mi.PositionSample3f), mi.Float(math.nan)  # as an envmap: it has none
@@ -300,3 +292,8 @@ def gaussian_environment() -> type:
             )
 
     return GaussianEnvironment
+
+
+def _emitted(light: mi.UnpolarizedSpectrum) -> mi.Spectrum:
+    """Return unpolarized light as the spectrum of the variant."""
+    return mi.depolarizer(light) if mi.is_polarized else light
