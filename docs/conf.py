@@ -40,7 +40,8 @@ exclude_patterns = ["tutorials/*.ipynb"]  # sphinx-gallery offers them, beside t
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "substitution"]
 myst_substitutions = measured.substitutions()  # a name that is not there is a warning
-myst_substitutions["gaussian_texture"] = pages.plugin_parameters()
+for plugin in ("gaussian_texture", "gaussian_environment"):
+    myst_substitutions[plugin] = pages.plugin_parameters(plugin)
 myst_heading_anchors = 3
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

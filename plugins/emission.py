@@ -145,8 +145,7 @@ def _grid(texture: Texture, smallest: float, spacing: Spacing) -> tuple[int, int
     wanted = spans / min(max(smallest / spacing.resolved, spacing.finest), spacing.coarsest)
     wanted *= min(1.0, math.sqrt(MOST / wanted.prod()))
     columns, rows = (
-        multiple * math.ceil(max(FEWEST, n) / multiple)
-        for n in np.minimum(wanted, MOST / FEWEST)
+        multiple * math.ceil(max(FEWEST, n) / multiple) for n in np.minimum(wanted, MOST / FEWEST)
     )
     return columns, rows, float((spans / (columns, rows)).max())
 

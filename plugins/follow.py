@@ -1,4 +1,4 @@
-"""Textures and environments that follow a sensor: footprints of its pixels, whatever its film and field of view."""
+"""Plugins that follow a sensor: footprints of its pixels, whatever its film and field of view."""
 
 from __future__ import annotations
 
@@ -56,14 +56,10 @@ def follow_where_asked(scene: mi.Scene, sensor: mi.Sensor | int) -> None:
     """
     sensor = sensor_of(scene, sensor)
     for plugin in plugins_of(scene):
+        is_texture = isinstance(plugin, texture_class())  # environments may be blurred on purpose
         if plugin.follows:
             plugin.follow(sensor)
-        # Environments may be blurred on purpose.
-        elif (
-            plugin.angle
-            and isinstance(plugin, texture_class())
-            and "x_fov" in mi.traverse(sensor)
-        ):
+        elif is_texture and plugin.angle and "x_fov" in mi.traverse(sensor):
             angle = pixel_angle(sensor)
             if not 1 / CLOSE < plugin.angle / angle < CLOSE:
                 warn(

@@ -7,6 +7,7 @@ repeat, and its first and last row lie on the poles.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -97,7 +98,7 @@ def gaussian_environment() -> type:
             self.to_world = self.world_transform()
             self.scale = dr.opaque(mi.Float, properties.scale(props))
             properties.check_known(props)
-            self.daylight = mi.load_dict({"type": "d65"}) if mi.is_spectral else None
+            self.daylight: Any = mi.load_dict({"type": "d65"}) if mi.is_spectral else None
             self.bounds: tuple | None = None
             self.parameters_changed([])
 
@@ -193,7 +194,7 @@ def gaussian_environment() -> type:
         def _light(
             self, uv: mi.Point2f, wavelengths: object, active: Mask, white: bool = True
         ) -> mi.UnpolarizedSpectrum:
-            """Return the light from a point of the picture; spectra times that of day if `white`."""
+            """Return the light from a point of the picture; spectra times D65 if `white`."""
             column, row, inside = self.point(uv)
             where = inside & active
             sums = self.sums_at(column, row, where, self._footprint(uv))
@@ -255,9 +256,7 @@ def gaussian_environment() -> type:
             return mi.Ray3f(si.p, -d, time, wavelengths), weight & active & (pdf > 0)
 
         @collector_off()
-        def sample_wavelengths(
-            self, si: Interaction, sample: Float, active: Mask = True
-        ) -> tuple:
+        def sample_wavelengths(self, si: Interaction, sample: Float, active: Mask = True) -> tuple:
             if not mi.is_spectral:
                 return mi.Color0f(), _emitted(self._light(si.uv, si.wavelengths, active))
             count = dr.size_v(mi.UnpolarizedSpectrum)

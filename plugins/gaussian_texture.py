@@ -1,4 +1,4 @@
-"""The Mitsuba texture ``gaussian_texture``: a sum of 2D Gaussians, differentiable and prefiltered."""
+"""The texture ``gaussian_texture``: a sum of 2D Gaussians, differentiable and prefiltered."""
 
 from __future__ import annotations
 
@@ -122,8 +122,8 @@ def gaussian_texture() -> type:
         def eval_3(self, si: Interaction, active: Mask = True) -> mi.Color3f:
             if self.channels == 1:
                 raise ValueError(
-                    f"{self.label()}: a lookup of three channels, such as a normal map, needs a set "
-                    "of two or three channels; this set has one"
+                    f"{self.label()}: a lookup of three channels, such as a normal map, needs a "
+                    "set of two or three channels; this set has one"
                 )
             return mi.Color3f(*self._color(si, active))
 

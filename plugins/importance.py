@@ -5,8 +5,8 @@ grid is cut into blocks of `SIDE` x `SIDE` cells, and each block is divided even
 1, 4, 16, ..., as few as keep its share of the noise. Blocks that need all of their cells are
 evaluated again, on finer ones. The density is constant in a leaf.
 
-The noise of one sample is ``integral f^2 / p``, which is smallest for the density
-``p = sqrt(mean of f^2)`` of each leaf, and then is ``(sum over leaves of area * sqrt(mean f^2))^2``.
+The mean square of one sample is ``integral f^2 / p``. It is smallest for the density
+``p = sqrt(mean of f^2)`` of each leaf, and then is ``(sum of areas times sqrt(mean of f^2))^2``.
 Smaller leaves lower the sum, and take memory: each has to lower it by the share `PRICE` at least.
 """
 
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -80,9 +81,12 @@ class Importance:
         place = dr.gather(mi.UInt32, self.places, leaf, active)
         column, row = mi.Float(place & 0xFFFF), mi.Float(place >> 16)
         first, level = self._block(column, row, active)
-        within, across = leaf - first, mi.Float(1 << level)
+        within, across = leaf - first, mi.Float(mi.UInt32(1) << level)
         along = (x - start) / dr.select(share > 0, share, 1)
-        u = column + (mi.Float(within & ((1 << level) - 1)) + dr.clip(along, 0, 1)) / across
+        u = (
+            column
+            + (mi.Float(within & ((mi.UInt32(1) << level) - 1)) + dr.clip(along, 0, 1)) / across
+        )
         v = row + (mi.Float(within >> level) + sample.y) / across
         return mi.Point2f(u / self.columns, v / self.rows), self._density(share, across)
 
@@ -92,7 +96,7 @@ class Importance:
         column = dr.clip(dr.floor(u), 0, self.columns - 1)
         row = dr.clip(dr.floor(v), 0, self.rows - 1)
         first, level = self._block(column, row, active)
-        across = mi.Float(1 << level)
+        across = mi.Float(mi.UInt32(1) << level)
         i, j = (
             mi.UInt32(dr.clip(dr.floor(k * across), 0, across - 1)) for k in (u - column, v - row)
         )
@@ -194,7 +198,7 @@ def _packed(leaves: list, levels: NDArray[np.int64], rows: int, columns: int) ->
     )
 
 
-def _spread(squares: NDArray[np.float64], sides: str) -> NDArray[np.float64]:
+def _spread(squares: NDArray[np.float64], sides: Literal["wrap", "edge"]) -> NDArray[np.float64]:
     """Return means with neighbours, 1 : 2 : 1 along both axes: light may lie beside the centre."""
     around = np.pad(squares, ((0, 0), (1, 1)), mode=sides)
     around = np.pad(around, ((1, 1), (0, 0)), mode="edge")

@@ -147,9 +147,7 @@ class SharedFile:
         self.path = path
         whole = Gaussians.load(path, backend)
         if first is not None and first > len(whole):
-            raise ValueError(
-                f"{path}: first is {first}; the file has {len(whole)} Gaussians"
-            )
+            raise ValueError(f"{path}: first is {first}; the file has {len(whole)} Gaussians")
         whole = whole if first is None else whole[:first]
         self.like = without_arrays(whole)
         self.tables: WeakValueDictionary[tuple, Any] = WeakValueDictionary()
@@ -170,9 +168,7 @@ class SharedFile:
             If the file holds maps and no name is given, has no such map, or holds no maps.
         """
         if name not in self.maps and None in self.maps:
-            raise ValueError(
-                f"{self.path} holds one image and no map {name!r}; leave map out"
-            )
+            raise ValueError(f"{self.path} holds one image and no map {name!r}; leave map out")
         if name not in self.maps:
             missing = "holds maps; say which by" if name is None else f"has no map {name!r};"
             options = ", ".join(map(str, self.maps))
@@ -359,7 +355,8 @@ class _Derived(dr.CustomOp):
         """Push the derivatives of the parameters through the graph."""
         if "values" in self.outputs:  # loops of a pyramid, which Dr.Jit 1.5 walks backward only
             raise RuntimeError(
-                "no forward mode of Gaussians with a prefilter; use drjit.backward, or prefilter = 0"
+                "no forward mode of Gaussians with a prefilter; use drjit.backward, or "
+                "prefilter = 0"
             )
         dr.set_grad(self.inputs, self.grad_in("inputs"))
         self.set_grad_out(self._walk(dr.ADMode.Forward, self.inputs, self.outputs))

@@ -15,6 +15,8 @@ from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
 
+from .environment import texels_of
+
 JUDGED = 4
 """Photos with held-out pixels, spread over all."""
 
@@ -50,7 +52,8 @@ def photo_loss(
         The bitmap that is looked for, as `mitsuba.traverse` names it, such as
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
         are those of ``space`` of `eigengs_dr.fit`. Bitmaps need ``raw: true``; their texels are
-        then light, so fit colours with ``space="linear"``, and roughness with ``"data"``.
+        then light, so fit colours with ``space="linear"``, and roughness with ``"data"``. An
+        ``envmap`` counts as a bitmap; fit its light with ``space="log"``, and without `bounds`.
     photos : sequence of array_like, shape (H, W, 3), path-like or mitsuba.Bitmap
         Of the size of the film of its sensor each. Arrays of floats are linear light; codes of 8
         bits are sRGB, and files what they say.
@@ -143,7 +146,7 @@ def photo_loss(
                 f"photo_loss: the bitmaps have the channels {_listed(channels)}, the pictures of "
                 f"the fit {_listed(found)}; the names and spaces of eigengs_dr.fit say them"
             )
-        known.update({key: mi.TensorXf(named[name]) for name, key in keys.items()})
+        known.update({key: texels_of(known, key, named[name]) for name, key in keys.items()})
         if parameters is not None:
             known.update(parameters)
 

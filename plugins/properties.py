@@ -47,8 +47,8 @@ def source_of(props: Properties) -> TextureParameters:
     given = [key for key in ("filename", "model", "mean") if key in props]
     if len(given) != 1:
         raise ValueError(
-            f"{props.plugin_name()}: give one of filename (a saved set), model (a saved EigenGS) or "
-            f"mean, factor, color, ... (see texture_of); got {' and '.join(given) or 'none'}"
+            f"{props.plugin_name()}: give one of filename (a saved set), model (a saved EigenGS) "
+            f"or mean, factor, color, ... (see texture_of); got {' and '.join(given) or 'none'}"
         )
     backend = backend_of(mi.variant())
     if given[0] == "model":

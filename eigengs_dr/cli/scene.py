@@ -247,9 +247,9 @@ def convert(
     after, and 8 times their difference. If a rendering misses the PSNR, the command says so and
     exits with code 1. A bitmap that takes less memory than its Gaussians, or an eighth of their
     time, stays; the command shows both. Bump maps with which the renderings would miss the PSNR,
-    environment maps whose light or picture would miss it, images of two values such as masks, data beyond 0 and 1, and images that no
-    camera sees stay too; the command says why. Other files stay where they are, and the new scene
-    names them relative to FOLDER.
+    environment maps whose light or picture would miss it, images of two values such as masks, data
+    beyond 0 and 1, and images that no camera sees stay too; the command says why. Other files stay
+    where they are, and the new scene names them relative to FOLDER.
 
     \b
     Examples:

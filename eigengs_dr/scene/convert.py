@@ -121,7 +121,9 @@ class ConvertedScene(NamedTuple):
         """Return the cameras, from 1, whose renderings differ by more than a goal and noise."""
         noise = self.noise or [math.inf] * len(self.psnr)
         goals = [min(target_psnr, n - NOISE) for n in noise]
-        return [k for k, pair in enumerate(zip(self.psnr, goals, strict=True), 1) if pair[0] < pair[1]]
+        return [
+            k for k, pair in enumerate(zip(self.psnr, goals, strict=True), 1) if pair[0] < pair[1]
+        ]
 
 
 NOISE = 0.5

@@ -16,12 +16,12 @@ WIDTH, HEIGHT = 64, 32
 def sky(space="radiance", channels=3, seed=0, count=40, deviation=(2.0, 5.0), size=(WIDTH, HEIGHT)):
     """A smooth set of light above 0, which does not end at the seam."""
     rng = np.random.default_rng(seed)
-    width, height = size
+    width, _ = size
     mean = rng.uniform(0, size, (count, 2))
     factor = np.stack([1 / rng.uniform(*deviation, count) for _ in range(3)], axis=1)
     factor[:, 1] = rng.uniform(-0.05, 0.05, count)
     color = rng.uniform(0.1, 1.5, (count, channels)) * (0.25 if space == "log" else 1)
-    mean = np.concatenate([mean + [k * width, 0] for k in (-1, 0, 1)])
+    mean = np.concatenate([mean + np.array([k * width, 0]) for k in (-1, 0, 1)])
     near = (mean[:, 0] > -20) & (mean[:, 0] < width + 20)
     return eg.Gaussians.from_arrays(
         mean[near],

@@ -8,6 +8,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.errors import refused
+from _helpers.poster import camera
 from _helpers.skies import HEIGHT, WIDTH, directions, lit, mi, seen, sky, uniform
 from _helpers.texture import backend
 from _helpers.variants import in_all, in_variants
@@ -88,11 +89,9 @@ class TestPicture:
                 "integrator": {"type": "direct"},
                 "ball": {"type": "sphere", "bsdf": white},
                 "sky": environment_of(even),
-                "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4,
-                           "height": 4, "rfilter": {"type": "box"}}, "fov": 10,
-                           "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])},
+                "sensor": camera([0, 0, 5], 4, fov=10),
             }
-        )  # fmt: skip
+        )
         image = np.array(mi.render(scene, spp=4096))
         np.testing.assert_allclose(image.mean((0, 1)), 1, rtol=0.01)
 
@@ -102,13 +101,16 @@ class TestPicture:
         emitter = mi.load_dict(environment_of(g))
         found = seen(emitter, texels())
         assert found.min() == 0
-        ds, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1000), uniform(1000))
+        _, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1000), uniform(1000))
         assert np.array(weight).min() >= 0
 
     def test_occluders_are_in_front_of_it_however_large_they_are(self):
         """What hides the sky hides it, although emitters in Python do not know the scene."""
         at = mi.ScalarTransform4f()
-        roof = {"type": "rectangle", "to_world": at.translate([0, 5e4, 0]).rotate([1, 0, 0], 90).scale(1e7)}
+        roof = {
+            "type": "rectangle",
+            "to_world": at.translate([0, 5e4, 0]).rotate([1, 0, 0], 90).scale(1e7),
+        }
         scene = mi.load_dict({"type": "scene", "roof": roof, "sky": environment_of(sky())})
         si = dr.zeros(mi.SurfaceInteraction3f, 4096)
         si.n = si.sh_frame.n = mi.Normal3f(0, 1, 0)
@@ -171,9 +173,7 @@ class TestFootprint:
             east, south = sigma * rng.normal(size=(2, count))
             around = seen(
                 sharp,
-                directions(
-                    u[k] + east / (2 * np.pi * np.sin(np.pi * v[k])), v[k] + south / np.pi
-                ),
+                directions(u[k] + east / (2 * np.pi * np.sin(np.pi * v[k])), v[k] + south / np.pi),
             )
             np.testing.assert_allclose(found[k], around.mean(axis=0), rtol=0.03)
 
@@ -219,9 +219,7 @@ class TestSampling:
         # Rounding moves few directions over the border of a leaf.
         same = np.isclose(np.array(density), np.array(ds.pdf), rtol=1e-2)
         assert same.mean() > 0.995
-        np.testing.assert_allclose(
-            np.array(light / ds.pdf), np.array(weight), rtol=0.02, atol=1e-3
-        )
+        np.testing.assert_allclose(np.array(light / ds.pdf), np.array(weight), rtol=0.02, atol=1e-3)
 
     @pytest.mark.parametrize("name", SETS)
     def test_chi_square(self, name):
@@ -237,9 +235,9 @@ class TestSampling:
 
         test = ChiSquareTest(
             domain=SphericalDomain(),
-            sample_func=lambda sample: emitter.sample_direction(
-                dr.zeros(mi.Interaction3f, dr.width(sample)), sample
-            )[0].d,
+            sample_func=lambda sample: (
+                emitter.sample_direction(dr.zeros(mi.Interaction3f, dr.width(sample)), sample)[0].d
+            ),
             pdf_func=density,
             sample_dim=2,
             sample_count=100_000,
@@ -307,6 +305,7 @@ def direction_like(array):
 
 
 STEPS = {"mean": 2e-2, "factor": 1e-3, "scale": 1e-2}
+
 
 class TestDerivatives:
     @pytest.mark.parametrize("space", ["radiance", "log"])
@@ -455,7 +454,9 @@ class TestMemory:
     def test_is_below_that_of_an_envmap(self):
         """A set of 16 bytes for each of its 2,600 texels would be no gain."""
         g = sky(count=500, size=(512, 256), deviation=(3.0, 20.0))
-        sizes = [resident_bytes(mi.load_dict(make(g))) for make in (environment_of, bake_environment)]
+        sizes = [
+            resident_bytes(mi.load_dict(make(g))) for make in (environment_of, bake_environment)
+        ]
         assert sizes[0] < 0.2 * sizes[1]
 
     def test_counts_the_table_of_an_envmap(self):

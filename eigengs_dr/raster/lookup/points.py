@@ -119,8 +119,8 @@ def fold(x: Float, side: int, wrap: str) -> tuple[Float, Float]:
 def axes_of(wrap: str) -> tuple[str, str]:
     """Return how an image continues along x and along y.
 
-    Of a "sphere" in equirectangular projection, columns repeat, and rows come back beyond a pole: on
-    the other side, which a mirror leaves out, since what sees beyond a pole sees all sides of it.
+    Of a "sphere" in equirectangular projection, columns repeat, and rows come back beyond a pole:
+    on the other side, which a mirror leaves out. What sees beyond a pole sees all sides of it.
     """
     return ("repeat", "mirror") if wrap == "sphere" else (wrap, wrap)
 
