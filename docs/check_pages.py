@@ -1,8 +1,10 @@
-"""List what pages of the manual say without a ground: ``python docs/check_pages.py``.
+"""List what README.md and the manual say without a ground: ``python docs/check_pages.py``.
 
-These are names that the package does not have, and figures that nobody can trace: a number with
-a unit that is not filled in from a row, not marked as ``{measured}``, and neither code nor a
-formula, which say what is set or computed; and tables of numbers that no row holds.
+These are names that the package does not have, links to files that are not there, and figures that
+nobody can trace: a number with a unit, in a sentence that neither names the commit that it was
+measured at, nor has it from a row (`eigengs_bench.pages`), nor says by ``<!-- setting -->`` that
+nobody measured it; and tables of numbers that no row holds. Code of several words and formulas
+say what is set or computed.
 """
 
 import ast
@@ -12,15 +14,25 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-FOLDER = Path(__file__).parent
-PAGES = sorted([*FOLDER.glob("*.md"), *FOLDER.glob("*/*.md")])
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/*/*.md"))]
 NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:, `(\w+)`$)?")
-FIGURE = re.compile(r"\d ?(?:dB|min|[mnu]?s|[kMG]i?B|GB/s|%)(?![\w/(])|^\|.*---:")
+UNIT = (
+    r"dB|decibels?|%|per cent|min|minutes?|hours?|[mnu]?s|seconds?|[kKMGT]i?B"
+    r"|GB/s|(?:bits?|bytes) (?:a|per) (?:pixel|texel|Gaussian)|bpp"
+    r"|times (?:as|closer|faster|slower|more|less|longer|smaller|larger)"
+)
+FIGURE = re.compile(rf"\d ?(?:{UNIT})(?![\w/(])|^\|.*---:", re.M)
 TRACED = re.compile(
-    r"^```.*?^```|^\$\$.*?^\$\$|\{\{.*?\}\}|\$[^$]+\$|``.+?``"
-    r"|\{measured\}`[^`]*\bcommit\s[0-9a-f]{7}[^`]*`|(?<!\{measured\})`[^`]+`",
+    r"^ *```.*?^ *```|^\$\$.*?^\$\$|\$[^$]+\$|``.+?``"
+    r"|<!-- (table|figure): (\S+) -->.*?<!-- end -->",
     re.M | re.S,
 )
+GROUND = re.compile(r"commit\s[0-9a-f]{7}|<!-- setting -->")
+SENTENCE = re.compile(r".+?(?:[.?!:](?=\s)|\n\s*\n|\n(?= *(?:[-*#|]|\d+\.) )|\Z)", re.S)
+LINK = re.compile(r"(?<!\[)(\[[^\]]*\])\(([^)\s]+)\)|(?:src|href)=\"([^\"]+)\"")
+BLOCKS = re.compile(r"^ *```.*?^ *```", re.M | re.S)
+CODE = re.compile(rf"{BLOCKS.pattern}|<!-- manual:.*?-->|`[^`\n]+`", re.M | re.S)
 
 FORMATS = {
     f"eigengs_dr.{kind}" for kind in ("gaussians", "material", "eigenbasis", "model", "checkpoint")
@@ -82,10 +94,36 @@ def untraced() -> list[str]:
 
 
 def untraced_in(text: str) -> list[str]:
-    """Find the lines of a page that give figures without a source, with their numbers."""
-    rest = TRACED.sub(lambda traced: "\n" * traced[0].count("\n"), text).splitlines()
-    return [f"{n}: {line.strip()}" for n, line in enumerate(rest, 1) if FIGURE.search(line)]
+    """Find the sentences of a page that give figures without a source, by their lines."""
+    rest = TRACED.sub(lambda traced: "\n" * traced[0].count("\n"), text)
+    return [
+        f"{rest.count(chr(10), 0, figure.start()) + 1}: {' '.join(sentence[0].split())}"
+        for sentence in SENTENCE.finditer(rest)
+        if not GROUND.search(sentence[0])
+        for figure in [FIGURE.search(rest, *sentence.span())]
+        if figure
+    ]
+
+
+def broken() -> list[str]:
+    """Find relative links and pictures that a checkout does not have, and links without words."""
+    wrong = []
+    for path in [*PAGES, *ROOT.glob("*.md"), *ROOT.glob("*/README.md")]:
+        for words, *targets in LINK.findall(CODE.sub("code", path.read_text())):
+            target = "".join(targets)
+            file, _, heading = target.partition("#")
+            there = path.parent / file if file else path
+            is_there = there.exists() and (not heading or heading in headings(there))
+            if not (is_there or re.match(r"\w+:", target)) or words == "[]":
+                wrong.append(f"{path.relative_to(ROOT)}: {words}({target})")
+    return wrong
+
+
+def headings(path: Path) -> set[str]:
+    """Return the anchors that GitHub and MyST give to the headings of a page."""
+    titles = re.findall(r"^#+ (.+)", BLOCKS.sub("", path.read_text()), re.M)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 if __name__ == "__main__":
-    sys.exit("\n".join([*missing(), *untraced()]) or 0)
+    sys.exit("\n".join([*missing(), *untraced(), *broken()]) or 0)

@@ -1,18 +1,21 @@
 """Settings of the manual: Sphinx, MyST-NB, numpydoc, sphinx-click and sphinx-gallery."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.util import logging
 
 import eigengs_dr as eg
 
 sys.path.insert(0, str(Path(__file__).parent))  # for what stands beside this file
-import measured
 import pages
-from check_pages import missing, untraced
+from check_pages import ROOT, missing, untraced
+
+from eigengs_bench.pages import outdated
 
 LOGGER = logging.getLogger(__name__)
 
@@ -38,9 +41,7 @@ exclude_patterns = ["tutorials/*.ipynb"]  # sphinx-gallery offers them, beside t
 
 # --- Pages ---------------------------------------------------------------------------------------
 
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "substitution"]
-myst_substitutions = measured.substitutions()  # a name that is not there is a warning
-myst_substitutions["gaussian_texture"] = pages.plugin_parameters()
+myst_enable_extensions = ["deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
@@ -79,21 +80,44 @@ def skip_tuple_fields(
 
 
 def check_pages(app: Any) -> None:
-    """Warn of public names that the reference leaves out, wrong names and figures of no source."""
+    """Warn of public names that the reference leaves out, and of what pages say without ground."""
     listed = set((Path(__file__).parent / "reference" / "python.md").read_text().split())
     for name in sorted(set(eg.__all__) - listed):
         LOGGER.warning("reference/python.md: the public name %s is not listed", name)
     for line in missing():
         LOGGER.warning("%s does not exist", line)
     for line in untraced():
-        LOGGER.warning("a figure that is neither of a row nor marked: %s", line)
+        LOGGER.warning("a figure that is neither of a row nor has its commit: %s", line)
+    for path in [*outdated(ROOT), *pages.outdated()]:
+        LOGGER.warning("%s differs from what its marks name; run 'make pages'", path)
 
 
-def mark_measured(
-    name: str, raw: str, text: str, line: int, inliner: Any, *_: Any
-) -> tuple[list[nodes.Node], list[nodes.system_message]]:
-    """Show the figures of the role "measured", with how and at which commit they were measured."""
-    return [nodes.inline(raw, text, classes=["measured"])], []
+def show_hidden(app: Any, name: str, source: list[str]) -> None:
+    """Take what only the HTML can show out of its comment; link examples to their tutorials.
+
+    The first page begins with README.md.
+    """
+    if name == "index":
+        readme = re.sub(r"\]\((?!https?:|#)", "](../", (ROOT / "README.md").read_text("utf-8"))
+        source[0] = readme.replace("](../docs/", "](") + source[0]
+    shown = re.sub(r"<!-- manual:\n(.*?)-->", r"\1", source[0], flags=re.S)
+    shown = re.sub(r"\((?:\.\./)+examples/README\.md\)", "(/tutorials/index.rst)", shown)
+    source[0] = re.sub(r"\((?:\.\./)+examples/(\w+)\.py\)", r"(/tutorials/\1.rst)", shown)
+
+
+def link_names(app: Any, page: nodes.document) -> None:
+    """Make links of the public names in backticks, as in `eigengs_dr.fit`."""
+    for code in list(page.findall(nodes.literal)):
+        package, _, name = code.astext().rpartition(".")
+        if (
+            package == "eigengs_dr"
+            and name in eg.__all__
+            and isinstance(code.parent, nodes.Element)
+        ):
+            if isinstance(code.parent, nodes.reference | addnodes.pending_xref):
+                continue
+            target = {"reftype": "obj", "reftarget": code.astext(), "refdoc": app.env.docname}
+            code.replace_self(addnodes.pending_xref("", code.deepcopy(), refdomain="py", **target))
 
 
 def write_pages(app: Any) -> None:
@@ -117,9 +141,10 @@ def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
 
 def setup(app: Any) -> None:
     """Connect the functions above."""
-    app.add_role("measured", mark_measured)
     app.connect("builder-inited", check_pages)
     app.connect("builder-inited", write_pages)
+    app.connect("source-read", show_hidden)
+    app.connect("doctree-read", link_names)
     app.connect("autodoc-skip-member", skip_tuple_fields)
     app.connect("sphinx-click-process-description", show_examples_as_code)
 

@@ -1,4 +1,7 @@
-"""What is made when the manual is built: pages of `eigengs_dr.view`, the plug-in's parameters."""
+"""Pages of `eigengs_dr.view` in the manual, and the parameters of the texture in its page.
+
+``python docs/pages.py`` writes the table of the parameters between its marks.
+"""
 
 import inspect
 import re
@@ -6,10 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import eigengs_dr as eg
+from eigengs_bench.pages import filled
 from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
 
 FOLDER = Path(__file__).parent.parent / "build" / "docs" / "extra"
 """Sphinx copies what is in it beside the manual."""
+
+PLUGIN = Path(__file__).parent / "reference" / "gaussian-texture.md"
+"""The page with the parameters of the texture."""
 
 
 def write_pages() -> None:
@@ -28,6 +35,13 @@ def write_pages() -> None:
 
 ENTRY = re.compile(r"^(\w[\w, ]*) : (.+)\n((?: {4}.*\n?)+)", re.M)
 """A parameter in a docstring: its name, or several, its type with the default, and what it is."""
+
+
+def outdated() -> dict[Path, str]:
+    """Return the page of the texture with what it should hold, if its table is another one."""
+    there = PLUGIN.read_text("utf-8")
+    right = filled(there, {"parameters: gaussian_texture": plugin_parameters()}, PLUGIN.name)
+    return {} if right == there else {PLUGIN: right}
 
 
 def plugin_parameters() -> str:
@@ -59,3 +73,8 @@ def _flags(mi: Any, texture: dict[str, Any]) -> dict[str, str]:
     parameters = mi.traverse(mi.load_dict(texture))
     fixed = mi.ParamFlags.NonDifferentiable
     return {key: "E" if parameters.flags(key) & fixed else "D, E" for key, _ in parameters}
+
+
+if __name__ == "__main__":
+    for page, text in outdated().items():
+        page.write_text(text, "utf-8")

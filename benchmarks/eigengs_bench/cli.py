@@ -23,12 +23,12 @@ from eigengs_bench.rows import FILE, Row, Task, code_state
 from eigengs_bench.rows import record as record_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.cli import options
-from eigengs_dr.cli.console import bar
+from eigengs_dr.cli.console import FAILED, bar
 from eigengs_dr.cli.options import number
 from eigengs_dr.cli.outputs import check_outputs, describe_run
 
-MANUAL = Path(__file__).parents[2] / "docs" / "rows.jsonl"
-"""The rows behind the figures of the manual, in a checkout."""
+CHECKOUT = Path(__file__).parents[2]
+"""The repository, whose docs/ has the rows behind the figures of the manual."""
 
 FOLDER = Path("build/bench")
 folder_option = options.output(
@@ -62,7 +62,7 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
         @main.command(bench)
         @folder_option
         @click.option(
-            "--record", is_flag=True, help="Add the rows to docs/rows.jsonl, for the manual."
+            "--record", is_flag=True, help="Add the rows to the manual, and fill in its pages."
         )
         @options.shared("backend", "quiet")
         @wraps(command)
@@ -83,7 +83,10 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
                 rows = module.run(task, **settings)
             _show(module.summarize(rows), rows, folder, run)
             if record:
-                record_rows(MANUAL, rows)
+                from eigengs_bench.pages import ROWS, write
+
+                record_rows(CHECKOUT / ROWS, rows)
+                write(CHECKOUT)
 
         return wrapped
 
@@ -275,3 +278,20 @@ def report(run: options.Run, folder: Path, output: Path) -> None:
 
     write_report(folder, output)
     run.tell(f"wrote {output / 'README.md'}")
+
+
+@main.command()
+@click.option("--check", is_flag=True, help="Write nothing; fail if a page is not up to date.")
+@options.shared("quiet")
+def pages(run: options.Run, check: bool) -> None:
+    """Write tables, charts and figures of docs/rows.jsonl into README.md and docs/.
+
+    They stand between marks, <!-- table: kodak.quality --> and <!-- end -->; charts lie in
+    docs/images/measured/.
+    """
+    from eigengs_bench.pages import outdated, write
+
+    paths = outdated(CHECKOUT) if check else write(CHECKOUT)
+    verb = "differs from its rows, run eigengs-dr bench pages:" if check else "wrote"
+    run.tell(*(f"{verb} {path.relative_to(CHECKOUT)}" for path in paths))
+    run.context.exit(FAILED if check and paths else 0)

@@ -342,8 +342,9 @@ def _photos(mi: Any, scene: Any, first: int) -> list[Image]:
 #  Tables and a chart
 # ---------------------------------------------------------------------------------------------
 
-METHODS = {"texels": "#888888", "pyramid": "#b5442f", "lookups": "#d9a441", "fit": "#0b6e99"}
-METHODS |= {"coefficients": "#5a8f3c"}
+METHODS = {"texels": fr.GREY, "pyramid": fr.RED, "lookups": fr.ORANGE, "fit": fr.BLUE}
+METHODS |= {"coefficients": fr.GREEN}
+MARKERS = dict(zip(METHODS, "vs^oD", strict=True))
 
 
 def summarize(rows: Sequence[Row]) -> Section:
@@ -354,7 +355,11 @@ def summarize(rows: Sequence[Row]) -> Section:
         case = job["scene"], job["cameras"], job["spp"]
         curves.setdefault(case, {}).setdefault(job["method"], {})[job["steps"]] = row
     tables = [_methods(curves), _gains(curves), _materials(curves)]
-    return Section([t for t in tables if len(t.frame)], {"inverse": _chart(curves)})
+    pairs = [methods for methods in curves.values() if {"pyramid", "fit"} <= methods.keys()]
+    gains = [decibels for methods in pairs for decibels in gain(methods)]
+    ends = {"behind": -min(gains), "ahead": max(gains)} if gains else {}
+    figures = {name: f"{number(value)} dB" for name, value in ends.items()}
+    return Section([t for t in tables if len(t.frame)], {"inverse": _chart(curves)}, figures)
 
 
 def _methods(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
@@ -415,15 +420,15 @@ def _materials(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table
 def _chart(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Figure:
     """Draw PSNR over seconds, a part for each scene and number of cameras."""
     cases = [case for case in curves if len(next(iter(curves[case].values()))) > 1]
-    figure = fr.new_figure(10, 2 + 2.6 * math.ceil(len(cases) / 2), "Textures from photos")
-    axes = np.ravel(figure.subplots(max(1, math.ceil(len(cases) / 2)), 2, squeeze=False))
+    lines = max(1, math.ceil(len(cases) / 2))
+    figure = fr.new_figure(8, 1 + 2.1 * lines, "Textures recovered from photos")
+    axes = np.ravel(figure.subplots(lines, 2, squeeze=False))
     for axis, case in zip(axes, cases, strict=False):
         for method, color in METHODS.items():
             rows = sorted(curves[case].get(method, {}).values(), key=lambda row: row["seconds"])
-            if rows:
-                text = f"{method}, {rows[0]['parameters']:,} parameters"
-                seconds, psnr = ([row[k] for row in rows] for k in ("seconds", "psnr_rgb"))
-                axis.plot(seconds, psnr, color=color, marker="o", ms=4, label=text)
+            points = np.array([(row["seconds"], row["psnr_rgb"]) for row in rows]).reshape(-1, 2).T
+            axis.plot(*points, color=color, marker=MARKERS[method], ms=5, label=method)
         axis.set_title(f"{case[0]}, {case[1]} cameras", fontsize=9)
-        fr.label_axes(axis, "seconds", "psnr_rgb / dB")
+        fr.label_axes(axis, "seconds", "psnr_rgb / dB", legend=False)
+    fr.legend_below(figure, axes[0], len(METHODS))
     return figure

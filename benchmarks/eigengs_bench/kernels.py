@@ -11,7 +11,7 @@ import numpy as np
 
 import eigengs_dr as eg
 from eigengs_bench.clock import interleaved
-from eigengs_bench.report import Section, table
+from eigengs_bench.report import Section, number, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
@@ -54,7 +54,8 @@ def run(task: Task) -> list[Row]:
 def summarize(rows: Sequence[Row]) -> Section:
     """Lay out the figures of the last row."""
     lines = [(name, f"{value:.4g}") for name, value in rows[-1].items() if isinstance(value, float)]
-    return Section([table("Kernels", ("figure", "value"), lines)])
+    figures = {"peak": number(rows[-1]["peak_evals_per_ns"])}
+    return Section([table("Kernels", ("figure", "value"), lines, "all")], figures=figures)
 
 
 def measure(task: Task) -> Row:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.resources import files
-from itertools import cycle, product
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,7 @@ import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, decibels, warm_up
 from eigengs_bench.images import images_of
-from eigengs_bench.names import SOLVE_STEPS
+from eigengs_bench.names import KODAK_COUNTS, SOLVE_STEPS
 from eigengs_bench.rows import Job, Row, Task
 
 SET = "kodak"
@@ -38,7 +38,8 @@ COLUMNS = (
     "source",
 )
 CAPTION = "PSNR in RGB of float pixels clamped to [0, 1]; means of the photos, medians of seconds"
-OTHERS = ("#b5442f", "#c27c0e", "#7a4f9a", "#5a8f3c", "#8a6d3b", "#666666", "#c2549a", "#2f8f83")
+OTHERS = (fr.RED, fr.ORANGE, fr.PINK, fr.GREEN, fr.GREY, fr.SKY, fr.INK, "#a07c00")
+MARKERS = "s^vDPX<>"
 
 # The metric is of RGB. On 9 training photos (5 of scikit-image, 4 of cats) fits in RGB gain 0.06,
 # 0.05, 0.13, 0.46 and 0.57 dB in it with 0.0127, 0.0254, 0.076, 0.127 and 0.178 Gaussians a pixel.
@@ -109,8 +110,41 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         )
         for line in both.itertuples()
     ]
-    table = fr.table(CAPTION, COLUMNS, lines, "quality")
-    return fr.Section([table], {"kodak-gaussians": _over_gaussians(photos, known)})
+    table = fr.table(CAPTION, COLUMNS, lines, "all")
+    charts = {"kodak-gaussians": _over_gaussians(photos, known)}
+    return fr.Section([table, _by_counts(both)], charts, _figures(ours, known))
+
+
+def _by_counts(both: pd.DataFrame) -> fr.Table:
+    """Put the usual numbers of Gaussians side by side: a line a method and its steps."""
+    both = both[both.gaussians.isin(KODAK_COUNTS)].fillna({"steps": 0})
+    both["cell"] = [
+        fr.number(line.psnr_float, 2)
+        + (f" ({fr.number(line.seconds)} s)" if line.seconds == line.seconds else "")
+        for line in both.itertuples()
+    ]
+    lines = []
+    for (method, steps), part in both.groupby(["method", "steps"], sort=False):
+        cells = dict(zip(part.gaussians, part.cell, strict=True))
+        name = f"{method}, {steps:,.0f} steps" if steps else str(method)
+        lines.append((name, *(cells.get(count, "") for count in KODAK_COUNTS)))
+    caption = (
+        "PSNR in RGB in dB of the Kodak photos by numbers of Gaussians, and the median seconds of "
+        "a photo: default on 2 cores, others on their GPU"
+    )
+    return fr.table(caption, ("method", *(f"{n:,}" for n in KODAK_COUNTS)), lines, "quality")
+
+
+def _figures(ours: pd.DataFrame, known: pd.DataFrame) -> dict[str, str]:
+    """Write PSNR and seconds of fits of 1,000 steps, beside the best published of Gaussians."""
+    usual = ours[(ours.steps == 1000) & (ours.solve_steps == SOLVE_STEPS)].set_index("gaussians")
+    best = known[~known.method.str.contains("not Gaussians")].groupby("gaussians").psnr_float.max()
+    figures = {}
+    for count in sorted(set(usual.index) & set(best.index)):
+        figures[f"psnr_{count}"] = f"{fr.number(usual.psnr_float[count])} dB"
+        figures[f"seconds_{count}"] = f"{fr.number(usual.seconds[count])} s"
+        figures[f"best_{count}"] = f"{fr.number(best[count])} dB"
+    return figures
 
 
 def published() -> pd.DataFrame:
@@ -125,16 +159,17 @@ def _name(depth: int) -> str:
 
 def _over_gaussians(photos: pd.DataFrame, known: pd.DataFrame) -> Figure:
     """Draw PSNR over the number of Gaussians: a line a number of steps, a line a method."""
-    figure = fr.new_figure(7.5, 5, f"Kodak, {fr.counted(photos.image)}")
+    figure = fr.new_figure(8, 4.6, f"Kodak, {fr.counted(photos.image)}: quality over numbers")
     axis = figure.subplots()
-    shades = cycle((1.0, 0.6, 0.4, 0.3))
-    for ((steps, depth), part), alpha in zip(photos.groupby(KIND), shades, strict=False):
+    for (steps, depth), part in photos.groupby(KIND):
+        alpha = {0: 0.3, 1000: 1.0}.get(steps, 0.6)
         points, label = part.groupby("gaussians").psnr_float.mean(), _name(depth)
         label += f", {steps:,} steps"
-        axis.plot(points, "o-", ms=5, color="#0b6e99", alpha=alpha, label=label)
-    for color, (name, part) in zip(
-        cycle(OTHERS), known.groupby("method", sort=False), strict=False
-    ):
-        axis.plot(part.gaussians, part.psnr_float, "s--", ms=4, color=color, label=name)
-    fr.label_axes(axis, "Gaussians", "PSNR in float RGB / dB")
+        axis.plot(points, "o-", ms=5, color=fr.BLUE, alpha=alpha, label=label)
+    styles = zip(OTHERS, MARKERS, known.groupby("method", sort=False), strict=False)
+    for color, marker, (name, part) in styles:
+        label = name.partition(" (")[0]
+        axis.plot(part.gaussians, part.psnr_float, f"{marker}--", ms=5, color=color, label=label)
+    fr.label_axes(axis, "Gaussians", "PSNR in float RGB / dB", legend=False)
+    fr.legend_beside(figure, axis)
     return figure

@@ -105,10 +105,10 @@ VARIANTS: dict[str, Any] = {
 }
 # What a knob is, its colour and marker.
 KNOBS = {
-    "init": ("Where Gaussians start", "#8a4f9e", "s"),
-    "solve steps": ("Steps of the colour solve", "#c27c0e", "^"),
-    "cutoff": ("Cutoff in standard deviations", "#7a5c43", "D"),
-    "gaussians": ("Number of Gaussians", "#1f9e89", "v"),
+    "init": ("Where Gaussians start", fr.PINK, "s"),
+    "solve steps": ("Steps of the colour solve", fr.ORANGE, "^"),
+    "cutoff": ("Cutoff in standard deviations", fr.GREY, "D"),
+    "gaussians": ("Number of Gaussians", fr.SKY, "v"),
 }
 
 
@@ -173,8 +173,8 @@ def text_of(value: str | float) -> str:
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:
     """Draw all fits of a set (see `points_of`) and their front."""
-    title = f"Speed against accuracy: {name}, images: {points.images.max()}; up and left is better"
-    figure = fr.new_figure(10, 6, title)
+    title = f"Settings: {name}, images: {points.images.max()}; up and left is better"
+    figure = fr.new_figure(8, 4.6, title)
     axis = figure.subplots()
     for knob, (text, color, marker) in KNOBS.items():
         if len(some := points[points.knob == knob]):
@@ -184,7 +184,8 @@ def _chart(points: pd.DataFrame, name: str) -> Figure:
         _plot(axis, line, preset, color=color, marker="o")
     edge = points[points.front].sort_values("seconds")
     _plot(axis, edge, "front: none is better", color=fr.INK, lw=8, alpha=0.18)
-    fr.label_axes(axis, "seconds, start included", "PSNR in YCbCr / dB")
+    fr.label_axes(axis, "seconds, start included", "PSNR in YCbCr / dB", legend=False)
+    fr.legend_beside(figure, axis)
     return figure
 
 

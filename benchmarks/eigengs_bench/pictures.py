@@ -111,16 +111,21 @@ def _curve_jobs(task: Task, name: str) -> Iterator[Job]:
 def _curves_chart(rows: Sequence[Row]) -> Figure:
     """Draw lines in the colours of the methods, one panel a set: means over its images."""
     names = list(dict.fromkeys(row["job"]["set"] for row in rows))
-    figure = fr.new_figure(2.8 * len(names) + 0.6, 3.2)
-    axes = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
-    for axis, name in zip(axes, names, strict=True):
+    columns = min(3, len(names))
+    lines = -(-len(names) // columns)
+    figure = fr.new_figure(8, 0.6 + 2.4 * lines)
+    axes = figure.subplots(lines, columns, squeeze=False, sharey=True).ravel()
+    for axis in axes[len(names) :]:
+        axis.set_axis_off()
+    for axis, name in zip(axes, names, strict=False):
         for preset in HEADINGS:
             job = {"set": name, "preset": preset}
             some = [row for row in rows if job.items() <= row["job"].items()]
             # A fit that has failed is None in a file, and NaN here.
             means = np.mean(np.array([row["psnr_ycbcr"] for row in some], float), axis=0)
             axis.plot(some[0]["marks"], means, label=preset, color=fr.COLORS[preset])
-        fr.label_axes(axis, "iterations", "PSNR (YCbCr) / dB", "", axis is axes[0], title=name)
+        fr.label_axes(axis, "iterations", "PSNR (YCbCr) / dB", "", False, title=name)
+    fr.legend_below(figure, axes[0], len(HEADINGS))
     return figure
 
 
@@ -158,7 +163,7 @@ def _radii_chart(rows: Sequence[Row]) -> Figure:
     for axis, row in zip(axes, rows, strict=True):
         low, high = np.split(np.array(row["radii"]), [row["low"]], axis=1)
         name = "high frequencies" if low.size else "all"
-        for part, label, color in ((high, name, "#1e5aa0"), (low, "low frequencies", "#d66014")):
+        for part, label, color in ((high, name, fr.BLUE), (low, "low frequencies", fr.RED)):
             if part.size:
                 weights = np.full(part.size, 1 / len(part))
                 label = f"{label}: {part.shape[1]:,} Gaussians"

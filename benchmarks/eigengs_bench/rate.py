@@ -66,12 +66,12 @@ class Codec(NamedTuple):
 # up to 20 s a photo, for 1 % more bits at equal PSNR.
 AVIF = {"speed": 4, "max_threads": 1, "subsampling": "4:4:4", "advanced": {"tune": "psnr"}}
 CODECS = {
-    "JPEG 4:2:0": Codec("JPEG", {"optimize": True, "subsampling": 2}, "#c27c0e", "s--"),
-    "JPEG 4:4:4": Codec("JPEG", {"optimize": True, "subsampling": 0}, "#b5442f", "D--"),
-    "JPEG 2000": Codec("JPEG2000", {"irreversible": True, "mct": 1}, "#8a6d3b", "v--", RATIOS),
-    "WebP": Codec("WEBP", {"method": 6}, "#5a8f3c", "^--"),
-    "AVIF 4:4:4": Codec("AVIF", AVIF, "#7a4f9a", "x--"),
-    "JPEG XL": Codec("JXL", {"effort": 7}, "#2f8f83", "P--"),
+    "JPEG 4:2:0": Codec("JPEG", {"optimize": True, "subsampling": 2}, fr.ORANGE, "s--"),
+    "JPEG 4:4:4": Codec("JPEG", {"optimize": True, "subsampling": 0}, fr.RED, "D--"),
+    "JPEG 2000": Codec("JPEG2000", {"irreversible": True, "mct": 1}, fr.GREY, "v--", RATIOS),
+    "WebP": Codec("WEBP", {"method": 6}, fr.GREEN, "^--"),
+    "AVIF 4:4:4": Codec("AVIF", AVIF, fr.PINK, "x--"),
+    "JPEG XL": Codec("JXL", {"effort": 7}, fr.SKY, "P--"),
 }
 import_module("pillow_jxl")  # Pillow knows JPEG XL from then on
 
@@ -136,12 +136,13 @@ def _point(setting: int, size: int, shown: NDArray[Any], image: Image) -> Row:
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
     """Lay out the bits a pixel that each codec takes for a PSNR: a table and a chart a set."""
-    tables, charts = [], {}
+    tables, charts, figures = [], {}, {}
     for name, part in fr.frame_of(rows, "points").groupby("set", sort=False):
         tables.append(_table(str(name), part))
         tables += [_published(part)] if name == "kodak" else []
         charts[f"rate-{name}"] = _chart(part, str(name))
-    return fr.Section(tables, charts)
+        figures[f"{name}_avif"] = _share(part, "AVIF 4:4:4")
+    return fr.Section(tables, charts, figures)
 
 
 def rates(points: pd.DataFrame, level: float) -> pd.DataFrame:
@@ -195,14 +196,23 @@ def bd_rate(ours: pd.DataFrame, other: pd.DataFrame) -> float:
     return float(np.exp(mine - others) - 1)
 
 
-def _saved(points: pd.DataFrame, codec: str) -> str:
-    """Write the BD-rate of ours against a codec."""
-    if codec == OURS:
-        return fr.MISSING
+def _change(points: pd.DataFrame, codec: str) -> float:
+    """Return the mean BD-rate of ours against a codec over the images; NaN if there is none."""
     parts = [part.groupby("codec") for _, part in points.groupby("image", sort=False)]
     both = [p for p in parts if {OURS, codec} <= set(p.groups)]
-    found = pd.Series([bd_rate(p.get_group(OURS), p.get_group(codec)) for p in both], dtype=float)
-    return fr.MISSING if found.isna().all() else f"{100 * found.mean():+.0f} %"
+    changes = [bd_rate(p.get_group(OURS), p.get_group(codec)) for p in both]
+    return float(pd.Series(changes, dtype=float).mean())
+
+
+def _saved(points: pd.DataFrame, codec: str) -> str:
+    """Write the BD-rate of ours against a codec."""
+    change = float("nan") if codec == OURS else _change(points, codec)
+    return fr.MISSING if np.isnan(change) else f"{100 * change:+.0f} %"
+
+
+def _share(points: pd.DataFrame, codec: str) -> str:
+    """Write the bytes of ours in per cent of those of a codec."""
+    return f"{fr.number(100 + 100 * _change(points, codec), 0)} %"
 
 
 def at_equal_slope(points: pd.DataFrame) -> pd.DataFrame:
@@ -244,17 +254,18 @@ def _published(points: pd.DataFrame) -> fr.Table:
 def _chart(points: pd.DataFrame, name: str) -> Figure:
     """Draw PSNR in RGB and MS-SSIM over bits a pixel: means over the images, a point a setting."""
     images = fr.counted(points.image)
-    figure = fr.new_figure(10, 4.8, f"Rate against distortion: {name}, {images}")
+    figure = fr.new_figure(8, 4.2, f"Rate against distortion: {name}, {images}")
     points = points.sort_values("setting", kind="stable")
     # Fits have other numbers of Gaussians on images of other sizes: the n-th are one point.
     rank = points.groupby(["codec", "image"]).cumcount().rename("rank")
     means = points.groupby(["codec", rank])[["bits_per_pixel", "psnr_rgb", "ms_ssim"]].mean()
-    styles = {OURS: ("#0b6e99", "o-")} | {k: (c.color, c.style) for k, c in CODECS.items()}
+    styles = {OURS: (fr.BLUE, "o-")} | {k: (c.color, c.style) for k, c in CODECS.items()}
     labels = {"psnr_rgb": "PSNR in 8-bit RGB / dB", "ms_ssim": "MS-SSIM"}
     for axis, (what, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
         for codec, (color, style) in styles.items():
             if codec in means.index:
                 curve = means.loc[codec]
                 axis.plot(curve.bits_per_pixel, curve[what], style, color=color, ms=4, label=codec)
-        fr.label_axes(axis, "bits a pixel", label)
+        fr.label_axes(axis, "bits per pixel", label, legend=False)
+    fr.legend_below(figure, axis, 4)
     return figure

@@ -1,6 +1,7 @@
 """Rows as data frames, tables and charts, and one report in Markdown of all rows of a folder."""
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
 from io import BytesIO
@@ -16,11 +17,13 @@ from matplotlib.figure import Figure
 from eigengs_bench.rows import FILE, Row, code_name, read
 from eigengs_dr.storage.atomic import atomic_write
 
+TAG = re.compile(rb"<[^>]+>")  # of an SVG file
 MISSING = "-"  # cell of a figure that is not there
 
-# Lines of the methods, which differ in lightness too, for readers who confuse red and green.
-COLORS = {"default": "#0b6e99", "gaussianimage": "#b5442f", "eigengs": "#5a8f3c"}
-INK = "#222222"
+# Colours that readers tell apart who confuse red and green (Okabe and Ito, 2008).
+BLUE, RED, GREEN, ORANGE = "#0072b2", "#d55e00", "#009e73", "#e69f00"
+SKY, PINK, GREY, INK = "#56b4e9", "#cc79a7", "#888888", "#222222"
+COLORS = {"default": BLUE, "gaussianimage": RED, "eigengs": GREEN}
 
 # Titles, and the modules of this package that make tables and charts of their rows.
 QUESTIONS = {
@@ -41,19 +44,21 @@ QUESTIONS = {
 class Table(NamedTuple):
     """Texts under headings; the caption says what they are, and what they were measured on.
 
-    Pages of the manual know a table by its name.
+    Pages of the manual know a table by its name. It is of `rows`, or of all of its section.
     """
 
     caption: str
     frame: pd.DataFrame
     name: str = ""
+    rows: Sequence[Row] | None = None
 
 
 class Section(NamedTuple):
-    """Tables of rows, and charts by the stem of a file."""
+    """Tables of rows, charts by the stem of a file, and figures of sentences by a name."""
 
     tables: Sequence[Table] = ()
     charts: Mapping[str, Figure] = {}
+    figures: Mapping[str, str] = {}
 
 
 def write_report(folder: Path, output: Path) -> None:
@@ -65,9 +70,9 @@ def write_report(folder: Path, output: Path) -> None:
     output.mkdir(parents=True, exist_ok=True)
     for bench, title in QUESTIONS.items():
         if rows := read(folder / FILE, bench):
-            tables, charts = import_module(f"eigengs_bench.{bench}").summarize(rows)
-            parts += [f"## {title}", *(as_text(table, "pipe") for table in tables)]
-            for name, figure in charts.items():
+            section = import_module(f"eigengs_bench.{bench}").summarize(rows)
+            parts += [f"## {title}", *(as_text(table, "pipe") for table in section.tables)]
+            for name, figure in section.charts.items():
                 save_figure(output / f"{name}.svg", figure)
                 parts.append(f"![{name}]({name}.svg)")
             parts.append("\n".join(f"- {line}" for line in sources_of(rows)))
@@ -127,9 +132,14 @@ def as_text(table: Table, style: str = "simple") -> str:
     """Lay a table out for a terminal, or for Markdown with the style "pipe"."""
     if table.frame.empty:
         return f"{table.caption}: none"
-    sides = ["left", *["right"] * (len(table.frame.columns) - 1)]
+    sides = ["right" if is_numeric(table.frame[name]) else "left" for name in table.frame]
     options: Any = {"tablefmt": style, "colalign": sides, "disable_numparse": True}
     return f"{table.caption}\n\n{table.frame.to_markdown(index=False, **options)}"
+
+
+def is_numeric(cells: pd.Series) -> bool:
+    """Tell whether the cells of a column begin like numbers, or are empty."""
+    return bool(cells.astype(str).str.fullmatch(r"[-+\d].*|").all())
 
 
 def number(value: float | None, decimals: int = 1) -> str:
@@ -184,14 +194,34 @@ def new_figure(width: float, height: float, title: str = "") -> Figure:
     return figure
 
 
+# Names in an SVG file are else drawn at random. Verdana is as wide as DejaVu Sans.
+STYLE: Any = {
+    "svg.hashsalt": "eigengs_dr",
+    "svg.fonttype": "none",
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "sans-serif"],
+}
+
+
+def drawn(figure: Figure, kind: str = "svg") -> bytes:
+    """Return the file of a chart, "svg", "png" or "pdf"; letters of an SVG file stay text."""
+    undated: Any = {"Date": None} if kind == "svg" else None
+    with rc_context(STYLE), BytesIO() as file:
+        figure.savefig(file, format=kind, dpi=90, metadata=undated)
+        content = file.getvalue()
+    return TAG.sub(_short, content) if kind == "svg" else content
+
+
+def _short(tag: re.Match[bytes]) -> bytes:
+    """Round the numbers of a tag to hundredths, put it on one line, and turn nothing by nothing."""
+    short = re.sub(rb"(\d\.\d\d)\d+", rb"\1", tag[0])
+    return b" ".join(re.sub(rb' transform="rotate\(-0 [^"]*"', b"", short).split())
+
+
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a chart as .svg, .png or .pdf, whole or not at all."""
-    undated: Any = {"Date": None} if path.suffix == ".svg" else None
-    # Names in an SVG file are else drawn at random.
-    with rc_context({"svg.hashsalt": "eigengs_dr"}), BytesIO() as file:
-        figure.savefig(file, format=path.suffix[1:], dpi=90, metadata=undated)
-        with atomic_write(path) as temporary:
-            temporary.write_bytes(file.getvalue())
+    content = drawn(figure, path.suffix[1:])
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def label_axes(
@@ -206,3 +236,14 @@ def label_axes(
     axis.grid(alpha=0.3)
     if legend:
         axis.legend(fontsize=8, framealpha=0.6)
+
+
+def legend_beside(figure: Figure, axis: Axes) -> None:
+    """Name the lines of an axis once, to the right of all axes of a figure."""
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", fontsize=8)
+
+
+def legend_below(figure: Figure, axis: Axes, columns: int) -> None:
+    """Name the lines of an axis once, below all axes of a figure."""
+    named = axis.get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower center", fontsize=8, ncols=columns)

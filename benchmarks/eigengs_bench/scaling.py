@@ -233,7 +233,7 @@ def _chart(part: pd.DataFrame, x: str) -> Figure:
     """Draw time and memory side by side: a line for images of one density, or of one size each."""
     from eigengs_bench import report as fr
 
-    figure = fr.new_figure(10, 4.2)
+    figure = fr.new_figure(8, 3.4)
     labels = {"mean_ms": "a step with lists / ms", "peak_gib": "peak of memory / GiB"}
     for axis, (column, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
         for (name, some), style in zip(part.groupby("line", sort=False), STYLES, strict=False):

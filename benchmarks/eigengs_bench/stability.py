@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 import eigengs_dr as eg
 from eigengs_bench import report as fr
@@ -110,7 +111,34 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
     ends = f"PSNR in dB, YCbCr, at the end, from the start; {steps} steps"
     costs = _matrix("Seconds", _seconds, rows, "costs")
-    return fr.Section([_matrix(ends, _ends, rows, "ends"), costs])
+    figures = {
+        row["job"]["case"]: f"{_decibels(row['end_ycbcr'])} dB"
+        for row in rows
+        if row["job"]["preset"] == "default" and "seed" not in row["job"]
+    }
+    charts = {"stability": _heat_map(rows)}
+    return fr.Section([_matrix(ends, _ends, rows, "ends"), costs], charts, figures)
+
+
+def _heat_map(rows: Sequence[Row]) -> Figure:
+    """Draw the PSNR at the end as the colour of a cell: cases down, methods across."""
+    lines = [(row["job"]["case"], row["job"]["preset"], row.get("end_ycbcr")) for row in rows]
+    ends = pd.DataFrame(lines, columns=["case", "preset", "end"]).astype({"end": float})
+    means = ends.groupby(["case", "preset"], sort=False).end.mean().unstack(sort=False)
+    figure = fr.new_figure(6.4, 1.4 + 0.27 * len(means), "PSNR in YCbCr at the end / dB")
+    axis = figure.subplots()
+    mesh = axis.pcolormesh(means, cmap="cividis", vmin=5, vmax=60, edgecolors="white")
+    for (y, x), value in np.ndenumerate(means.to_numpy()):
+        text = "needs a basis" if np.isnan(value) else _decibels(value)
+        dark = value < 30  # of the colours, on which white letters read
+        axis.text(x + 0.5, y + 0.5, text, ha="center", va="center", color="w" if dark else "k")
+    axis.set_xticks(np.arange(means.shape[1]) + 0.5, means.columns)
+    axis.set_yticks(np.arange(len(means)) + 0.5, means.index)
+    axis.tick_params(length=0, top=True, labeltop=True)
+    axis.set(xlabel="method", ylabel="case")
+    axis.invert_yaxis()
+    figure.colorbar(mesh, extend="max", aspect=40, label="dB")
+    return figure
 
 
 def _matrix(

@@ -94,10 +94,6 @@ def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:
 #  The tables, and the figures that the paper prints
 # ---------------------------------------------------------------------------------------------
 
-PUBLISHED = {  # rows of tables 1 and 2, and of table 3
-    "published_steps": "What the paper prints: PSNR / dB",
-    "published_ablation": "What the paper prints, after 10,000 steps: PSNR / dB",
-}
 KINDS = {"main": "Methods", "cross": "Bases of other images", "ablation": "Colour space and split"}
 ENDS: dict[str, Any] = {
     "RGB": ("psnr_rgb", fr.mean),
@@ -110,22 +106,37 @@ ENDS: dict[str, Any] = {
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Make a table of each kind and number of steps, and those that the paper prints.
+    """Make two tables of each kind and number of steps, with all figures and with few.
 
     A line is a set and a method: psnr_ycbcr by steps, means over the images, and figures of the
-    start and of the last step.
+    start and of the last step. What the paper prints stands beside it in brackets.
     """
     fits, tables = fr.frame_of(rows, "moments"), []
     for length in sorted(fits.iterations.unique()):
         for kind, title in KINDS.items():
             chosen = _chosen(fits[fits.iterations == length], kind)
             if chosen.method.nunique() > 1:
+                few = _ablation if kind == "ablation" else _few
+                used = [row for row in rows if _is_shown(row, chosen, length)]
                 caption = f"{title}, {length:,} steps: PSNR YCbCr / dB by steps"
-                tables.append(_by_steps(caption, chosen)._replace(name=f"{kind}_{length}"))
-    for file, caption in PUBLISHED.items():
-        printed = pd.read_csv(str(files("eigengs_bench") / f"{file}.csv"), dtype=str)
-        tables.append(fr.Table(caption, printed, file))
-    return fr.Section(tables)
+                both = [_by_steps(caption, chosen), few(chosen)]
+                names = (f"{kind}_{length}_all", f"{kind}_{length}")
+                tables += [t._replace(name=n, rows=used) for t, n in zip(both, names, strict=True)]
+    caption = (
+        "What the paper prints of FFHQ, 512 x 512 pixels, 20,000 Gaussians: PSNR / dB by steps"
+    )
+    return fr.Section([*tables, fr.Table(caption, _published("ffhq"), "ffhq", ())])
+
+
+def _published(name: str) -> pd.DataFrame:
+    """Read figures that the paper prints."""
+    return pd.read_csv(str(files("eigengs_bench") / f"published_{name}.csv"), dtype=str).fillna("")
+
+
+def _is_shown(row: Row, chosen: pd.DataFrame, length: int) -> bool:
+    job = row["job"]
+    same = (chosen[list(Method._fields)] == [job[k] for k in Method._fields]).all(axis=1)
+    return bool(job["iterations"] == length and (same & (chosen.set == job["set"])).any())
 
 
 def _chosen(fits: pd.DataFrame, kind: str) -> pd.DataFrame:
@@ -157,6 +168,62 @@ def _by_steps(caption: str, fits: pd.DataFrame) -> fr.Table:
     for title, (figure, write) in ENDS.items():
         columns[title] = figure, _where(last, write)
     return fr.grouped(caption, fits, ["set", "method"], columns)
+
+
+SHOWN = (0, 100, 1000, 10000)
+
+
+def _few(fits: pd.DataFrame) -> fr.Table:
+    """Lay out PSNRs by steps and the seconds, of bases with the paper's 300 components."""
+    printed = {(ln["set"], ln["source"]): ln for ln in _published("steps").to_dict("records")}
+    fits = fits[fits.components.isin([0, COMPONENTS[0]])]
+    steps, lines = [n for n in SHOWN if n in set(fits.iteration)], []
+    for (name, method), part in fits.groupby(["set", "method"], sort=False):
+        source, ours = part.source.iloc[0], part.preset.iloc[0] == "default"
+        paper = {} if ours else printed.get((name, source), {})
+        first = "" if lines and str(name) in {line[0] for line in lines} else str(name)
+        cells = [
+            fr.mean(part[part.iteration == n].psnr_ycbcr) + _bracket(paper.get(str(n), ""))
+            for n in steps
+        ]
+        text = str(method).replace(f", {COMPONENTS[0]} components", "")
+        last = part[part.iteration == part.iterations]
+        lines.append((first, text, *cells, fr.median(last.seconds)))
+    caption = (
+        f"PSNR in YCbCr after so many steps in dB, in brackets what the paper prints of "
+        f"{_sets(fits)}; median seconds of a fit; {fr.counted(fits.image)} a set"
+    )
+    return fr.table(caption, ("set", "method", *(f"{n:,}" for n in steps), "s"), lines)
+
+
+def _sets(fits: pd.DataFrame) -> str:
+    """Name the paper's sets that stand beside ours."""
+    printed = _published("steps").drop_duplicates("set")
+    return ", ".join(printed[printed.set.isin(fits.set.unique())].images)
+
+
+def _ablation(fits: pd.DataFrame) -> fr.Table:
+    """Lay out colour space and split as in the paper: a line a setting, a column a set."""
+    last, printed = fits[fits.iteration == fits.iterations], _published("ablation")
+    names, lines = list(last.set.unique()), []
+    for line in printed.to_dict("records"):
+        some = last[(last.space == line["space"]) & (last.split == line["split"])]
+        sets = [some[some.set == name] for name in names]
+        cells = [
+            f"{fr.mean(part.psnr_ycbcr)} / {fr.mean(part.psnr_rgb)}{_bracket(line.get(name, ''))}"
+            for name, part in zip(names, sets, strict=True)
+        ]
+        lines.append((f"{line['space']}, {line['split']}", *cells))
+    caption = (
+        f"psnr_ycbcr / psnr_rgb in dB after {last.iterations.max():,} steps of eigengs, by the "
+        "space of the descent and the frequency-aware split; in brackets the one PSNR that the "
+        f"paper prints after 10,000 steps; {fr.counted(last.image)} a set"
+    )
+    return fr.table(caption, ("fitted in", *names), lines)
+
+
+def _bracket(printed: str) -> str:
+    return f" ({printed})" if printed not in ("", "-") else ""
 
 
 def _where(rows: pd.Series, write: Callable[[pd.Series], str]) -> Callable[[pd.Series], str]:

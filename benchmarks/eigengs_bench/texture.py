@@ -58,14 +58,14 @@ def summarize(rows: Sequence[Row]) -> Section:
     over = f"Time of a picture over that with a bitmap of {TEXELS:,} x {TEXELS:,} texels"
     after = "Time to take over a change of all shapes, or of all colours"
     columns = ("lookup", *(f"{n:,} Gaussians" for n in CHANGED))
-    return Section(
-        [
-            table("Texture", ("figure", "value"), lines),
-            table(over, ("texture", "over a bitmap"), costs, name="costs"),
-            table(after, columns, changes, name="changes"),
-            _memory(row),
-        ]
-    )
+    tables = [
+        table("Texture", ("figure", "value"), lines),
+        table(over, ("texture", "over a bitmap"), costs, name="costs"),
+        table(after, columns, changes, name="changes"),
+        _memory(row),
+    ]
+    ratios = ("ratio_prefiltered", "ratio_step")
+    return Section(tables, figures={name: f"{row[name]:.2f}" for name in ratios})
 
 
 LOOKUPS = {

@@ -1,0 +1,95 @@
+"""PSNR over seconds: this package beside what else there is, on one machine and as published.
+
+Rows are those of other questions: "pareto" has the methods of this package on photos of
+scikit-image; "kodak" has timed fits, which stand beside published figures; "peers" has other
+programs on this machine, "job" with "set" (samples or kodak) and "method", and "moments", a list of
+`score`, as in "tables".
+"""
+
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from eigengs_bench import report as fr
+from eigengs_bench.kodak import published
+from eigengs_bench.names import SAMPLES, SETS
+from eigengs_bench.rows import Row
+
+NAMES = {
+    "default": "eigengs_dr",
+    "gaussianimage": "recipe of GaussianImage",
+    "eigengs": "recipe of EigenGS",
+}
+PEERS = ((fr.ORANGE, "P"), (fr.PINK, "X"), (fr.SKY, "v"), (fr.GREY, "<"), (fr.INK, ">"))
+
+
+def charts(rows: Mapping[str, Sequence[Row]]) -> dict[str, Figure]:
+    """Draw the chart of speed against accuracy, if there are rows for both of its parts."""
+    return {"speed": _speed(rows)} if {"pareto", "kodak"} <= rows.keys() else {}
+
+
+def _speed(rows: Mapping[str, Sequence[Row]]) -> Figure:
+    """Draw methods on small photos at the left, and Kodak beside published figures at the right."""
+    figure = fr.new_figure(9, 4.6)
+    left, right = figure.subplots(1, 2)
+    peers = fr.frame_of(rows.get("peers", []), "moments")
+    _methods(left, fr.frame_of(rows["pareto"], "trace"))
+    _kodak(right, fr.frame_of(rows["kodak"]))
+    for axis, name in ((left, SAMPLES), (right, "kodak")):
+        _peers(axis, peers[peers.set == name] if len(peers) else peers)
+        fr.label_axes(axis, "seconds per photo", "PSNR in RGB / dB", legend=False)
+        axis.xaxis.set_minor_formatter("")  # the axis is of several decades
+        axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.45, -0.2))
+    return figure
+
+
+def _methods(axis: Axes, fits: pd.DataFrame) -> None:
+    """Draw a line a method: fits of more and more steps, the start included."""
+    fits = fits[(fits.knob == "preset") & (fits.set == SAMPLES)]
+    for (method, color), marker in zip(fr.COLORS.items(), "osD", strict=True):
+        points = fits[fits.value == method].groupby("iteration")[["seconds", "psnr_rgb"]]
+        means = points.agg({"seconds": "median", "psnr_rgb": "mean"})
+        style = {"color": color, "marker": marker, "ms": 5}
+        axis.plot(means.seconds, means.psnr_rgb, label=NAMES[method], **style)
+    shape = SETS[SAMPLES]
+    size = f"{shape.width}x{shape.height} pixels, {shape.gaussians:,} Gaussians, 2 cores"
+    axis.set_title(f"{fits.image.nunique()} photos of {size}", fontsize=9)
+
+
+def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
+    """Draw timed fits, a line a number of steps, and what is published with its seconds."""
+    timed = fits[fits.timed & (fits.iterations > 0)]
+    for (steps, part), alpha in zip(timed.groupby("iterations"), (1.0, 0.5), strict=False):
+        points = part.groupby("gaussians").agg({"seconds": "median", "psnr_float": "mean"})
+        style = {"color": fr.BLUE, "marker": "o", "ms": 5, "alpha": alpha}
+        axis.plot(
+            points.seconds,
+            points.psnr_float,
+            label=f"eigengs_dr, {steps:,} steps, by Gaussians",
+            **style,
+        )
+        for count, point in points.iterrows() if alpha == 1 else ():
+            words = f"{count:,} Gaussians" if count == points.index.min() else f"{count:,}"
+            at = (point.seconds, point.psnr_float)
+            axis.annotate(words, at, (-6, 3), textcoords="offset points", fontsize=7, ha="right")
+    known = published().dropna(subset="seconds")
+    marks = zip(
+        known.groupby("method", sort=False), (fr.RED, fr.ORANGE, fr.GREY), "*XP", strict=False
+    )
+    for (name, part), color, marker in marks:
+        method, counts = str(name).partition(" (")[0], ", ".join(f"{n:,}" for n in part.gaussians)
+        machine, source = part.machine.iloc[0], part.source.iloc[0]
+        label = f"{method}, {counts}, {machine} ({source})"
+        axis.plot(part.seconds, part.psnr_float, marker, color=color, ms=9, label=label)
+    axis.set_title(f"{fits.image.nunique()} photos of Kodak, 2 cores beside GPUs", fontsize=9)
+
+
+def _peers(axis: Axes, fits: pd.DataFrame) -> None:
+    """Draw other programs on the same machine."""
+    groups = fits.groupby("method", sort=False) if len(fits) else ()
+    for (name, part), (color, marker) in zip(groups, PEERS, strict=False):
+        points = part.groupby("iteration").agg({"seconds": "median", "psnr_rgb": "mean"})
+        style = {"color": color, "marker": marker, "ms": 6, "ls": "--"}
+        axis.plot(points.seconds, points.psnr_rgb, label=name, **style)

@@ -1,0 +1,138 @@
+"""Tables, charts and figures of the rows of a checkout, written into its pages.
+
+A page has marks, which are comments of HTML and do not show::
+
+    <!-- table: kodak.quality -->
+    (what `as_text` makes of the table "quality" that `summarize` of kodak returns)
+    <!-- end -->
+
+In a sentence it is ``<!-- figure: kernels.peak -->6.3<!-- end -->``, not at the start of a line. A
+page shows a chart as a picture in ``docs/images/measured/``.
+
+Rows of "once" hold tables that no question of today makes: their caption, columns and lines. If
+nobody wrote down the commit of a run, theirs is the one with which the figures came into a page.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+
+from matplotlib import __version__ as drawn_with
+
+from eigengs_bench import overview
+from eigengs_bench.report import QUESTIONS, Table, as_text, drawn, sources_of, table
+from eigengs_bench.rows import Row, read
+from eigengs_dr.storage.atomic import atomic_write
+
+ROWS = Path("docs/rows.jsonl")
+CHARTS = Path("docs/images/measured")
+MARK = re.compile(r"(?<!`)<!-- ((\w+): [\w.-]+) -->(.*?)<!-- end -->", re.S)
+CHART = re.compile(r"images/measured/([\w-]+)\.svg")
+DRAWN_WITH = re.compile(rb"Matplotlib v([^,<]+)")
+
+
+def pages_of(checkout: Path) -> list[Path]:
+    """List README.md and the pages of the manual."""
+    docs = checkout / "docs"
+    return [checkout / "README.md", *sorted(docs.glob("*.md")), *sorted(docs.glob("*/*.md"))]
+
+
+def outdated(checkout: Path) -> dict[Path, bytes]:
+    """Return the pages and charts that differ from what the rows give, with what they should hold.
+
+    A chart that another version of matplotlib has drawn counts as right. `ValueError` if a page
+    names a table, a figure or a chart that no row holds.
+    """
+    parts, charts = contents(checkout / ROWS)
+    right, wanted = dict[Path, bytes](), set[str]()
+    for page in pages_of(checkout):
+        text = page.read_text("utf-8")
+        right[page] = filled(text, parts, str(page)).encode()
+        wanted |= set(CHART.findall(text))
+    if unknown := wanted - charts.keys():
+        raise ValueError(f"{checkout / ROWS}: no row holds the chart {min(unknown)}")
+    right |= {checkout / CHARTS / f"{name}.svg": charts[name] for name in wanted}
+    return {path: content for path, content in right.items() if not _is_right(path, content)}
+
+
+def _is_right(path: Path, content: bytes) -> bool:
+    if not path.exists():
+        return False
+    there = path.read_bytes()
+    version = DRAWN_WITH.search(there) if path.suffix == ".svg" else None
+    return there == content or bool(version and version[1].decode() != drawn_with)
+
+
+def write(checkout: Path) -> list[Path]:
+    """Write the pages and charts that differ from what the rows give, and return their paths."""
+    changed = outdated(checkout)
+    (checkout / CHARTS).mkdir(parents=True, exist_ok=True)
+    for path, content in changed.items():
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(content)
+    return list(changed)
+
+
+def filled(text: str, parts: Mapping[str, str], name: str) -> str:
+    """Return a page with its parts written between their marks; marks of other kinds stay."""
+    kinds = {key.partition(":")[0] for key in parts}
+    if inside := re.search(r"^ *<!-- (figure: \S+|setting) -->", text, re.M):
+        raise ValueError(
+            f"{name}: a line begins with <!-- {inside[1]} -->, which ends the sentence"
+        )
+
+    def part(mark: re.Match[str]) -> str:
+        if mark[2] not in kinds:
+            return mark[0]
+        if mark[1] not in parts:
+            raise ValueError(f"{name}: no row holds the {mark[1]}")
+        space = "" if mark[2] == "figure" else "\n\n"
+        return f"<!-- {mark[1]} -->{space}{parts[mark[1]]}{space}<!-- end -->"
+
+    return MARK.sub(part, text)
+
+
+def contents(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
+    """Return what a page can name, in Markdown, by its mark; and the charts by their names."""
+    rows: dict[str, list[Row]] = {}
+    for row in read(path):
+        rows.setdefault(row["bench"], []).append(row)
+    parts = _tables_measured_once(rows.get("once", []))
+    charts = {name: drawn(figure) for name, figure in overview.charts(rows).items()}
+    for bench in QUESTIONS:
+        if made := rows.get(bench):
+            section = import_module(f"eigengs_bench.{bench}").summarize(made)
+            known = [one for one in section.tables if not one.frame.empty]
+            parts |= {f"table: {bench}.{one.name}": _with_source(one, made) for one in known}
+            parts |= {f"figure: {bench}.{name}": text for name, text in section.figures.items()}
+            charts |= {name: drawn(figure) for name, figure in section.charts.items()}
+    return parts, charts
+
+
+def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
+    """Lay out the rows of "once"; rows of one table are parts of it, of several runs."""
+    groups: dict[str, list[Row]] = {}
+    for row in measured:
+        groups.setdefault(row["job"]["table"], []).append(row)
+    return {
+        f"table: once.{name}": _with_source(
+            table(rows[0]["caption"], rows[0]["columns"], [ln for r in rows for ln in r["lines"]]),
+            rows,
+        )
+        for name, rows in groups.items()
+    }
+
+
+def _with_source(shown: Table, rows: Sequence[Row]) -> str:
+    """Lay a table out for a page: its caption below it, and folded how its rows were made."""
+    cells = as_text(shown, "pipe").removeprefix(shown.caption).strip()
+    sources = sources_of(rows if shown.rows is None else shown.rows)
+    if not sources:
+        return f"{cells}\n\n*{shown.caption}.*"
+    lines = "\n".join(f"- {line}" for line in sources)
+    return f"{cells}\n\n*{shown.caption}.*\n\n{_folded('How it was measured', lines)}"
+
+
+def _folded(title: str, text: str) -> str:
+    return f"<details><summary>{title}</summary>\n\n{text}\n\n</details>"

@@ -1,0 +1,64 @@
+"""Compose the picture of README.md: ``python docs/teaser.py`` writes docs/images/teaser.jpg.
+
+From left to right: a photo; outlines of Gaussians over their rendering; the Gaussians as the
+texture of a poster in a Mitsuba scene; the texture that photos of this scene give back. It takes
+a minute.
+"""
+
+from pathlib import Path
+
+import eigengs_dr as eg  # isort: skip  (before Mitsuba: it finds libLLVM)
+import mitsuba as mi
+import numpy as np
+from PIL import Image
+
+from eigengs_bench.inverse import bitmap, grey, scene_of
+from eigengs_dr.image.color import to_coded
+from eigengs_dr.plugins import photo_loss, texture_of
+from eigengs_dr.viewer.pictures import overlay
+
+TEASER = Path(__file__).parent / "images" / "teaser.jpg"
+CELL, GAP = 300, 6  # pixels: sides of a picture, and white between two
+CAMERAS = 6
+VIEW = {"origin": [1.9, 0.5, 3.1], "target": [0.05, -0.12, 0], "up": [0, 1, 0]}
+
+
+def main() -> None:
+    """Make the four pictures and write them side by side."""
+    mi.set_variant("llvm_ad_rgb")
+    eg.register_plugins()
+    photo = eg.sample("coffee")[:400, 120:520]
+    few = eg.fit(photo, 1500)
+    many = eg.fit(photo, 5000, space="linear").gaussians
+    scene = scene_of(mi, "poster", {"color": texture_of(many, wrap_mode="clamp")}, CAMERAS)
+    photos = [mi.render(scene, sensor=k, spp=64, seed=k).numpy() for k in range(CAMERAS)]
+    unknown = scene_of(mi, "poster", {"color": bitmap(mi, grey("color"))}, CAMERAS)
+    loss = photo_loss(unknown, "poster.bsdf.reflectance", photos)
+    recovered = eg.fit(loss=loss, size=(256, 256), iterations=480, space="linear")
+    pictures = [
+        photo,
+        overlay(few.gaussians, eg.picture_of(few.gaussians, width=800)),
+        to_coded(mi.render(scene, sensor=camera(), spp=512).numpy()),
+        recovered.image,
+    ]
+    cells = [np.asarray(cell_of(picture)) for picture in pictures]
+    gap = np.full((CELL, GAP, 3), 255, np.uint8)
+    strip = np.concatenate([part for cell in cells for part in (cell, gap)][:-1], axis=1)
+    Image.fromarray(strip).save(TEASER, quality=88, optimize=True)
+
+
+def camera() -> "mi.Sensor":
+    """Return a camera that sees the picture in its room, from the side."""
+    film = {"type": "hdrfilm", "pixel_format": "rgb", "width": CELL, "height": CELL}
+    view = mi.ScalarTransform4f().look_at(**VIEW)
+    return mi.load_dict({"type": "perspective", "fov": 40, "to_world": view, "film": film})
+
+
+def cell_of(picture: np.ndarray) -> Image.Image:
+    """Bring a picture to the size of a cell."""
+    codes = Image.fromarray(np.uint8(255 * picture.clip(0, 1) + 0.5))
+    return codes.resize((CELL, CELL), Image.Resampling.LANCZOS)
+
+
+if __name__ == "__main__":
+    main()
