@@ -45,7 +45,7 @@ BETTER = {
     "splatthis": "writes SVG, CSS and PowerPoint that need no program of its own",
     "JPEG": "any program shows it; encodes and decodes in milliseconds",
     "AVIF": "fewer bytes at equal PSNR on most photos",
-    "texels": "a lookup of four texels takes the same short time everywhere; no fit",
+    "texels": "higher MS-SSIM at equal memory; a lookup reads four texels, everywhere; no fit",
 }
 
 
@@ -158,6 +158,8 @@ def _splatthis(folder: Path, image: Image, count: int, stages: str) -> Row:
         shown = np.asarray(pillow.open(preview).convert("RGB"), np.float32) / 255
         size = drawing.stat().st_size
     figures = {"seconds": log["total_time_sec"], "number": log["final_splat_count"], "bytes": size}
+    # What its optimiser sees, before the splats are drawn as those of SVG.
+    figures["own_psnr_rgb"] = log["final_metrics"]["psnr_srgb"]
     return {**figures, "requirements": list(REQUIREMENTS), **judge(shown, image)}
 
 
@@ -236,6 +238,7 @@ def _table(name: str, points: pd.DataFrame) -> fr.Table:
         "bytes of file": ("bytes", partial(_mean, decimals=0)),
         "bytes in memory": ("memory", partial(_mean, decimals=0)),
         "psnr_rgb": ("psnr_rgb", _mean),
+        "as it says": ("own_psnr_rgb", _mean),
         "psnr_ycbcr": ("psnr_ycbcr", _mean),
         "MS-SSIM": ("ms_ssim", partial(_mean, decimals=3)),
     }

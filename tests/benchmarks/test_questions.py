@@ -297,6 +297,7 @@ log = pathlib.Path(words["--artifacts-dir"])
 log.mkdir()
 count = int(words["--splats"]) - 1
 figures = {{"total_time_sec": len(words["--stages"].split(",")), "final_splat_count": count}}
+figures["final_metrics"] = {{"psnr_srgb": 20.5}}
 (log / "run_manifest.json").write_text(json.dumps(figures))
 sys.exit("of no use\\nno splats" if count < 1 else 0)
 """
@@ -311,7 +312,11 @@ def test_a_peer_draws_its_own_picture(tmp_path, monkeypatch):
     image = one_image()
     found = peers._splatthis(tmp_path, image, 5, "3,2,1")
     assert (found["seconds"], found["number"], found["bytes"]) == (3, 4, 6)
-    assert found["psnr_rgb"] == 100 and "torch==2.13.0" in found["requirements"]
+    assert (
+        found["psnr_rgb"] == 100
+        and found["own_psnr_rgb"] == 20.5
+        and "torch==2.13.0" in found["requirements"]
+    )
     with pytest.raises(ValueError, match="splatthis failed: no splats"):
         peers._splatthis(tmp_path, image, 1, "3,2,1")
 
