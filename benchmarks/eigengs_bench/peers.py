@@ -39,7 +39,7 @@ OURS, PACKED, TEXELS = "eigengs_dr", "eigengs_dr, packed", "texels"
 # With the build of PyTorch that it fits with.
 REQUIREMENTS = ("splatthis==0.3.2", "torch==2.13.0")
 # Its best profile, which is its default, with its own numbers of steps; and a third of its steps.
-SPLATTHIS = {"500 steps": "200,150,100,50", "170 steps": "70,50,33,17"}
+SPLATTHIS = {"170 steps": "70,50,33,17", "500 steps": "200,150,100,50"}
 CODED = {"JPEG": ("JPEG 4:2:0", "JPEG 4:4:4"), "AVIF": ("AVIF 4:4:4",)}
 BETTER = {
     "splatthis": "writes SVG, CSS and PowerPoint that need no program of its own",
