@@ -41,7 +41,7 @@ exclude_patterns = ["tutorials/*.ipynb"]  # sphinx-gallery offers them, beside t
 
 # --- Pages ---------------------------------------------------------------------------------------
 
-myst_enable_extensions = ["deflist", "dollarmath"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
@@ -92,17 +92,27 @@ def check_pages(app: Any) -> None:
         LOGGER.warning("%s differs from what its marks name; run 'make pages'", path)
 
 
-def show_hidden(app: Any, name: str, source: list[str]) -> None:
-    """Take what only the HTML can show out of its comment; link examples to their tutorials.
+OUTSIDE = {"README": "index", "CHANGELOG": "changelog", "CONTRIBUTING": "contributing"}
+"""Pages at the top of the checkout, and the pages of the manual that show them."""
 
-    The first page begins with README.md.
+
+def read_page(app: Any, name: str, source: list[str]) -> None:
+    """Make a page of a checkout one of the HTML.
+
+    Pages of `OUTSIDE` are shown where they belong, links to examples lead to their tutorials, and
+    what only the HTML can show comes out of its comment.
     """
-    if name == "index":
-        readme = re.sub(r"\]\((?!https?:|#)", "](../", (ROOT / "README.md").read_text("utf-8"))
-        source[0] = readme.replace("](../docs/", "](") + source[0]
-    shown = re.sub(r"<!-- manual:\n(.*?)-->", r"\1", source[0], flags=re.S)
-    shown = re.sub(r"\((?:\.\./)+examples/README\.md\)", "(/tutorials/index.rst)", shown)
-    source[0] = re.sub(r"\((?:\.\./)+examples/(\w+)\.py\)", r"(/tutorials/\1.rst)", shown)
+    text = source[0]
+    for file, page in OUTSIDE.items():
+        if page == name:
+            outside = (ROOT / f"{file}.md").read_text("utf-8")
+            outside = re.sub(r"\]\((?!https?:|#)", "](../", outside).replace("](../docs/", "](")
+            text = outside + text if name == "index" else outside
+    for file, page in OUTSIDE.items():
+        text = re.sub(rf"\]\((\.\./)+{file}\.md", f"](/{page}.md", text)
+    text = re.sub(r"\]\((\.\./)+examples/README\.md", "](/tutorials/index.rst", text)
+    text = re.sub(r"\]\((?:\.\./)+examples/(\w+)\.py", r"](/tutorials/\1.rst", text)
+    source[0] = re.sub(r"<!-- manual:\n(.*?)-->", r"\1", text, flags=re.S)
 
 
 def link_names(app: Any, page: nodes.document) -> None:
@@ -143,7 +153,7 @@ def setup(app: Any) -> None:
     """Connect the functions above."""
     app.connect("builder-inited", check_pages)
     app.connect("builder-inited", write_pages)
-    app.connect("source-read", show_hidden)
+    app.connect("source-read", read_page)
     app.connect("doctree-read", link_names)
     app.connect("autodoc-skip-member", skip_tuple_fields)
     app.connect("sphinx-click-process-description", show_examples_as_code)

@@ -411,7 +411,7 @@ def test_pages_and_charts_have_what_their_rows_give(checkout):
     charts = sorted((checkout / pages.CHARTS).iterdir())
     shown = {name for p in pages.pages_of(checkout) for name in pages.CHART.findall(p.read_text())}
     assert {chart.stem for chart in charts} == shown
-    assert max(chart.stat().st_size for chart in charts) < 75_000
+    assert max(chart.stat().st_size for chart in charts) < 60_000
 
     results, chart = checkout / "docs/results.md", charts[0]
     right = results.read_text(), chart.read_bytes()
@@ -430,6 +430,13 @@ def test_the_page_of_the_texture_has_its_parameters(monkeypatch):
     pytest.importorskip("eigengs_bench", reason="pip install ./benchmarks")
     pages = runpy.run_path(str(FOLDER / "pages.py"))
     assert pages["outdated"]() == {}
+
+
+def test_readme_fits_a_screen():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    first = [line for line in lines if line.startswith("!")]
+    assert len(lines) <= 120 and "speed.svg" in first[1]
+    assert (FOLDER / "images/teaser.jpg").stat().st_size < 150_000
 
 
 def test_no_page_needs_a_build_to_be_read():

@@ -312,6 +312,6 @@ def pages(run: options.Run, check: bool) -> None:
     from eigengs_bench.pages import outdated, write
 
     paths = outdated(CHECKOUT) if check else write(CHECKOUT)
-    verb = "differs from its rows, run eigengs-dr bench pages:" if check else "wrote"
-    run.tell(*(f"{verb} {path.relative_to(CHECKOUT)}" for path in paths))
+    verb = "not up to date, run eigengs-dr bench pages:" if check else "wrote"
+    run.tell(*(f"{verb} {path.relative_to(CHECKOUT)}" for path in paths), f"{len(paths)} files")
     run.context.exit(FAILED if check and paths else 0)

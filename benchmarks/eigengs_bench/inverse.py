@@ -388,19 +388,31 @@ def gain(methods: Mapping[str, Mapping[int, Row]], key: str = "psnr_rgb") -> lis
 
 
 def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
-    lines = []
+    """Put the gains of a scene and its cameras on one line, a column a descent."""
+    descents = [*((steps, SPP) for steps in STEPS), *((NOISY_STEPS, spp) for spp in NOISES)]
+    cells: dict[tuple[str, int], dict[tuple[int, int], str]] = {}
     for (scene, cameras, spp), methods in curves.items():
-        if not {"pyramid", "fit"} <= methods.keys():
-            continue
-        gains = zip(sorted(methods["fit"]), gain(methods), strict=True)
-        for steps, decibels in gains:
-            row, other = methods["fit"][steps], next(iter(methods["pyramid"].values()))
-            share = row["parameters"] / other["parameters"]
-            name = f"{scene}, {cameras} cameras, {spp} samples"
-            line = (name, f"{steps}", f"{row['gaussians']:,}", f"{share:.2f}", f"{decibels:+.1f}")
-            lines.append(line)
-    columns = ("photos", "steps", "Gaussians", "share of parameters", "dB at equal seconds")
-    return table("fit over the pyramid of texels", columns, lines, name="gains")
+        if {"pyramid", "fit"} <= methods.keys():
+            gains = zip(sorted(methods["fit"]), gain(methods), strict=True)
+            line = cells.setdefault((scene, cameras), {})
+            line.update({(steps, spp): f"{decibels:+.1f}" for steps, decibels in gains})
+    lines = [
+        (f"{scene}, {cameras} cameras", *(line.get(descent, "") for descent in descents))
+        for (scene, cameras), line in cells.items()
+    ]
+    pairs = [methods for methods in curves.values() if {"pyramid", "fit"} <= methods.keys()]
+    fits, pyramids = ([next(iter(m[name].values())) for m in pairs] for name in ("fit", "pyramid"))
+    count = ", ".join(sorted({f"{row['gaussians']:,}" for row in fits}))
+    shares = {
+        f"{fit['parameters'] / other['parameters']:.2f}"
+        for fit, other in zip(fits, pyramids, strict=True)
+    }
+    columns = ("photos", *(f"{steps} steps, {spp} samples" for steps, spp in descents))
+    caption = (
+        f"psnr_rgb of fit in dB over that of the pyramid at equal seconds; {count} Gaussians have "
+        f"{' or '.join(sorted(shares))} of its parameters"
+    )
+    return table(caption, columns, lines, name="gains")
 
 
 def _materials(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:

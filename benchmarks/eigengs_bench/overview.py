@@ -1,9 +1,8 @@
 """PSNR over seconds: this package beside what else there is, on one machine and as published.
 
 Rows are those of other questions: "pareto" has the methods of this package on photos of
-scikit-image; "kodak" has timed fits, which stand beside published figures; "peers" has other
-programs on this machine, "job" with "set" (samples or kodak) and "method", and "moments", a list of
-`score`, as in "tables".
+scikit-image; "kodak" has timed fits, which stand beside published figures; "peers" has what else
+runs on this machine.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,15 @@ NAMES = {
     "gaussianimage": "recipe of GaussianImage",
     "eigengs": "recipe of EigenGS",
 }
-PEERS = ((fr.ORANGE, "P"), (fr.PINK, "X"), (fr.SKY, "v"), (fr.GREY, "<"), (fr.INK, ">"))
+PEERS = (
+    (fr.BLUE, "o"),
+    (fr.SKY, "v"),
+    (fr.RED, "s"),
+    (fr.GREY, "D"),
+    (fr.ORANGE, "P"),
+    (fr.PINK, "X"),
+    (fr.GREEN, "^"),
+)
 
 
 def charts(rows: Mapping[str, Sequence[Row]]) -> dict[str, Figure]:
@@ -31,17 +38,19 @@ def charts(rows: Mapping[str, Sequence[Row]]) -> dict[str, Figure]:
 
 
 def _speed(rows: Mapping[str, Sequence[Row]]) -> Figure:
-    """Draw methods on small photos at the left, and Kodak beside published figures at the right."""
-    figure = fr.new_figure(9, 4.6)
-    left, right = figure.subplots(1, 2)
-    peers = fr.frame_of(rows.get("peers", []), "moments")
-    _methods(left, fr.frame_of(rows["pareto"], "trace"))
-    _kodak(right, fr.frame_of(rows["kodak"]))
-    for axis, name in ((left, SAMPLES), (right, "kodak")):
-        _peers(axis, peers[peers.set == name] if len(peers) else peers)
+    """Draw methods on small photos, Kodak beside published figures, and what else runs here."""
+    peers = fr.frame_of(rows.get("peers", []))
+    figure = fr.new_figure(11.5 if len(peers) else 9, 4.8)
+    axes = figure.subplots(1, 3 if len(peers) else 2)
+    _methods(axes[0], fr.frame_of(rows["pareto"], "trace"))
+    _kodak(axes[1], fr.frame_of(rows["kodak"]))
+    if len(peers):
+        _peers(axes[2], peers[peers.timed])
+    for axis in axes:
         fr.label_axes(axis, "seconds per photo", "PSNR in RGB / dB", legend=False)
         axis.xaxis.set_minor_formatter("")  # the axis is of several decades
-        axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.45, -0.2))
+        columns = 1 + (len(axis.lines) > 5)
+        axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.45, -0.2), ncols=columns)
     return figure
 
 
@@ -51,10 +60,11 @@ def _methods(axis: Axes, fits: pd.DataFrame) -> None:
     for (method, color), marker in zip(fr.COLORS.items(), "osD", strict=True):
         points = fits[fits.value == method].groupby("iteration")[["seconds", "psnr_rgb"]]
         means = points.agg({"seconds": "median", "psnr_rgb": "mean"})
-        style = {"color": color, "marker": marker, "ms": 5}
-        axis.plot(means.seconds, means.psnr_rgb, label=NAMES[method], **style)
+        axis.plot(
+            means.seconds, means.psnr_rgb, f"{marker}-", ms=5, color=color, label=NAMES[method]
+        )
     shape = SETS[SAMPLES]
-    size = f"{shape.width}x{shape.height} pixels, {shape.gaussians:,} Gaussians, 2 cores"
+    size = f"{shape.width}x{shape.height} pixels,\n{shape.gaussians:,} Gaussians, 2 cores"
     axis.set_title(f"{fits.image.nunique()} photos of {size}", fontsize=9)
 
 
@@ -63,13 +73,9 @@ def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
     timed = fits[fits.timed & (fits.iterations > 0)]
     for (steps, part), alpha in zip(timed.groupby("iterations"), (1.0, 0.5), strict=False):
         points = part.groupby("gaussians").agg({"seconds": "median", "psnr_float": "mean"})
-        style = {"color": fr.BLUE, "marker": "o", "ms": 5, "alpha": alpha}
-        axis.plot(
-            points.seconds,
-            points.psnr_float,
-            label=f"eigengs_dr, {steps:,} steps, by Gaussians",
-            **style,
-        )
+        label = f"eigengs_dr, {steps:,} steps, by Gaussians"
+        x, y = points.seconds, points.psnr_float
+        axis.plot(x, y, "o-", ms=5, color=fr.BLUE, alpha=alpha, label=label)
         for count, point in points.iterrows() if alpha == 1 else ():
             words = f"{count:,} Gaussians" if count == points.index.min() else f"{count:,}"
             at = (point.seconds, point.psnr_float)
@@ -83,13 +89,18 @@ def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
         machine, source = part.machine.iloc[0], part.source.iloc[0]
         label = f"{method}, {counts}, {machine} ({source})"
         axis.plot(part.seconds, part.psnr_float, marker, color=color, ms=9, label=label)
-    axis.set_title(f"{fits.image.nunique()} photos of Kodak, 2 cores beside GPUs", fontsize=9)
+    axis.set_title(f"{fits.image.nunique()} photos of Kodak,\n2 cores beside GPUs", fontsize=9)
 
 
-def _peers(axis: Axes, fits: pd.DataFrame) -> None:
-    """Draw other programs on the same machine."""
-    groups = fits.groupby("method", sort=False) if len(fits) else ()
+def _peers(axis: Axes, points: pd.DataFrame) -> None:
+    """Draw what each program reaches: a line a program, a point a setting."""
+    groups = points.groupby("peer", sort=False)
     for (name, part), (color, marker) in zip(groups, PEERS, strict=False):
-        points = part.groupby("iteration").agg({"seconds": "median", "psnr_rgb": "mean"})
-        style = {"color": color, "marker": marker, "ms": 6, "ls": "--"}
-        axis.plot(points.seconds, points.psnr_rgb, label=name, **style)
+        means = part.groupby("setting").agg({"seconds": "median", "psnr_rgb": "mean"})
+        means = means.sort_values("seconds")
+        axis.plot(means.seconds, means.psnr_rgb, f"{marker}--", ms=5, color=color, label=name)
+    count = points.gaussians.iloc[0]
+    axis.set_title(
+        f"{fr.counted(points.image)} of {points.set.iloc[0]},\n{count:,} Gaussians, 2 cores"
+    )
+    axis.title.set_fontsize(9)

@@ -133,7 +133,8 @@ def as_text(table: Table, style: str = "simple") -> str:
     """Lay a table out for a terminal, or for Markdown with the style "pipe"."""
     if table.frame.empty:
         return f"{table.caption}: none"
-    sides = ["right" if is_numeric(table.frame[name]) else "left" for name in table.frame]
+    others = table.frame.columns[1:]
+    sides = ["left", *("right" if is_numeric(table.frame[name]) else "left" for name in others)]
     options: Any = {"tablefmt": style, "colalign": sides, "disable_numparse": True}
     return f"{table.caption}\n\n{table.frame.to_markdown(index=False, **options)}"
 

@@ -114,7 +114,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     figures = {
         row["job"]["case"]: f"{_decibels(row['end_ycbcr'])} dB"
         for row in rows
-        if row["job"]["preset"] == "default" and "seed" not in row["job"]
+        if row["job"]["preset"] == "default" and "end_ycbcr" in row
     }
     charts = {"stability": _heat_map(rows)}
     return fr.Section([_matrix(ends, _ends, rows, "ends"), costs], charts, figures)

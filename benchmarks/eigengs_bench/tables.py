@@ -177,11 +177,11 @@ def _few(fits: pd.DataFrame) -> fr.Table:
     """Lay out PSNRs by steps and the seconds, of bases with the paper's 300 components."""
     printed = {(ln["set"], ln["source"]): ln for ln in _published("steps").to_dict("records")}
     fits = fits[fits.components.isin([0, COMPONENTS[0]])]
-    steps, lines = [n for n in SHOWN if n in set(fits.iteration)], []
+    steps, lines = [n for n in SHOWN if n in set(fits.iteration)], list[tuple[str, ...]]()
     for (name, method), part in fits.groupby(["set", "method"], sort=False):
         source, ours = part.source.iloc[0], part.preset.iloc[0] == "default"
         paper = {} if ours else printed.get((name, source), {})
-        first = "" if lines and str(name) in {line[0] for line in lines} else str(name)
+        first = "" if str(name) in {line[0] for line in lines} else str(name)
         cells = [
             fr.mean(part[part.iteration == n].psnr_ycbcr) + _bracket(paper.get(str(n), ""))
             for n in steps

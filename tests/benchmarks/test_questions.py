@@ -24,6 +24,7 @@ from eigengs_bench import (
     cases,
     kernels,
     kodak,
+    overview,
     pareto,
     peers,
     pictures,
@@ -89,6 +90,28 @@ def test_means_of_tables_count_failures():
     assert lines_of(first)[0] == tuple(texts.split(","))
 
 
+def test_few_columns_have_what_the_paper_prints_beside_ours():
+    usual = {"set": "faces256", "iterations": 1000, "gaussians": 60, "space": "ycbcr"}
+    starts = {"default": "", "gaussianimage": "", "eigengs": "natural256"}
+    made = [
+        row(
+            {**usual, "preset": preset, "source": source, "components": 300 * bool(source)}
+            | {"split": "auto", "image": image},
+            moments=[moment(0, 20.0 + k), moment(1000, 30.0 + k)],
+        )
+        for image in ("a", "b")
+        for k, (preset, source) in enumerate(starts.items())
+    ]
+    [few] = [t for t in tables.summarize(made).tables if t.name == "main_1000"]
+    assert list(few.frame) == ["set", "method", "0", "1,000", "s"]
+    assert lines_of(few) == [
+        ("faces256", "default", "20.0", "30.0", "1.00"),
+        ("", "gaussianimage", "21.0", "31.0 (30.0)", "1.00"),
+        ("", "eigengs, universal basis", "22.0 (28.7)", "32.0 (42.2)", "1.00"),
+    ]
+    assert few.rows == made and "CelebA" in few.caption
+
+
 def test_pictures(data, tmp_path, backend):  # noqa: F811
     out = tmp_path / "out"
     arguments = (data, "--images", 1, "--iterations", 3, "--backend", backend)
@@ -120,6 +143,24 @@ def test_pareto(small, tmp_path, backend):
     assert [m["iteration"] for m in default["trace"]] == [0, 3] and default["gaussians"] == 60
     assert "preset default" in text and "gaussians 240" in text
     assert (tmp_path / "out" / "pareto-samples.svg").exists()
+
+
+def test_other_programs_stand_in_the_chart_of_speed():
+    photo = {"set": "samples", "image": "a"}
+    ours = row({**photo, "knob": "preset", "value": "default"}, trace=[moment(0, 30.0)])
+    job = {"set": "kodak", "image": "a", "gaussians": 5000, "iterations": 1000, "timed": True}
+    fits = row(job, psnr_float=33.0, seconds=4.0)
+    rows = {"pareto": [ours], "kodak": [fits]}
+    job = {**photo, "peer": "another program", "setting": "fast", "gaussians": 60, "timed": True}
+    peer = row(job, seconds=2.0, psnr_rgb=31.0)
+    assert overview.charts({"kodak": [fits]}) == {}
+    for others in ([], [peer]):
+        left, right, *more = overview.charts({**rows, "peers": others})["speed"].axes
+        assert left.get_legend().get_texts()[0].get_text() == "eigengs_dr"
+        published = [text.get_text() for text in right.get_legend().get_texts()]
+        assert any("NVIDIA V100 (arXiv 2403.08551)" in text for text in published)
+        names = [text.get_text() for axis in more for text in axis.get_legend().get_texts()]
+        assert names == ["another program"] * len(others)
 
 
 # --- Where methods fail ---
@@ -417,7 +458,7 @@ def test_inverse(monkeypatch, tmp_path):
         assert first["seconds"] > 0 and 5 < first["psnr_rgb"] < then["psnr_rgb"]
     assert [row["job"]["method"] for row in material] == ["texels", "pyramid", "fit"] * 2
     assert all(row["albedo"] > 5 and row["roughness_constant"] > 5 for row in material)
-    assert "ball, 2 cameras" in text and "dB at equal seconds" in text
+    assert "ball, 2 cameras" in text and "at equal seconds" in text
 
 
 def test_gain_at_equal_seconds():
