@@ -131,13 +131,19 @@ def environment(folder: Path, requirements: Sequence[str]) -> Path:
     wanted = "\n".join(requirements)
     if not done.exists() or done.read_text() != wanted:
         EnvBuilder(clear=True, with_pip=True).create(folder)
-        command = [programs / "python", "-m", "pip", "install", "--quiet", *requirements]
+        python = str(programs / "python")
+        command = [python, "-m", "pip", "install", "--quiet", *requirements]
         process = subprocess.run(command, capture_output=True, text=True, check=False)
         if process.returncode:
             words = (process.stderr.strip() or "pip failed").splitlines()[-1]
             raise ValueError(f"{folder}: {' '.join(requirements)} cannot be installed: {words}")
         done.write_text(wanted)
     return programs
+
+
+def _pixels(file: Path | io.BytesIO) -> Image:
+    """Decode a picture of 8 bits."""
+    return np.asarray(pillow.open(file).convert("RGB")).astype(np.float32) / np.float32(255)
 
 
 def _splatthis(folder: Path, image: Image, count: int, stages: str) -> Row:
@@ -147,13 +153,14 @@ def _splatthis(folder: Path, image: Image, count: int, stages: str) -> Row:
         here = Path(place)
         source, drawing, preview = here / "image.png", here / "fit.svg", here / "preview.png"
         save_image(source, image)
-        settings = ["--splats", str(count), "--stages", stages, "--artifacts-dir", here / "log"]
-        command = [program, source, "-o", drawing, "--preview", preview, *settings]
+        settings = ["--splats", count, "--stages", stages, "--artifacts-dir", here / "log"]
+        words = [program, source, "-o", drawing, "--preview", preview, *settings]
+        command = [str(word) for word in words]
         process = subprocess.run(command, capture_output=True, text=True, check=False)
         if process.returncode:
             raise ValueError(f"splatthis failed: {(process.stderr or '?').splitlines()[-1]}")
         log = json.loads((here / "log" / "run_manifest.json").read_text())
-        shown = np.asarray(pillow.open(preview).convert("RGB"), np.float32) / 255
+        shown = _pixels(preview)
         size = drawing.stat().st_size
     figures = {"seconds": log["total_time_sec"], "number": log["final_splat_count"], "bytes": size}
     # What its optimiser sees, before the splats are drawn as those of SVG.
@@ -210,7 +217,7 @@ def _coded_as_small(packed: Callable[[], Row], image: Image, title: str) -> Row:
     started = time.perf_counter()
     content = encoded(low)
     seconds = time.perf_counter() - started
-    shown = np.asarray(pillow.open(io.BytesIO(content)).convert("RGB"), np.float32) / 255
+    shown = _pixels(io.BytesIO(content))
     return {"seconds": seconds, "bytes": len(content), "quality": low, **judge(shown, image)}
 
 
@@ -227,7 +234,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     better = fr.table("What a peer does better", ("peer", "better"), BETTER.items(), "better")
     known = pd.read_csv(str(files("eigengs_bench") / "published_peers.csv"), dtype=str)
     gpu = fr.Table("Packages that need a CUDA GPU, by what they publish", known, "published")
-    return fr.Section([*tables, better, gpu])
+    return fr.Section([*tables, better._replace(rows=()), gpu._replace(rows=())])
 
 
 def _table(name: str, points: pd.DataFrame) -> fr.Table:
