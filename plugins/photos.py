@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -11,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from eigengs_dr.backend.recording import freeze_rendering
 from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
@@ -49,11 +51,11 @@ def photo_loss(
     pictures : str or mapping of str to str
         The bitmap that is looked for, as `mitsuba.traverse` names it, such as
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
-        are those of ``space`` of `eigengs_dr.fit`. Bitmaps need ``raw: true``; their texels are
-        then light, so fit colours with ``space="linear"``, and roughness with ``"data"``.
-    photos : sequence of array_like, shape (H, W, 3), path-like or mitsuba.Bitmap
-        Of the size of the film of its sensor each. Arrays of floats are linear light; codes of 8
-        bits are sRGB, and files what they say.
+        are those of the set. Bitmaps need ``raw: true``; their texels are then light or data, so
+        the ``space`` of a fit is by default "linear" for three channels, and "data" for one.
+    photos : sequence of array_like or tensor, shape (H, W, 3), path-like or mitsuba.Bitmap
+        Of the size of the film of its sensor each. Floats, such as those of `mitsuba.render`, are
+        linear light; codes of 8 bits are sRGB, and files what they say.
     sensors : sequence of sensors or numbers, optional
         One for each photo, by default the first ones of the scene.
     integrator : mitsuba.Integrator, optional
@@ -100,12 +102,11 @@ def photo_loss(
     ...     "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": grey}}})
     >>> photo = 1.2 * mi.render(scene, spp=64).numpy()
     >>> loss = photo_loss(scene, "wall.bsdf.reflectance", [photo])
-    >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40, space="linear")
+    >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40)
     """
     known = mi.traverse(scene)
     keys = dict(pictures) if isinstance(pictures, Mapping) else {"": pictures}
     keys = {name: _data_of(known, key) for name, key in keys.items()}
-    channels = {name: known[key].shape[2] for name, key in keys.items()}
     for key in parameters.keys() if parameters is not None else ():
         _check_known(known, key)
     if not 0 <= held_out < 1:
@@ -114,52 +115,74 @@ def photo_loss(
         raise ValueError(f"photo_loss: spp is {spp}; it must be at least 1")
     if len(photos) == 0:
         raise ValueError("photo_loss: there are no photos; give one for each sensor")
-    chosen = list(range(len(photos)) if sensors is None else sensors)
-    if len(chosen) != len(photos):
-        raise ValueError(f"photo_loss: {len(photos)} photos, but {len(chosen)} sensors")
+    if sensors is not None and len(sensors) != len(photos):
+        raise ValueError(f"photo_loss: {len(photos)} photos, but {len(sensors)} sensors")
     if sensors is None and len(photos) > len(scene.sensors()):
         raise ValueError(
             f"photo_loss: {len(photos)} photos, but the scene has {len(scene.sensors())} sensors"
         )
+    named = range(len(photos)) if sensors is None else sensors
+    chosen = [scene.sensors()[s] if isinstance(s, int) else s for s in named]
     targets = [
-        _check_photo(scene, number, photo, sensor)
+        _check_photo(number, photo, sensor.film().crop_size())
         for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
     ]
-    generator, first = np.random.default_rng(seed), seed * STEPS_OF_A_SEED
-    number_judged = min(JUDGED, len(targets))
-    judged = [k * len(targets) // number_judged for k in range(number_judged)]
+    judged = sorted({k * len(targets) // JUDGED for k in range(JUDGED)})
+    generator = np.random.default_rng(seed)
     hidden = [
         mi.TensorXf(
             np.float32(generator.random((*target.shape[:2], 1)) < held_out * (number in judged))
         )
         for number, target in enumerate(targets)
     ]
+    integrator = scene.integrator() if integrator is None else integrator
+    first = seed * STEPS_OF_A_SEED
+    add_slopes = freeze_rendering(_add_slopes)
+    channels = {name: known[key].shape[2] for name, key in keys.items()}
 
-    def show(picture: Any) -> None:
+    def texels_of(picture: Any) -> dict[str, mi.TensorXf]:
         named = picture if isinstance(picture, Mapping) else {"": picture}
-        found = {name: p.shape[2] for name, p in named.items()}
-        if found != channels:
+        given = {name: p.shape[2] for name, p in named.items()}
+        if given != channels:
             raise ValueError(
                 f"photo_loss: the bitmaps have the channels {_listed(channels)}, the pictures of "
-                f"the fit {_listed(found)}; the names and spaces of eigengs_dr.fit say them"
+                f"the fit {_listed(given)}; the names and spaces of eigengs_dr.fit say them"
             )
-        known.update({key: mi.TensorXf(named[name]) for name, key in keys.items()})
-        if parameters is not None:
-            known.update(parameters)
+        return {key: mi.TensorXf(named[name]) for name, key in keys.items()}
 
     def difference(number: int, seed: int, samples: int) -> Any:
-        rendered = mi.render(
-            scene, known, sensor=chosen[number], integrator=integrator, spp=samples, seed=seed
-        )
-        return rendered[..., :3] - targets[number]
+        sensor = chosen[number]
+        shown = mi.render(scene, known, sensor, integrator, seed, spp=samples)
+        return shown[..., :3] - targets[number]
 
     def function(picture: Any, step: int) -> Any:
-        show(picture)
-        number = step % len(targets)
-        return _mean(dr.square(difference(number, first + step, spp)), 1 - hidden[number])
+        number, seed, texels = step % len(targets), first + step, texels_of(picture)
+        seen = 1 - hidden[number]
+        if parameters is None and dr.grad_enabled(picture):
+            return dr.custom(_Frozen, partial(slopes, number, seed, seen), texels)
+        known.update(texels)
+        if parameters is not None:
+            known.update(parameters)
+        return _mean(dr.square(difference(number, seed, spp)), seen)
+
+    def slopes(number: int, seed: int, seen: mi.TensorXf, texels: dict) -> tuple[Any, dict]:
+        nonlocal add_slopes
+        with dr.resume_grad():
+            leaves = {key: dr.detach(t) for key, t in texels.items()}
+            dr.enable_grad(leaves)
+            known.update(leaves)
+            drawn = scene, integrator, chosen[number], spp, dr.opaque(mi.UInt32, seed)
+            try:
+                value = add_slopes(*drawn, targets[number], seen)
+            except RuntimeError:  # Dr.Jit cannot record projective integrators, say
+                add_slopes = _add_slopes
+                dr.clear_grad(leaves)
+                value = add_slopes(*drawn, targets[number], seen)
+            known.update(texels)
+            return value, dr.grad(leaves)
 
     def judge(picture: Any) -> Any:
-        show(picture)
+        known.update(texels_of(picture))
         products = [
             difference(number, first, JUDGE_SAMPLES * spp)
             * difference(number, first + 1, JUDGE_SAMPLES * spp)
@@ -168,7 +191,47 @@ def photo_loss(
         means = [_mean(p, hidden[n]) for p, n in zip(products, judged, strict=True)]
         return sum(means) / len(means)
 
-    return Loss(function, bounds, parameters, judge if held_out else None)
+    spaces = {name: "linear" if number == 3 else "data" for name, number in channels.items()}
+    space = spaces if isinstance(pictures, Mapping) else spaces[""]
+    return Loss(function, bounds, parameters, judge if held_out else None, space=space)
+
+
+def _add_slopes(
+    scene: mi.Scene,
+    integrator: mi.Integrator,
+    sensor: mi.Sensor,
+    spp: int,
+    seed: mi.UInt32,
+    photo: mi.TensorXf,
+    weight: mi.TensorXf,
+) -> mi.TensorXf:
+    """Return the squared error of a rendering; parameters of the scene get its derivatives.
+
+    To be frozen, so it leaves the scene as it is: Dr.Jit 1.5 replays a change of a bitmap with the
+    memory of the recording, which may be gone.
+    """
+    shown = mi.render(scene, mi.traverse(scene), sensor, integrator, seed, spp=spp)
+    error = _mean(dr.square(shown[..., :3] - photo), weight)
+    dr.backward(error)
+    return dr.detach(error)
+
+
+class _Frozen(dr.CustomOp):
+    """A number of some arrays that comes with its derivatives."""
+
+    def eval(self, function: Callable, arrays: dict) -> Any:
+        value, self.slopes = function(arrays)
+        return value
+
+    def forward(self) -> None:
+        rates = self.grad_in("arrays")
+        self.set_grad_out(
+            sum(dr.sum(slope * rates[key], axis=None) for key, slope in self.slopes.items())
+        )
+
+    def backward(self) -> None:
+        rate = self.grad_out()
+        self.set_grad_in("arrays", {key: slope * rate for key, slope in self.slopes.items()})
 
 
 def _mean(values: Any, weight: Any) -> Any:
@@ -205,16 +268,14 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
     )
 
 
-def _check_photo(
-    scene: mi.Scene, number: int, photo: ArrayLike, sensor: mi.Sensor | int
-) -> mi.TensorXf:
+def _check_photo(number: int, photo: Any, size: Sequence[int]) -> mi.TensorXf:
     """Return a photo as a tensor of linear light, of the size of its film."""
+    photo = photo.numpy() if dr.is_array_v(photo) else photo
     floats = np.issubdtype(getattr(photo, "dtype", np.uint8), np.floating)
     image = read_floats(photo, encoding="linear" if floats else None)
     pixels = to_linear(image.pixels) if image.encoding == "srgb" else np.asarray(image.pixels)
     pixels = pixels[..., :3]
-    film = (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
-    width, height = film.crop_size()
+    width, height = size
     if pixels.shape != (height, width, 3):
         raise ValueError(
             f"photo_loss: photo {number} has shape {pixels.shape}, but its film has "

@@ -74,7 +74,7 @@ def test_every_long_function_takes_a_bar_or_a_function(progress, at_once, photo)
 def test_a_line_stands_above_the_bar_of_a_command(at_once):
     with redirect_stderr(Terminal()) as terminal, console.bar(False) as show:
         show("photos", 3, 4, {"psnr_rgb": 31.2})
-        console.say("error: x.png: no image")
+        console.print_message("error: x.png: no image")
     assert "photos" in terminal.getvalue()
     assert "eigengs-dr: error: x.png: no image\n" in terminal.getvalue()
 

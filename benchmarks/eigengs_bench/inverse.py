@@ -159,9 +159,10 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
 
 
 UNKNOWNS = (texels, pyramid, lookups, coefficients)
+FROZEN = "frozen"  # the pyramid with the rendering of `photo_loss`, which Dr.Jit replays
 SINGLE = ("lookups", "coefficients")  # of one map
 MOST_LOOKUPS = 240  # steps of these, which are slow
-COMPARED = ("pyramid", "fit")  # with other numbers of samples
+COMPARED = ("pyramid", FROZEN, "fit")  # with other numbers of samples
 
 
 def run(task: Task) -> list[Row]:
@@ -176,7 +177,7 @@ def _jobs(task: Task) -> Iterator[Job]:
 
     mi.set_variant("cuda_ad_rgb" if task.backend == "cuda" else "llvm_ad_rgb")
     register_plugins()
-    methods = [unknown.__name__ for unknown in UNKNOWNS] + ["fit"]
+    methods = [unknown.__name__ for unknown in UNKNOWNS] + [FROZEN, "fit"]
     for kind in PHOTOS:
         maps = maps_of(kind)
         for count in MATERIAL_CAMERAS if kind == "material" else CAMERAS:
@@ -198,23 +199,34 @@ def recover(mi: Any, scene: Scene, method: str, steps: int) -> Row:
     """Recover the maps of a scene by a method; return seconds, parameters and PSNRs."""
     if method == "fit":
         return fit(mi, scene, steps)
-    [unknown] = [describe(mi, scene.kind) for describe in UNKNOWNS if describe.__name__ == method]
-    return descend(mi, scene, unknown, steps)
+    name = pyramid.__name__ if method == FROZEN else method
+    [unknown] = [describe(mi, scene.kind) for describe in UNKNOWNS if describe.__name__ == name]
+    return descend(mi, scene, unknown, steps, method == FROZEN)
 
 
-def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int) -> Row:
-    """Descend by Adam; the seconds are without the first step, which compiles."""
+def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = False) -> Row:
+    """Descend by Adam; the seconds are without the first steps, which compile and record."""
+    from eigengs_dr.plugins import photo_loss
+
     loaded = scene_of(mi, scene.kind, unknown.textures, scene.cameras)
     parameters, values = mi.traverse(loaded), mi.ad.Adam(1.0, unknown.start, beta_1=MOMENTUM)
     photos = [mi.TensorXf(photo) for photo in scene.photos[: scene.cameras]]
+    names = NAMES[scene.kind]
+    replayed = photo_loss(loaded, names, photos, spp=scene.spp).function if frozen else None
+
+    def error(shown: Mapping[str, Any], step: int) -> Any:
+        if replayed:
+            return replayed({name: shown[f"{key}.data"] for name, key in names.items()}, step)
+        parameters.update(shown)
+        camera = step % scene.cameras
+        rendered = mi.render(loaded, parameters, sensor=camera, spp=scene.spp, seed=step)
+        return dr.mean(dr.square(rendered - photos[camera]), axis=None)
+
     started = 0.0
     for step in range(steps):
-        camera = step % scene.cameras
         rate = LAST_RATE + (1 - LAST_RATE) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
-        parameters.update(unknown.shown(values))
         values.set_learning_rate({key: rate * r for key, r in unknown.rates.items()})
-        shown = mi.render(loaded, parameters, sensor=camera, spp=scene.spp, seed=step)
-        dr.backward(dr.mean(dr.square(shown - photos[camera]), axis=None))
+        dr.backward(error(unknown.shown(values), step))
         values.step()
         unknown.bound(values)
         if not step:
@@ -343,8 +355,8 @@ def _photos(mi: Any, scene: Any, first: int) -> list[Image]:
 # ---------------------------------------------------------------------------------------------
 
 METHODS = {"texels": fr.GREY, "pyramid": fr.RED, "lookups": fr.ORANGE, "fit": fr.BLUE}
-METHODS |= {"coefficients": fr.GREEN}
-MARKERS = dict(zip(METHODS, "vs^oD", strict=True))
+METHODS |= {"coefficients": fr.GREEN, FROZEN: fr.PINK}
+MARKERS = dict(zip(METHODS, "vs^oDP", strict=True))
 
 
 def summarize(rows: Sequence[Row]) -> Section:
@@ -373,13 +385,15 @@ def _methods(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
     return table("psnr_rgb and seconds of a descent", columns, lines, name="methods")
 
 
-def gain(methods: Mapping[str, Mapping[int, Row]], key: str = "psnr_rgb") -> list[float]:
-    """Return the decibels of each fit above the pyramid at equal seconds.
+def gain(
+    methods: Mapping[str, Mapping[int, Row]], rival: str = "pyramid", key: str = "psnr_rgb"
+) -> list[float]:
+    """Return the decibels of each fit above a pyramid at equal seconds.
 
     Between two descents of the pyramid, its PSNR is linear in the logarithm of the seconds; outside
     of them it is that of the nearest.
     """
-    curve = sorted((row["seconds"], row[key]) for row in methods["pyramid"].values())
+    curve = sorted((row["seconds"], row[key]) for row in methods[rival].values())
     seconds, psnr = zip(*curve, strict=True)
     return [
         row[key] - float(np.interp(math.log(row["seconds"]), np.log(seconds), psnr))
@@ -388,17 +402,18 @@ def gain(methods: Mapping[str, Mapping[int, Row]], key: str = "psnr_rgb") -> lis
 
 
 def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
-    """Put the gains of a scene and its cameras on one line, a column a descent."""
+    """Put the gains of a scene and its cameras on one line a pyramid, a column a descent."""
     descents = [*((steps, SPP) for steps in STEPS), *((NOISY_STEPS, spp) for spp in NOISES)]
-    cells: dict[tuple[str, int], dict[tuple[int, int], str]] = {}
+    cells: dict[tuple[str, int, str], dict[tuple[int, int], str]] = {}
     for (scene, cameras, spp), methods in curves.items():
-        if {"pyramid", "fit"} <= methods.keys():
-            gains = zip(sorted(methods["fit"]), gain(methods), strict=True)
-            line = cells.setdefault((scene, cameras), {})
-            line.update({(steps, spp): f"{decibels:+.1f}" for steps, decibels in gains})
+        for rival in ("pyramid", FROZEN):
+            if {rival, "fit"} <= methods.keys():
+                gains = zip(sorted(methods["fit"]), gain(methods, rival), strict=True)
+                line = cells.setdefault((scene, cameras, rival), {})
+                line.update({(steps, spp): f"{decibels:+.1f}" for steps, decibels in gains})
     lines = [
-        (f"{scene}, {cameras} cameras", *(line.get(descent, "") for descent in descents))
-        for (scene, cameras), line in cells.items()
+        (f"{scene}, {cameras} cameras", rival, *(line.get(descent, "") for descent in descents))
+        for (scene, cameras, rival), line in cells.items()
     ]
     pairs = [methods for methods in curves.values() if {"pyramid", "fit"} <= methods.keys()]
     fits, pyramids = ([next(iter(m[name].values())) for m in pairs] for name in ("fit", "pyramid"))
@@ -407,9 +422,9 @@ def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
         f"{fit['parameters'] / other['parameters']:.2f}"
         for fit, other in zip(fits, pyramids, strict=True)
     }
-    columns = ("photos", *(f"{steps} steps, {spp} samples" for steps, spp in descents))
+    columns = ("photos", "over", *(f"{steps} steps, {spp} samples" for steps, spp in descents))
     caption = (
-        f"psnr_rgb of fit in dB over that of the pyramid at equal seconds; {count} Gaussians have "
+        f"psnr_rgb of fit in dB over that of a pyramid at equal seconds; {count} Gaussians have "
         f"{' or '.join(sorted(shares))} of its parameters"
     )
     return table(caption, columns, lines, name="gains")

@@ -1,4 +1,4 @@
-"""Numbers that callers give: those of Python and of NumPy, but no truth values and no text."""
+"""Checks of numeric arguments: Python and NumPy numbers are accepted, booleans and text are not."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from .types import Record
 Function = TypeVar("Function", bound=Callable[..., object])
 
 KINDS: dict[str, type] = {"int": int, "int | None": int, "float": float, "float | None": float}
-"""The type of number that an annotation stands for."""
+"""The numeric type that each annotation stands for."""
 
 
 def plain_numbers(values: Mapping[str, object], annotations: Mapping[str, str]) -> Record:
-    """Return the numbers among named values as numbers of Python.
+    """Return the numbers among named values as Python numbers.
 
-    Numbers of NumPy would promote Dr.Jit arrays to double precision, and JSON has none of them.
+    NumPy numbers would promote Dr.Jit arrays to double precision, and JSON cannot store them.
 
     Parameters
     ----------
     values : mapping of str to object
     annotations : mapping of str to str
-        Annotations of the values; those of numbers are "int" and "float", perhaps with "| None".
+        Annotations of the values. Those of numbers are "int" or "float", optionally with "| None".
 
     Raises
     ------
     ValueError
-        If something else stands where a number belongs.
+        If an argument that is annotated as a number has another type.
     """
     return {
         name: _plain(name, value, KINDS[annotations[name]])
@@ -40,15 +40,15 @@ def plain_numbers(values: Mapping[str, object], annotations: Mapping[str, str]) 
 
 
 def _plain(name: str, value: object, kind: type) -> Any:
-    # NumPy registers its numbers with these classes, and its truth values with none.
+    # NumPy registers its numbers with these classes, but not its booleans.
     if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
-        must = "a whole number" if kind is int else "a number"
-        raise ValueError(f"{name} is {value!r}; it must be {must}")
+        expected = "a whole number" if kind is int else "a number"
+        raise ValueError(f"{name} is {value!r}; it must be {expected}")
     return kind(value)
 
 
 def takes_numbers(function: Function) -> Function:
-    """Decorate a function whose numbers may be those of NumPy, see `plain_numbers`."""
+    """Decorate a function so that it accepts NumPy numbers, see `plain_numbers`."""
     arguments = signature(function)
     annotations = {name: p.annotation for name, p in arguments.parameters.items()}
     if not any(annotation in KINDS for annotation in annotations.values()):

@@ -1,8 +1,8 @@
 """Array types of one Dr.Jit backend and precision, copies of NumPy arrays, and exact arithmetic.
 
-On cuda, Dr.Jit 1.5 takes the hardware's approximations: `drjit.rcp` and `drjit.rsqrt` of double
+On cuda, Dr.Jit 1.5 uses approximate instructions: `drjit.rcp` and `drjit.rsqrt` of double
 precision have 20 bits (PTX: ``rcp.approx.ftz.f64``), and `drjit.tanh` of single precision has 11
-(``tanh.approx.f32``). Code of this package takes these three functions from here.
+(``tanh.approx.f32``). This package uses the three functions of this module instead.
 """
 
 from __future__ import annotations
@@ -83,32 +83,33 @@ def _types(module: str, bits: int) -> ArrayTypes:
     suffix = "64" if bits == 64 else ""
     names = ["Int32", "UInt32", "Bool", "Array2u"]
     names += [name + suffix for name in ("Float", "Array2f", "Array3f", "ArrayXf", "TensorXf")]
-    found = [getattr(sys.modules[module], name) for name in names]
-    return ArrayTypes._make([*found, module.split(".")[1], bits])
+    classes = [getattr(sys.modules[module], name) for name in names]
+    return ArrayTypes._make([*classes, module.split(".")[1], bits])
 
 
-LARGE = 1 << 22
-"""Most values of an image whose memory is kept for the next one: new pages take time. The start of
-a fit of 512x512 pixels took 1.6 times as long without. Recorded programs must not give memory back:
-at least `eigengs_dr.backend.recording.LARGEST_RECORDED`."""
+MAX_CACHED_VALUES = 1 << 22
+"""Largest number of values of an image whose memory is kept for the next image, because new pages
+take time: without this, the start of a fit of 512x512 pixels took 1.6 times as long. Recorded
+programs must not release memory, so this is at least
+`eigengs_dr.backend.recording.LARGEST_RECORDED`."""
 
 
 def release_memory(values: int) -> None:
-    """Give memory that is free back to the system: that of Dr.Jit, and that of the C library.
+    """Return the free memory of Dr.Jit and of the C library to the system.
 
-    Both keep what was freed for later. After a step of a fit that takes much memory, nothing later
-    asks for blocks of these sizes.
+    Both cache freed memory. After a stage of a fit that takes much memory, no later stage
+    allocates blocks of these sizes.
 
     Parameters
     ----------
     values : int
-        Size of the image of this step: above `LARGE`, its memory is given back.
+        Size of the image of this stage. Memory is released above `MAX_CACHED_VALUES`.
     """
-    if values <= LARGE:
+    if values <= MAX_CACHED_VALUES:
         return
     dr.flush_malloc_cache()
     if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc; others have none
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # only glibc has it
         if trim is not None:
             trim(0)
 
@@ -144,7 +145,7 @@ def upload_rows(kind: type[Kind], rows: Iterable[Values]) -> list[Kind]:
             target = kind(np.ascontiguousarray(values))
         else:
             target = dr.empty(kind, len(values))
-            target.numpy()[:] = values  # a view: the host writes to memory of Dr.Jit
+            target.numpy()[:] = values  # a view: the host writes to Dr.Jit's memory
         targets.append(target)
     dr.eval(targets)
     dr.sync_thread()  # the copies may read the caller's memory until here
@@ -152,10 +153,11 @@ def upload_rows(kind: type[Kind], rows: Iterable[Values]) -> list[Kind]:
 
 
 def settle(rows: list[kinds.Float]) -> list[kinds.Float]:
-    """Return rows after their pending scatters, if there are any.
+    """Return rows after evaluating their pending scatters, if there are any.
 
-    Dr.Jit 1.5 ends the process ("dirty variable") where it scatters several such rows at once, as
-    `drjit.ravel` does. `drjit.concat` and `drjit.ravel` return such rows, and users scatter too.
+    Dr.Jit 1.5 ends the process ("dirty variable") if several rows with pending scatters are
+    scattered at once, as `drjit.ravel` does. `drjit.concat`, `drjit.ravel` and users' scatters
+    produce such rows.
     """
     dr.eval([row for row in rows if row.state == dr.VarState.Dirty])
     return rows
@@ -170,7 +172,7 @@ def gather_run(
 ) -> list:
     """Gather ``source[index * length : (index + 1) * length]``, in packets if the length is even.
 
-    Return a list of `length` Float.
+    Returns a list of `length` Floats.
     """
     shape, kind = (length, dr.width(index)), types.FloatX
     if dr.type_v(source) == dr.VarType.Float16:
@@ -189,15 +191,15 @@ TANH_DENOMINATOR = (
 power: Cephes 2.8, tanh.c (Moshier, 1989)."""
 
 TANH_SMALL = 0.625
-"""Below, ``1 - exp(-2 |v|)`` would lose digits."""
+"""Below this absolute value, ``1 - exp(-2 |v|)`` would lose digits."""
 
 
 def rcp(x: Number) -> Number:
-    """Return ``1 / x``, in double precision to the last bits on every backend.
+    """Return ``1 / x``, accurate to the last bits in double precision on every backend.
 
     Parameters
     ----------
-    x : Float, shape (N,), or an array of several
+    x : Float, shape (N,), or an array of several Floats
         In single or double precision.
 
     Returns
@@ -212,11 +214,11 @@ def rcp(x: Number) -> Number:
 
 
 def rsqrt(x: Number) -> Number:
-    """Return ``1 / sqrt(x)``, in double precision to the last bits on every backend.
+    """Return ``1 / sqrt(x)``, accurate to the last bits in double precision on every backend.
 
     Parameters
     ----------
-    x : Float, shape (N,), or an array of several
+    x : Float, shape (N,), or an array of several Floats
         In single or double precision.
 
     Returns
@@ -231,11 +233,11 @@ def rsqrt(x: Number) -> Number:
 
 
 def tanh(v: kinds.Float) -> kinds.Float:
-    """Return the hyperbolic tangent, differentiable, with a relative error of a few last bits.
+    """Return the hyperbolic tangent with a relative error of a few last bits; differentiable.
 
     Parameters
     ----------
-    v : Float, shape (N,), or an array of several
+    v : Float, shape (N,), or an array of several Floats
         In single or double precision; infinities are allowed.
 
     Returns
@@ -251,17 +253,17 @@ def tanh(v: kinds.Float) -> kinds.Float:
     share = rcp(1 + decay)
     large = dr.copysign((1 - decay) * share, exact)
     value = dr.select(dr.abs(exact) < TANH_SMALL, small, large)
-    # Dr.Jit would differentiate both branches, and that for small v overflows at large ones.
+    # Dr.Jit would differentiate both branches, and the branch for small v overflows for large v.
     return _with_slope(value, 4 * decay * dr.square(share), v)
 
 
 @dataclass(frozen=True)
 class Divisor:
-    """An integer that divides others, in arrays: a literal would compile a program for each value.
+    """An integer divisor in arrays; a literal would compile a program for each value.
 
-    LLVM and PTX divide by an array slowly, lane after lane on llvm. A product with the reciprocal
-    is exact: with ``2^(s-1) < d <= 2^s`` and ``m = ceil(2^(31+s) / d)``, the quotient of n < 2^31
-    is ``n m >> 31 + s`` (Granlund and Montgomery, "Division by Invariant Integers using
+    LLVM and PTX divide slowly by an array (llvm lane by lane). Multiplication by the reciprocal is
+    exact: with ``2^(s-1) < d <= 2^s`` and ``m = ceil(2^(31+s) / d)``, the quotient of n < 2^31 is
+    ``n m >> 31 + s`` (Granlund and Montgomery, "Division by Invariant Integers using
     Multiplication", 1994).
 
     Attributes
@@ -284,14 +286,14 @@ class Divisor:
 
 
 def make_divisor(types: ArrayTypes, value: int) -> Divisor:
-    """Return a divisor in [1, 2^31)."""
+    """Return the `Divisor` of an integer in [1, 2^31)."""
     shift = (value - 1).bit_length()
     multiplier = -(-(1 << (31 + shift)) // value)
     return Divisor(*(dr.opaque(types.UInt, v) for v in (value, multiplier, shift)))
 
 
 def _with_slope(value: Number, slope: Number, x: Number) -> Number:
-    """Return a value whose derivative by x is `slope`; Dr.Jit's own takes `drjit.rcp`."""
+    """Attach the derivative `slope` with respect to x; Dr.Jit's own would use `drjit.rcp`."""
     return dr.replace_grad(value, slope * x) if dr.grad_enabled(x) else value
 
 

@@ -29,22 +29,23 @@ except Exception as error:
     answer = {"works": False, "problem": str(error)}
 print(json.dumps(answer))
 """
-"""Python program that computes with the backend of its first argument and prints a JSON object."""
+"""Python program that runs a computation on the backend given by its first argument and prints a
+JSON object."""
 
 VARIANTS = "import json, mitsuba; print(json.dumps(mitsuba.variants()))"
 """Python program that prints the variants of Mitsuba as JSON."""
 
 
 def report() -> Record:
-    """Try every backend and collect the versions of this machine.
+    """Try every backend, and collect the versions of the software on this machine.
 
-    This takes one or two seconds and starts Dr.Jit in other processes only.
+    This takes one or two seconds, and starts Dr.Jit in other processes only.
 
     Returns
     -------
     dict
         ``llvm``, ``cuda``, ``metal`` : dict
-            ``works`` and ``problem`` (None, or one line that says what to do). If the backend
+            ``works`` and ``problem`` (None, or one line with advice). If the backend
             works, also the entries of `eigengs_dr.backend.selection.describe`.
         ``libllvm`` : list of dict
             ``path``, ``version`` and ``usable`` of every library found.
@@ -67,12 +68,12 @@ def report() -> Record:
     }
 
 
-def describe(found: Record) -> str:
+def describe(diagnosis: Record) -> str:
     """Format a report as text.
 
     Parameters
     ----------
-    found : dict
+    diagnosis : dict
         The result of `report`.
 
     Returns
@@ -80,10 +81,10 @@ def describe(found: Record) -> str:
     str
         Lines for a terminal, without a newline at the end.
     """
-    lines = [f"python   {found['python']} on {found['platform']}"]
+    lines = [f"python   {diagnosis['python']} on {diagnosis['platform']}"]
     for name in BACKENDS:
-        trial = found[name]
-        if name == "metal" and found["platform"].startswith("Linux"):
+        trial = diagnosis[name]
+        if name == "metal" and diagnosis["platform"].startswith("Linux"):
             continue
         if not trial["works"]:
             lines.append(f"{name:8} does not work: {trial['problem']}")
@@ -95,12 +96,12 @@ def describe(found: Record) -> str:
             library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
             detail = f", {library}, {trial['threads']} threads on {trial['cpu']}"
         lines.append(f"{name:8} works: Dr.Jit {versions['drjit']}{detail}")
-    lines.append("libLLVM  found:" if found["libllvm"] else "libLLVM  none found")
-    used = found["llvm"]["versions"]["libllvm_path"] if found["llvm"]["works"] else None
-    for library in found["libllvm"]:
+    lines.append("libLLVM  found:" if diagnosis["libllvm"] else "libLLVM  none found")
+    used = diagnosis["llvm"]["versions"]["libllvm_path"] if diagnosis["llvm"]["works"] else None
+    for library in diagnosis["libllvm"]:
         note = "used" if library["path"] == used else "usable" if library["usable"] else "too old"
         lines.append(f"           {library['version'] or '?':>3}  {library['path']} ({note})")
-    lines.append(f"mitsuba  {_mitsuba_line(**found['mitsuba'])}")
+    lines.append(f"mitsuba  {_mitsuba_line(**diagnosis['mitsuba'])}")
     return "\n".join(lines)
 
 
@@ -120,8 +121,9 @@ def _try(name: str) -> Record:
     process = _python(TRIAL, name)
     if process.returncode == 0:
         return dict(json.loads(process.stdout.splitlines()[-1]))
-    how = f"signal {-process.returncode}" if process.returncode < 0 else process.returncode
-    return {"works": False, "problem": f"the process ended with {how}; {libllvm.INSTALL_ADVICE}"}
+    code = process.returncode
+    status = f"signal {-code}" if code < 0 else f"exit code {code}"
+    return {"works": False, "problem": f"the process ended with {status}; {libllvm.INSTALL_ADVICE}"}
 
 
 def _mitsuba() -> Record:

@@ -1,8 +1,8 @@
-"""Doors: what callers reach the package by, and the one place where these take the lock of Dr.Jit.
+"""Doors: the entry points of the package, and the one place where these take the lock of Dr.Jit.
 
 A public function that uses Dr.Jit is a door, and so is each public method of a class of doors.
-What is reached through doors alone needs no lock. Work that has no door takes `exclusive` itself:
-a group of images, a block, a task of a cluster.
+Functions that are only called from doors need no lock. Work that starts elsewhere takes
+`exclusive` itself: a group of images, a block, a task of a cluster.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ Kind = TypeVar("Kind", bound=type)
 def door(function: Function) -> Function:
     """Decorate a public function that uses Dr.Jit.
 
-    No other thread uses Dr.Jit during a call: without that, threads end the process or hang, see
-    `eigengs_dr.backend.recording`. Numbers may be those of NumPy, see `takes_numbers`.
+    No other thread uses Dr.Jit during a call. Without the lock, threads crash the process or hang,
+    see `eigengs_dr.backend.recording`. NumPy numbers are accepted, see `takes_numbers`.
     """
     plain = takes_numbers(function)
 
@@ -34,7 +34,7 @@ def door(function: Function) -> Function:
 
 
 def class_of_doors(kind: Kind) -> Kind:
-    """Decorate a class, so that its public methods and ``[...]`` are doors; properties are none."""
+    """Decorate a class: its public methods and ``[...]`` become doors, its properties do not."""
     for name, member in list(vars(kind).items()):
         if name.startswith("_") and name != "__getitem__":
             continue

@@ -1,6 +1,6 @@
-"""Where tasks run: in this process, or on the workers of a cluster.
+"""Executors run tasks in this process or on the workers of a cluster.
 
-Functions that take ``client`` ask `eigengs_dr.cluster.client.executor_for` for an `Executor`.
+Functions that take ``client`` get an `Executor` from `eigengs_dr.cluster.client.executor_for`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ Task = TypeVar("Task")
 Value = TypeVar("Value")
 
 Function = Callable[[Task, Any], Value]
-"""``function(task, shared)``, a function of a module."""
+"""``function(task, shared)``, defined at the top level of a module."""
 
 
 class ClusterError(RuntimeError):
-    """A cluster cannot be used or is lost; the message is one line."""
+    """A cluster cannot be used, or the connection is lost; the message is one line."""
 
 
 class Done(NamedTuple):
@@ -29,8 +29,8 @@ class Done(NamedTuple):
     value : object
         What the function returned.
     lost : str
-        One line, if the task ended its worker so often that it is given up; the value is then
-        None. Else empty.
+        One line if the task was given up because it crashed its worker too often; the value is
+        then None. Otherwise empty.
     """
 
     task: Any
@@ -58,12 +58,12 @@ class Executor(Protocol):
         Parameters
         ----------
         function : callable
-            A function of a module. It may run twice for one task, if a worker is lost.
+            Defined at the top level of a module. It may run twice for one task if a worker is lost.
         tasks : iterable
-            Tasks of NumPy arrays, paths, numbers, bytes, and records of these. They are drawn when
-            workers become free, a few ahead.
+            NumPy arrays, paths, numbers, bytes, and records of these. Tasks are taken from the
+            iterable as workers become free, a few ahead.
         shared : object
-            What all tasks use; it travels once.
+            Data that all tasks use; it is sent once.
 
         Yields
         ------
@@ -75,7 +75,7 @@ class Executor(Protocol):
         ClusterError
             If the cluster is lost.
         Exception
-            What the function raises.
+            The exception of the function, if it raises one.
         """
 
 
@@ -88,7 +88,7 @@ class LocalExecutor:
         self, function: Function[Task, Value], tasks: Iterable[Task], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`."""
-        from .recording import exclusive  # loads Dr.Jit, which the help of commands does not need
+        from .recording import exclusive  # loads Dr.Jit, which `--help` does not need
 
         for task in tasks:
             with exclusive():  # a task may use Dr.Jit, beside other threads of the caller
@@ -102,7 +102,7 @@ def completed(
     tasks: Iterable[Task],
     shared: Any = None,
 ) -> Generator[tuple[Task, Value], None, None]:
-    """Run tasks none of which may fail.
+    """Run tasks, and fail if one of them is given up.
 
     Parameters
     ----------
@@ -123,5 +123,5 @@ def completed(
     with closing(executor.map(function, tasks, shared)) as ended:
         for task, value, lost in ended:
             if lost:
-                raise ClusterError(f"a part of the work cannot be done: {lost}")
+                raise ClusterError(f"part of the work cannot be done: {lost}")
             yield task, value

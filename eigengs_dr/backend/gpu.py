@@ -1,7 +1,7 @@
-"""Whether a GPU computes what llvm computes: trials in other processes, one verdict a machine.
+"""Check that a GPU computes the same as llvm: trials in other processes, one verdict per machine.
 
-A trial is a small piece of work, ``eigengs-dr doctor --trial NAME``, which prints its figures. It
-runs in another process for each backend, so that a driver that crashes ends only that process.
+A trial, ``eigengs-dr doctor --trial NAME``, is a small computation that prints its figures. Each
+backend runs it in a process of its own, so that a driver that crashes ends only that process.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import NamedTuple
 from .types import Record
 
 ALLOWED = {"fit": 0.05, "gradients": 1e-3, "texture": 1e-3, "scene": 5e-3}
-"""Largest difference of the figures of a trial, by its name: decibels for "fit", else a share of
-the largest figure. On a GPU sums run in another order, and some instructions have 20 bits."""
+"""Largest allowed difference of the figures of each trial: in dB for "fit", otherwise relative to
+the largest figure. A GPU sums in another order, and some of its instructions have 20 bits."""
 
 TRIAL_SECONDS = 600.0
-"""Time for a trial, most of which compiles its programs."""
+"""Time limit of a trial, which spends most of it compiling its programs."""
 
 
 class Trial(NamedTuple):
@@ -31,10 +31,10 @@ class Trial(NamedTuple):
     Attributes
     ----------
     seconds : float
-        Of a second run in the process, whose programs are compiled.
+        Time of the second run in the process, after its programs are compiled.
     figures : list of float
     problem : str
-        One line, if the trial has failed; else empty.
+        One line if the trial has failed, otherwise empty.
     """
 
     seconds: float
@@ -66,7 +66,7 @@ class Comparison(NamedTuple):
 
 
 def compare(name: str, backend: str) -> Comparison:
-    """Run a trial on llvm and on a GPU, in some seconds to a minute.
+    """Run a trial on llvm and on a GPU; this takes between a few seconds and a minute.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def run_trial(name: str, backend: str) -> Trial:
             command, capture_output=True, text=True, check=False, timeout=TRIAL_SECONDS
         )
     except subprocess.TimeoutExpired:
-        return Trial(0.0, [], f"no end after {TRIAL_SECONDS:.0f} s")
+        return Trial(0.0, [], f"not finished after {TRIAL_SECONDS:.0f} s")
     if process.returncode == 0:
         answer: Record = json.loads(process.stdout.splitlines()[-1])
         return Trial(answer["seconds"], answer["figures"])
@@ -102,16 +102,16 @@ def run_trial(name: str, backend: str) -> Trial:
 
 
 def agrees(backend: str, identity: str) -> bool:
-    """Whether a fit on a GPU agrees with one on llvm, as a trial has shown once on this machine.
+    """Return whether a fit on a GPU agrees with one on llvm; the trial runs once per machine.
 
-    The verdict is kept in `verdict_file`. Where no trial can run, because llvm does not work, the
-    GPU has nothing to be compared with, and counts as right.
+    The verdict is stored in `verdict_file`. If llvm does not work, there is nothing to compare the
+    GPU with, and it counts as correct.
 
     Parameters
     ----------
     backend : {"cuda", "metal"}
     identity : str
-        What the verdict holds for: the device and the versions. Another one is tried anew.
+        The device and the versions that the verdict is valid for. A new identity is tried again.
     """
     path = verdict_file()
     verdicts: dict[str, bool] = {}
@@ -125,11 +125,11 @@ def agrees(backend: str, identity: str) -> bool:
         verdicts[identity] = comparison.agrees
         with suppress(OSError):  # a home that is read-only: the next process tries again
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(verdicts), encoding="utf-8")  # half a file is tried anew
+            path.write_text(json.dumps(verdicts), encoding="utf-8")  # a damaged file is ignored
     return verdicts[identity]
 
 
 def verdict_file() -> Path:
-    """Return the file of the verdicts, in the folder of Dr.Jit's compiled programs."""
+    """Return the file of the verdicts, in the folder of Dr.Jit's kernel cache."""
     folder = os.environ.get("DRJIT_CACHE_DIR")
     return (Path(folder) if folder else Path.home() / ".drjit") / "eigengs-dr-gpu.json"

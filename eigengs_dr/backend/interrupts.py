@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM during a call: it stops between two steps, or cleans up."""
+"""Ctrl-C and SIGTERM during a call: the call stops between two steps, or cleans up."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def _is_heard(handler: Handler) -> bool:
 def terminate_as_interrupt() -> Iterator[None]:
     """Turn Ctrl-C and SIGTERM into a `KeyboardInterrupt` during a block, so that it cleans up.
 
-    A second signal ends the process. The block changes nothing in other threads than the main
-    thread, nor where something else handles a signal, such as `defer_interrupts`.
+    A second signal ends the process. The block has an effect in the main thread only, and leaves
+    alone signals that something else handles, such as `defer_interrupts`.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def _first_signal(
 ) -> Iterator[None]:
     """Call a function at the first signal in a block; a second one has its usual effect.
 
-    In the main thread alone, and for signals whose handler may be replaced.
+    This has an effect in the main thread only, for signals whose handler may be replaced.
     """
     handlers = {number: signal.getsignal(number) for number in numbers}
     handlers = {number: old for number, old in handlers.items() if replaced(old)}

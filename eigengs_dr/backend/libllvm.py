@@ -1,8 +1,8 @@
 """Choice of the libLLVM that Dr.Jit loads.
 
 Dr.Jit looks for libLLVM while it is imported: first at ``DRJIT_LIBLLVM_PATH``, then for the
-system's ``libLLVM.so``, then in ``/usr/lib``. The library may be too old: Dr.Jit refuses version
-14, and accepts versions 15 and 16, but these end the process at the first ``dr.clip``. Therefore
+system's ``libLLVM.so``, then in ``/usr/lib``. That library may be too old: Dr.Jit rejects version
+14, and accepts versions 15 and 16 although these crash at the first ``dr.clip``. Therefore
 `select_libllvm` sets the variable to a newer library before the import.
 """
 
@@ -50,23 +50,24 @@ class Library(NamedTuple):
 
 
 def candidates() -> list[Library]:
-    """Find the LLVM libraries of this machine by their file names, without loading them.
+    """Find the LLVM libraries on this machine by their file names, without loading them.
 
     Returns
     -------
     list of Library
-        One entry for each file: tested versions first, then the others, each from the newest to
-        the oldest. Unknown versions come last.
+        One entry for each file: tested versions first, then the others, both from newest to
+        oldest. Unknown versions come last.
     """
-    found: dict[str, Library] = {}
+    libraries: dict[str, Library] = {}
     for pattern in _patterns():
         for path in sorted(glob.glob(pattern)):
             real = os.path.realpath(path)
             # A small file with this name is a linker script.
             if os.path.isfile(real) and os.path.getsize(real) > 1_000_000:
-                found.setdefault(real, _library(path))
+                libraries.setdefault(real, _library(path))
     return sorted(
-        found.values(), key=lambda one: (one.version not in TESTED_VERSIONS, -(one.version or 0))
+        libraries.values(),
+        key=lambda library: (library.version not in TESTED_VERSIONS, -(library.version or 0)),
     )
 
 
@@ -108,7 +109,7 @@ def _patterns() -> list[str]:
 
 
 def _library(path: str) -> Library:
-    """Take the version from the name of a file, or from the name of what it links to."""
+    """Read the version from the name of a file, or from the name of the target of a link."""
     return Library(path, _version_in(path) or _version_in(os.path.realpath(path)))
 
 
@@ -116,33 +117,35 @@ def _version_in(path: str) -> int | None:
     """Read the major version from ``libLLVM.so.19.1``, ``libLLVM-15.so`` or ``llvm@18/lib/...``."""
     name = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+)", os.path.basename(path))
     folder = re.search(r"llvm(?:[@-]?|/)(\d+)(?:\.[\d.]*)?[/\\]lib", path, re.IGNORECASE)
-    found = name or folder
-    return int(found.group(1)) if found else None
+    match = name or folder
+    return int(match.group(1)) if match else None
 
 
 def too_old() -> str | None:
-    """Say in part of a line that the library at `PATH_VARIABLE` has a name of an old version.
+    """Return a message if the file name of the library at `PATH_VARIABLE` has an old version.
 
-    To load a library only to refuse it may crash the process, and takes minutes on a cold disk.
+    Loading a library only to reject it may crash the process, and takes minutes on a cold disk.
     """
-    asked = _library(os.environ.get(PATH_VARIABLE, ""))
-    if asked.usable:
+    library = _library(os.environ.get(PATH_VARIABLE, ""))
+    if library.usable:
         return None
-    return f"{asked.path} (from {PATH_VARIABLE}) is LLVM {asked.version}, which Dr.Jit cannot use"
+    return (
+        f"{library.path} (from {PATH_VARIABLE}) is LLVM {library.version}, which Dr.Jit cannot use"
+    )
 
 
 def load_failure() -> str:
-    """Say in part of a line which libLLVM Dr.Jit refused, or that none was found."""
-    asked = os.environ.get(PATH_VARIABLE)
-    if not asked:
+    """Return a message that names the libLLVM that Dr.Jit rejected, or says that none was found."""
+    path = os.environ.get(PATH_VARIABLE)
+    if not path:
         names = ", ".join(library.path for library in candidates())
         return f"no libLLVM is new enough for Dr.Jit ({names})" if names else "no libLLVM was found"
-    fault = "is no libLLVM" if os.path.exists(asked) else "does not exist"
-    return f"{asked} (from {PATH_VARIABLE}) {fault}"
+    fault = "is not a libLLVM" if os.path.exists(path) else "does not exist"
+    return f"{path} (from {PATH_VARIABLE}) {fault}"
 
 
 def advice() -> str:
-    """Say in part of a line what to do: use another library of this machine, or install one."""
+    """Return what to do, for a message: use another library of this machine, or install one."""
     failed = os.path.realpath(os.environ.get(PATH_VARIABLE) or loaded_path() or "")
     for path in _usable():
         if os.path.realpath(path) != failed:
@@ -159,12 +162,12 @@ def loaded_path() -> str | None:
         On Linux the file that the process has loaded, or None; on other systems the value of
         `PATH_VARIABLE`, or None.
     """
-    asked = os.environ.get(PATH_VARIABLE)
+    configured = os.environ.get(PATH_VARIABLE)
     try:
         lines = Path("/proc/self/maps").read_text().splitlines()
     except OSError:
-        return asked
+        return configured
     loaded = sorted({line.split(maxsplit=5)[5] for line in lines if "libLLVM" in line})
-    if asked and os.path.realpath(asked) in loaded:
-        return asked
+    if configured and os.path.realpath(configured) in loaded:
+        return configured
     return loaded[0] if loaded else None

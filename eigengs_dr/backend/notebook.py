@@ -1,13 +1,13 @@
-"""What a notebook shows of objects of this package; the viewer makes it, which is above them."""
+"""HTML representations for notebooks, which the viewer, a layer above, provides."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 make_html: Callable[[object], str] = repr
-"""That of the viewer, see `eigengs_dr.viewer.notebook.to_html`; `eigengs_dr` puts it here."""
+"""`eigengs_dr.viewer.notebook.to_html`, which `eigengs_dr` assigns here."""
 
 
 def to_html(value: object) -> str:
-    """Return pictures and figures of a set, a fit, a basis or a model."""
+    """Return pictures and figures of a set, a fit, a basis or a model as HTML."""
     return make_html(value)

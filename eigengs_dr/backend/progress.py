@@ -1,4 +1,4 @@
-"""Bars that show how far a call is, in a terminal or a notebook."""
+"""Progress bars for long calls, in a terminal or a notebook."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ DELAY = 2.0
 """Seconds before a bar appears."""
 
 Progress = Callable[..., None] | bool | None
-"""What callers give, see `shows_progress`."""
+"""Values of the argument ``progress``, see `shows_progress`."""
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
 
 def shows_progress(function: Function) -> Function:
-    """Decorate a function with an argument ``progress``, so that it shows a bar by itself.
+    """Decorate a function with an argument ``progress``, so that it shows a progress bar.
 
-    None and True make a bar that appears after `DELAY` seconds, in a notebook or if standard error
-    is a terminal. False shows nothing. A function ``progress(done, total, row)`` is called.
+    None and True show a bar after `DELAY` seconds, in a notebook or if standard error is a
+    terminal. False shows nothing. A function is called as ``progress(done, total, row)``.
     """
     arguments = signature(function)
 
@@ -38,21 +38,21 @@ def shows_progress(function: Function) -> Function:
 
 @contextmanager
 def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable[..., None] | None]:
-    """Show a bar during a block, and return what reports progress.
+    """Show a bar during a block, and yield a function that updates it.
 
     Parameters
     ----------
     progress : bool or callable, optional
         See `shows_progress`.
     name : str, optional
-        What stands before the bar.
+        Text before the bar.
 
     Yields
     ------
     callable or None
-        ``show(done, total, row)``, or with a label before these; a new label restarts the bar. The
-        bar shows ``psnr_rgb`` of the row, or its loss; the row may be left out. None if nobody sees
-        a bar.
+        ``show(done, total, row)``, optionally with a label as the first argument; a new label
+        restarts the bar. The bar shows ``psnr_rgb`` of the row, or its loss; the row may be left
+        out. None if no bar is visible.
     """
     if callable(progress):
         yield progress
@@ -69,7 +69,7 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
                 label, *values = values  # type: ignore[assignment]
                 if label != bar.desc:
                     bar.set_description_str(label, refresh=False)
-                    if bar.n:  # else it would be shown at once
+                    if bar.n:  # otherwise the bar would appear at once
                         bar.reset()
             done, bar.total, *rest = values
             row = rest[0] if rest else None
@@ -84,7 +84,7 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
 
 
 def _is_watched() -> bool:
-    """Return whether somebody sees a bar: in a notebook, or in a terminal."""
+    """Return whether a bar is visible, in a notebook or in a terminal."""
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     if shell is not None and hasattr(shell, "kernel"):
         return True

@@ -1,18 +1,18 @@
-"""Programs of Dr.Jit: one thread at a time; frozen ones take flat lists, and are freed safely.
+"""Dr.Jit programs: one thread at a time; frozen programs take flat lists and are freed safely.
 
-Dr.Jit 1.5 keeps state for the whole process. While one thread records or replays a frozen program,
-another thread that traces, differentiates, records or frees a program ends the process, hangs it,
-or lets the replay fail ("determining size of variable"). One lock of this module excludes that.
+Dr.Jit 1.5 has process-wide state. While one thread records or replays a frozen program, another
+thread that traces, differentiates, records or frees a program crashes the process, hangs it, or
+makes the replay fail ("determining size of variable"). The lock of this module prevents this.
 
-Other threads free arrays at any time: Python drops a result, a worker of Dask a message. They then
-hold Python's lock and wait for Dr.Jit's. A frozen call holds Dr.Jit's lock while it walks its
-arguments and builds its result. If code of Python ran there, such as `dataclasses.fields` or the
-``__init__`` of a dataclass, Python might hand its lock to one of these threads, and both would wait
-for ever. Therefore a frozen program takes and returns lists of arrays alone, which Dr.Jit walks
-without Python, and `_flatten` and `_build` do the rest outside of the call.
+Other threads free arrays at any time, for example when Python drops a result, or a Dask worker a
+message. They then hold Python's lock and wait for Dr.Jit's. A frozen call holds Dr.Jit's lock while
+it traverses its arguments and builds its result. If Python code ran there, such as
+`dataclasses.fields` or the ``__init__`` of a dataclass, Python might pass its lock to one of these
+threads: a deadlock. Therefore a frozen program takes and returns only lists of arrays, which
+Dr.Jit traverses without running Python code; `_flatten` and `_build` convert outside of the call.
 
-Nor do constants reach Dr.Jit: it mixes them up. A program recorded with the numbers 16, 32, 0 was
-replayed for 16, 32, 16. Each set of constants has a program of its own.
+Constants do not reach Dr.Jit either, because it confuses them: a program recorded with the numbers
+16, 32, 0 was replayed for 16, 32, 16. Each set of constants has a program of its own.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from __future__ import annotations
 import atexit
 import gc
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -36,42 +37,42 @@ Program = Callable[..., Any]
 """A function of Dr.Jit arrays."""
 
 Shape = tuple | None
-"""What is left of a value without its arrays: None for an array; the type and the value of a
-constant; the type, the names and the shapes of the parts of a list, a dictionary or a dataclass."""
+"""The structure of a value without its arrays: None for an array; type and value of a constant;
+type, names and shapes of the parts of a list, a dictionary or a dataclass."""
 
 CONSTANTS = (int, float, bool, str, range)
-"""Types of constants, beside None. Each value of one has a program of its own."""
+"""Types of constants, besides None. A program is recorded for each value."""
 
 _LOCK = threading.RLock()
 """The thread that holds it may use Dr.Jit."""
 
 _retired: deque[Callable[[], None]] = deque()
-"""Functions that free programs and arrays that nobody uses any more; for `_clear_retired`."""
+"""Functions that free unused programs and arrays; `_clear_retired` calls them."""
 
 _calls = 0
-"""Calls of frozen programs under way, in the thread that holds `_LOCK`."""
+"""Number of running calls of frozen programs, in the thread that holds `_LOCK`."""
 
 _COLLECTOR_LOCK = threading.RLock()
 _pauses = 0
-"""Blocks that keep the garbage collector off, in all threads."""
+"""Number of blocks, in all threads, that keep the garbage collector off."""
 _collects = False
-"""Whether the collector was on before the first of these blocks."""
+"""Whether the collector was enabled before the first of these blocks."""
 
 
 @contextmanager
 def exclusive() -> Iterator[None]:
-    """Let no other thread use Dr.Jit during a block, or during every call of a function.
+    """Keep other threads from using Dr.Jit during a block, or during every call of a function.
 
-    The functions of this package that use Dr.Jit do so by themselves, as `eigengs_dr.fit` and
-    `eigengs_dr.render`. Use it around your own use of Dr.Jit or Mitsuba, such as `drjit.backward`
-    or `mitsuba.render`, if another thread may call this package meanwhile. Blocks of one thread
-    may nest. Scenes may be loaded in a block: Mitsuba's loading threads are let in. A block that
-    waits for any other thread must not hold what that thread waits for.
+    The functions of this package that use Dr.Jit, such as `eigengs_dr.fit` and
+    `eigengs_dr.render`, do so by themselves. Use it around your own calls of Dr.Jit or Mitsuba,
+    such as `drjit.backward` or `mitsuba.render`, if another thread may call this package at the
+    same time. Blocks of one thread may nest. Scenes may be loaded in a block, because Mitsuba's
+    loading threads need no lock. A block must not wait for another thread that waits for the lock.
 
     Returns
     -------
     context manager
-        Also a decorator, ``@exclusive()``, of functions that are no generators.
+        Also a decorator, ``@exclusive()``, of functions that are not generators.
 
     Examples
     --------
@@ -94,18 +95,18 @@ def exclusive() -> Iterator[None]:
 
 
 _guests = threading.local()
-"""``here`` counts the blocks of `guest` around this thread, which works for one that waits."""
+"""``here`` counts the open `guest` blocks of a thread."""
 
 
 @contextmanager
 def guest() -> Iterator[None]:
-    """Use Dr.Jit for a thread that waits for this one: nothing in the block waits for a lock.
+    """Use Dr.Jit on behalf of a thread that waits for this one, without taking the lock.
 
-    Mitsuba makes the objects of a scene in the threads of Dr.Jit's pool, for which the caller
-    waits. If the caller holds the lock, they would wait for it for ever. Guests do not even wait
-    for each other: a thread that waits for a kernel does other work of the pool meanwhile, such as
-    the object of a bitmap, and OpenEXR waits for threads of the same pool. So guests trace, which
-    threads may do at once, and replay nothing, see `record`.
+    Mitsuba creates the objects of a scene in the threads of Dr.Jit's pool, and the caller waits for
+    them. If the caller holds the lock, they would wait for ever. Guests do not wait for each other
+    either: a thread that waits for a kernel runs other tasks of the pool, such as loading a
+    bitmap, and OpenEXR waits for threads of the same pool. So guests trace, which several threads
+    may do at the same time, and replay nothing, see `record`.
     """
     _guests.here = getattr(_guests, "here", 0) + 1
     try:
@@ -119,27 +120,28 @@ def _is_guest() -> bool:
 
 
 MANY_RECORDINGS = 1 << 30
-"""Recordings of one program after which Dr.Jit warns; by default after 10. Lists grow and shrink in
-a descent, and images have many sizes: each other size is recorded, in 3 ms, which is no fault."""
+"""Number of recordings of one program after which Dr.Jit warns; its default is 10. Lists grow and
+shrink during a descent, and images have many sizes; each new size is recorded in 3 ms."""
 
 
 @contextmanager
 def freeze_program(function: Program) -> Iterator[Program]:
     """Freeze a function with `drjit.freeze` during a block, and free its program after the block.
 
-    While Dr.Jit 1.5 records a program, the process ends if Python frees another program or an array
-    that shares NumPy's memory. The garbage collector frees such objects at any time if a reference
-    cycle holds them. Therefore the collector is off during calls, and the block frees the program.
+    While Dr.Jit 1.5 records a program, the process crashes if Python frees another program or an
+    array that shares NumPy's memory. The garbage collector may free such objects at any time if
+    they belong to a reference cycle. Therefore the collector is off during calls, and the block
+    frees the program.
 
-    A generator that nobody reads to its end closes its block wherever Python drops it, perhaps in
-    another thread or during a recording. Therefore the end of the block only retires the program.
-    It is freed at once if no program is being called, else by the next `exclusive` block.
+    A generator that is not exhausted closes its block wherever Python drops it, perhaps in another
+    thread or during a recording. Therefore the end of the block only retires the program. It is
+    freed at once if no program is running, otherwise by the next `exclusive` block.
 
     Parameters
     ----------
     function : callable
-        A function of positional arguments: arrays of Dr.Jit, numbers, texts and None, in lists,
-        tuples, dictionaries and dataclasses; so is its result. It changes none of them in place.
+        Its positional arguments and its result are Dr.Jit arrays, numbers, strings and None, in
+        lists, tuples, dictionaries and dataclasses. It changes none of them in place.
 
     Yields
     ------
@@ -155,19 +157,19 @@ def freeze_program(function: Program) -> Iterator[Program]:
 
 
 KEPT_RECORDINGS = 8
-"""Recordings that a function of `record` keeps: those that were used last."""
+"""Number of recordings that `record` keeps for a function: the most recently used ones."""
 
 LARGEST_RECORDED = 1 << 22
-"""Size of the largest array of a call that is recorded. A replay frees its temporary arrays at its
-end, which takes memory, and where arrays are larger tracing hardly counts."""
+"""Size of the largest array of a call that is recorded. A replay frees its temporary arrays only at
+its end, which takes memory, and for larger arrays the time of tracing is negligible."""
 
 
 def record(function: Program) -> Program:
-    """Freeze a function of a module, for all its calls in the process; see `freeze_program`.
+    """Freeze a top-level function for all its calls in the process; see `freeze_program`.
 
-    Other fits with arrays of the same sizes replay what the first one recorded. All that a call
-    needs must be in its arguments, and these must be positional: a replay notices nothing else.
-    The function may not sort: on cuda, Dr.Jit 1.5 ends the process when it records `drjit.argsort`.
+    Later fits with arrays of the same sizes replay what the first one recorded. All inputs must be
+    positional arguments, because a replay notices nothing else. The function must not sort: on
+    cuda, Dr.Jit 1.5 crashes when it records `drjit.argsort`.
     """
     programs, replay = _freeze(lambda sizes, arguments: function(*arguments), KEPT_RECORDINGS)
     atexit.register(programs.clear)
@@ -180,8 +182,8 @@ def record(function: Program) -> Program:
         if max(sizes) > LARGEST_RECORDED or _is_guest():
             return function(*arguments)
         result = replay(sizes, arguments)
-        # A recording begins a new scope, a replay does not. Programs of later operations have
-        # their instructions in the order of scopes: they would be others after a replay.
+        # A recording begins a new scope, a replay does not. Later programs order their
+        # instructions by scope: they would differ after a replay.
         new_scope(dr.backend_v(arrays[0]))
         return result
 
@@ -195,7 +197,7 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Pr
     ----------
     function : callable
     limit : int, optional
-        Largest number of programs; the one that was not used for longest goes first.
+        Largest number of programs; the least recently used one is dropped first.
 
     Returns
     -------
@@ -213,40 +215,75 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Pr
             results[shape] = _flatten(function(*_build(shape, iter(flat))), arrays)
             return arrays
 
-        # Dr.Jit walks the variables of a frozen function, too: this one has `trace` alone.
+        # Dr.Jit also traverses the closure of a frozen function: this one only holds `trace`.
         return dr.freeze(lambda flat: trace(flat), warn_after=MANY_RECORDINGS)
 
     @wraps(function)
     def call(*arguments: object) -> object:
-        global _calls
-        with exclusive(), collector_off():
+        with _calling():
             arrays: list[DrJitArray] = []
             shape = _flatten(arguments, arrays)
             program = programs.pop(shape, None) or freeze(shape)
-            programs[shape] = program  # now the last one
+            programs[shape] = program  # now the most recently used
             if limit is not None and len(programs) > limit:
                 _retire([programs.pop(next(iter(programs)))].clear)
-            _calls += 1
-            try:
-                flat = program(arrays)
-            except RuntimeError as error:
-                if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps what it meets
-                    raise KeyboardInterrupt from error
-                raise
-            finally:
-                _calls -= 1
+            flat = program(arrays)
             return _build(results[shape], iter(flat))
 
     return programs, call
 
 
+@contextmanager
+def _calling() -> Iterator[None]:
+    """Let no other thread use Dr.Jit, and nothing be freed, while a frozen program is called."""
+    global _calls
+    with exclusive(), collector_off():
+        _calls += 1
+        try:
+            yield
+        except RuntimeError as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps exceptions
+                raise KeyboardInterrupt from error
+            raise
+        finally:
+            _calls -= 1
+
+
+def freeze_rendering(function: Program) -> Program:
+    """Freeze a function that takes objects of Mitsuba, such as a scene, beside arrays.
+
+    Dr.Jit walks what the objects hold at every call, so a change of the scene is noticed. If one of
+    them is written in Python, a thread that drops arrays meanwhile may wait for ever, see above:
+    such a scene belongs to a program of one thread.
+
+    Parameters
+    ----------
+    function : callable
+        Of positional arguments; it uses nothing else that changes.
+
+    Returns
+    -------
+    callable
+        The frozen function; its recordings are freed after it.
+    """
+    frozen = dr.freeze(function, warn_after=MANY_RECORDINGS)
+
+    @wraps(function)
+    def call(*arguments: object) -> object:
+        with _calling():
+            return frozen(*arguments)
+
+    weakref.finalize(call, _retire, frozen.clear)
+    return call
+
+
 def _flatten(value: Any, arrays: list[DrJitArray]) -> Shape:
-    """Append the arrays of a value to a list, and return all else: its shape.
+    """Append the arrays of a value to a list, and return the rest: its shape.
 
     Raises
     ------
     TypeError
-        If the value holds something else than arrays and constants.
+        If the value holds anything other than arrays and constants.
     """
     if dr.is_array_v(value):
         arrays.append(value)
@@ -272,7 +309,7 @@ def _field_names(kind: type) -> tuple[str, ...]:
 
 
 def _build(shape: Shape, arrays: Iterator[DrJitArray]) -> Any:
-    """Return the value that `_flatten` took apart."""
+    """Rebuild a value from its shape and its arrays; the inverse of `_flatten`."""
     if shape is None:
         return next(arrays)
     if len(shape) == 2:
@@ -288,14 +325,14 @@ def _build(shape: Shape, arrays: Iterator[DrJitArray]) -> Any:
 
 @contextmanager
 def release_later(*objects: object) -> Iterator[None]:
-    """Keep objects during a block, and release them after it as `freeze_program` its program.
+    """Keep objects during a block, and release them after it as `freeze_program` does.
 
     For a generator that holds arrays of its caller, because they may share NumPy's memory.
 
     Parameters
     ----------
     *objects
-        Such as a set of Gaussians.
+        For example a set of Gaussians.
     """
     kept = list(objects)
     try:
@@ -305,7 +342,7 @@ def release_later(*objects: object) -> Iterator[None]:
 
 
 def _retire(release: Callable[[], None]) -> None:
-    """Call a function that frees objects, at once or when no program is being called."""
+    """Call a function that frees objects, at once or as soon as no program is running."""
     _retired.append(release)
     if _LOCK.acquire(blocking=False):
         try:
@@ -315,18 +352,18 @@ def _retire(release: Callable[[], None]) -> None:
 
 
 def _clear_retired() -> None:
-    """Free what nobody uses any more, unless a program is being called, or a user's is recorded."""
+    """Free retired objects, unless a program is running or a user's function is being recorded."""
     while _retired and not _calls and not dr.flag(dr.JitFlag.FreezingScope):
         _retired.popleft()()
 
 
 @contextmanager
 def collector_off() -> Iterator[None]:
-    """Keep Python's garbage collector off during a block or a call; on after the last thread's.
+    """Disable Python's garbage collector during a block or a call, until the last thread leaves.
 
-    Lookups of a texture need it too: Mitsuba calls them while it records a program. If the
+    Texture lookups need it too, because Mitsuba calls them while it records a program. If the
     collector frees another scene during the recording, the program loses the textures of that
-    scene; it then ends the process or reads freed memory.
+    scene, and then crashes the process or reads freed memory.
 
     Returns
     -------

@@ -20,11 +20,11 @@ from .types import Record
 BACKENDS = ("llvm", "cuda", "metal")
 
 UNTESTED_ON_METAL = "never run; only its names are tested"
-"""State of the metal backend of Dr.Jit, which is on Macs."""
+"""Status of Dr.Jit's metal backend, which runs on Macs."""
 
 
 class BackendError(RuntimeError):
-    """A backend is not available; the message is one line that says what to install."""
+    """A backend is not available; the message is one line with what to install."""
 
 
 def select(backend: str | None = None) -> ModuleType:
@@ -52,8 +52,8 @@ def select(backend: str | None = None) -> ModuleType:
     Warns
     -----
     UserWarning
-        At the first use of metal in a process: `UNTESTED_ON_METAL`. If a GPU is there and disagrees
-        with llvm.
+        At the first use of metal in a process: `UNTESTED_ON_METAL`. If there is a GPU whose
+        results differ from llvm.
 
     Examples
     --------
@@ -84,42 +84,42 @@ def select(backend: str | None = None) -> ModuleType:
 
 
 def name_of(module: ModuleType) -> str:
-    """Return the name of the backend of a module of `select`, e.g. "llvm"."""
+    """Return the name of the backend of a module from `select`, e.g. "llvm"."""
     return module.__name__.split(".")[1]
 
 
 def backend_of(variant: str) -> str | None:
-    """Return the backend of a variant of Mitsuba such as ``llvm_ad_rgb``; None if it is scalar."""
+    """Return the backend of a Mitsuba variant such as ``llvm_ad_rgb``; None if it is scalar."""
     backend = variant.partition("_")[0]
     return backend if backend in BACKENDS else None
 
 
 @cache
 def _has(dr: ModuleType, name: str) -> bool:
-    """Whether Dr.Jit has a backend; asked once, since the question waits for Dr.Jit's lock."""
-    kind = getattr(dr.JitBackend, name, None)  # Metal is there since Dr.Jit 1.4
+    """Return whether Dr.Jit has a backend; cached, because the query waits for Dr.Jit's lock."""
+    kind = getattr(dr.JitBackend, name, None)  # Dr.Jit has Metal since 1.4
     return kind is not None and bool(dr.has_backend(kind))
 
 
 @cache  # the second call is silent
 def _announce_metal() -> None:
-    """Warn of the state of the metal backend, once in a process."""
+    """Warn about the status of the metal backend, once in a process."""
     warn(f"backend metal: {UNTESTED_ON_METAL}; compare with backend 'llvm'")
 
 
-@cache  # it asks a file, or compares fits, and warns once
+@cache  # reads a file or compares fits, and warns once
 def _cuda_agrees() -> bool:
-    """Whether cuda may be the default: a fit agrees with llvm; warn if it does not."""
+    """Return whether a fit on cuda agrees with llvm, so that cuda is the default; warn if not."""
     from .detail import cuda_device
 
     versions = {name: version_of(name) for name in ("eigengs-dr", "drjit")}
-    right = gpu.agrees("cuda", f"{platform.node()} {cuda_device()} {versions}")
-    if not right:
+    agrees = gpu.agrees("cuda", f"{platform.node()} {cuda_device()} {versions}")
+    if not agrees:
         warn(
             "backend cuda: a small fit differs from llvm, which is used instead; "
-            "'eigengs-dr doctor --gpu' tells more"
+            "'eigengs-dr doctor --gpu' shows details"
         )
-    return right
+    return agrees
 
 
 def describe(backend: str | None = None) -> Record:
@@ -184,7 +184,7 @@ def version_of(package: str) -> str | None:
 
 
 def _import_drjit() -> ModuleType:
-    """Import Dr.Jit; if libatomic is missing, say so more clearly than Dr.Jit does."""
+    """Import Dr.Jit, with a clearer error than Dr.Jit's if libatomic is missing."""
     if "drjit" in sys.modules:
         return sys.modules["drjit"]
     try:
@@ -210,7 +210,7 @@ def _cpu_model() -> str:
 
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Hide what Dr.Jit prints about a libLLVM that fails; `BackendError` says what to do."""
+    """Hide Dr.Jit's messages about a libLLVM that fails; `BackendError` gives advice instead."""
     try:
         saved = os.dup(2)
     except OSError:  # some daemons close standard error

@@ -1,9 +1,9 @@
-"""The words of annotations: arrays of Dr.Jit, and arrays of NumPy.
+"""Names of types for annotations: Dr.Jit and NumPy arrays.
 
-Which types of Dr.Jit an array has, of llvm or cuda, in single or double precision, is known at run
-time only: the same code serves all. What a checker can know is what an array holds, and that is
-what these names say. It then refuses a mask where a number belongs, or a row for several rows.
-Functions of Dr.Jit itself take and return anything, as far as a checker sees.
+The Dr.Jit type of an array (llvm or cuda, single or double precision) is known at run time only,
+because the same code serves all of them. These names tell a type checker what an array holds, so
+that it rejects a mask in the place of a number, or one row in the place of several. To a checker,
+Dr.Jit's own functions take and return anything.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ PathLike = str | os.PathLike[str]
 Doubles = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Floats = NDArray[np.floating]
-"""Floats of NumPy: of double, of single, of either precision."""
+"""NumPy floats in double, in single and in either precision."""
 
 Integers = NDArray[np.int64]
-"""Integers of NumPy."""
+"""NumPy integers."""
 
 Values = NDArray[Any]
 """A NumPy array of any dtype."""
 
 Arrays = dict[str, Values]
-"""Arrays of NumPy by their names, as in a file."""
+"""NumPy arrays by name, as in a file."""
 
 Record = dict[str, Any]
-"""Numbers, texts and lists of them by their names, as in JSON."""
+"""Numbers, strings and lists by name, as in JSON."""
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     Other = TypeVar("Other", contravariant=True)
 
     class DrJitArray:
-        """What all arrays of Dr.Jit have."""
+        """Attributes of all Dr.Jit arrays."""
 
         index: int
         state: object
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
         def __len__(self) -> int: ...
         def __eq__(self, other: object) -> bool: ...
         def numpy(self) -> Singles:
-            """Return a copy, or a view."""
+            """Return a copy or a view."""
 
     class Bool(DrJitArray):
         """A mask."""
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
         __or__ = __xor__ = __rand__ = __ror__ = __and__
 
     class Numbers(DrJitArray, Generic[Other]):
-        """What computes with others: the type parameter."""
+        """Arrays with arithmetic; the type parameter is the type of the other operand."""
 
         def __add__(self, other: Other) -> Self: ...
         def __neg__(self) -> Self: ...
@@ -74,7 +74,7 @@ if TYPE_CHECKING:
         __le__ = __gt__ = __ge__ = __lt__
 
     class UInt(Numbers["UInt | int"]):
-        """Integers of 32 bits, with or without a sign."""
+        """32-bit integers, signed or unsigned."""
 
         def __getitem__(self, place: int) -> int: ...
         def __invert__(self) -> UInt: ...
@@ -105,15 +105,15 @@ if TYPE_CHECKING:
 
         def __getitem__(self, part: object) -> Tensor: ...
 
-else:  # whatever Dr.Jit gives
+else:
 
     class DrJitArray:
-        """Stands for the arrays of Dr.Jit in annotations alone."""
+        """Placeholder for Dr.Jit arrays, used in annotations only."""
 
     Bool = UInt = Float = Rows = Tensor = DrJitArray
 
 Mask = Bool | bool
-"""A mask, or one truth value for all."""
+"""A mask, or one boolean for all."""
 
 FloatLike = Float | float
 """Floats, or one number for all."""

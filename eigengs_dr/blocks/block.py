@@ -1,17 +1,17 @@
 """The fit of one block: pure functions of pixels and numbers, which may run on any machine.
 
 A fit works on the window of the block, with all Gaussians whose means lie in it; those that only
-touch it are fixed. It moves them all, but returns those of the block alone: those of neighbours
-stand in for what the neighbours do at the same time. Between rounds of steps every block sees what
-the others have reached.
+touch it are fixed. All of them move, but only those of the block are returned: the Gaussians of
+neighbours stand in for the fits of the neighbours, which run at the same time. Between rounds of
+steps, blocks exchange their Gaussians.
 
-In one round, with stand-ins to the end, no block would see what its neighbours draw, and seams
-would stay along the borders. Blocks that wait for the results of their neighbours would fit to
-Gaussians that no longer move, and not at the same time.
+With a single round, no block would see the final Gaussians of its neighbours, and seams would
+remain along the borders. If blocks waited for the results of their neighbours, they could not run
+at the same time, and would fit to Gaussians that no longer move.
 
-Gaussians start by the adaptive placement, of one density over all blocks. Every Gaussian belongs to
-one block, which places it in its core. The density depends on the pixels around the core too, so
-that it is the density of the whole image.
+Gaussians are initialized by the adaptive placement, with one density over all blocks. Every
+Gaussian belongs to one block, which places it in its core. The density also depends on the pixels
+around the core, so that it is the density of the full image.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ Arrays = dict[str, NDArray[np.floating]]
 
 
 class Settings(NamedTuple):
-    """What all tasks of a run share.
+    """Settings that all tasks of a run share.
 
     Attributes
     ----------
     options : FitOptions
-        With a space.
+        Options whose space is set.
     gaussians : int
         Number of Gaussians of all blocks.
     spacing : float
@@ -85,7 +85,7 @@ class Surveyed(NamedTuple):
 
 
 class PlaceTask(NamedTuple):
-    """A block whose Gaussians shall be placed.
+    """A block whose Gaussians are to be placed.
 
     Attributes
     ----------
@@ -93,12 +93,12 @@ class PlaceTask(NamedTuple):
         The pixels.
     block : Block
     gaussians : int
-        From 1 to the pixels of the core.
+        From 1 to the number of pixels of the core.
     old : dict of str to ndarray, or None
-        What a fit has shown about the density: mean (N, 2) and factor (N, 3) of the Gaussians in
-        the window, in its pixels, and the ratio (N, 1), see
-        `eigengs_dr.fitting.placement.density.density_ratio`. By default the density follows the
-        second derivatives alone.
+        The density according to a fit: mean (N, 2) and factor (N, 3) of the Gaussians in the
+        window, in pixels of the window, and the ratio (N, 1), see
+        `eigengs_dr.fitting.placement.density.density_ratio`. By default the density depends on
+        second derivatives only.
     """
 
     window: Window
@@ -108,7 +108,7 @@ class PlaceTask(NamedTuple):
 
 
 class FitTask(NamedTuple):
-    """A block whose Gaussians shall be fitted.
+    """A block whose Gaussians are to be fitted.
 
     Attributes
     ----------
@@ -116,29 +116,30 @@ class FitTask(NamedTuple):
         The pixels.
     block : Block
     arrays : dict of str to ndarray of float32
-        Mean (N, 2) and factor (N, 3) of the Gaussians whose means lie in the window, as they start;
-        in pixels of the window. And their color (N, C); else a solve finds the first ones.
-    own : slice
-        Those of them that belong to the block.
+        Initial mean (N, 2) and factor (N, 3) of the Gaussians whose means lie in the window, in
+        pixels of the window, and optionally their color (N, C); otherwise the initial colours are
+        solved for.
+    members : slice
+        The Gaussians that belong to the block.
     fixed : dict of str to ndarray, or None
         Mean, factor and color of other Gaussians that touch the window.
     iterations : int
-        Number of steps of the whole fit.
+        Number of steps of the complete fit.
     part : range
-        Those of them that shall be taken.
+        The steps of this task.
     """
 
     window: Window
     block: Block
     arrays: Arrays
-    own: slice
+    members: slice
     fixed: Arrays | None
     iterations: int
     part: range
 
 
 def measure_extent(task: PlaceTask, settings: Settings) -> Extent:
-    """Return the smallest and the largest value of a block, and their sum; refuse bad pixels."""
+    """Return the extent of the values of a block, and reject invalid pixels."""
     pixels, space = task.window.read()[task.block.core], settings.space
     bright = BRIGHT.get(space)
     if bright and task.window.encoding == "linear" and pixels.max() > WHITE:
@@ -149,7 +150,7 @@ def measure_extent(task: PlaceTask, settings: Settings) -> Extent:
 
 
 def survey(task: PlaceTask, settings: Settings) -> Surveyed:
-    """Measure how many Gaussians a block needs, relative to others, before any fit."""
+    """Measure the number of Gaussians that a block needs, relative to other blocks."""
     objective = _objective(task, settings)
     canvas, _, density = _density(objective, settings)
     assert objective.model.target is not None
@@ -166,7 +167,7 @@ def _objective(task: PlaceTask | FitTask, settings: Settings) -> Pixels:
 
 
 def _density(objective: Pixels, settings: Settings) -> tuple[Canvas, Float, Float]:
-    """Return the canvas of a window, and squared Hessian and density on it."""
+    """Return the canvas of a window, the squared Hessian and the density."""
     canvas = Canvas.of(objective.types, objective.grid)
     return canvas, *density_from_hessian(canvas, objective.shown, settings.spacing)
 
@@ -183,7 +184,7 @@ def place(task: PlaceTask, settings: Settings) -> Arrays:
     Returns
     -------
     dict of str to ndarray
-        The mean (n, 2) in pixels of the window, inside of the core, and the factor (n, 3).
+        The mean (n, 2), in pixels of the window and inside the core, and the factor (n, 3).
     """
     options, count, spacing = settings.options, task.gaussians, settings.spacing
     canvas, energy, density = _density(_objective(task, settings), settings)
@@ -202,38 +203,38 @@ def place(task: PlaceTask, settings: Settings) -> Arrays:
         )
         density *= Owners.of(old).average(old.color[0])
     column, row, _, _ = canvas.pixels()
-    for place, part in zip((row, column), task.block.core, strict=True):
+    for position, part in zip((row, column), task.block.core, strict=True):
         first, last = (dr.opaque(types.Int, edge) for edge in (part.start, part.stop))
-        density = dr.select((place >= first) & (place < last), density, 0)
+        density = dr.select((position >= first) & (position < last), density, 0)
     mean, factor = place_by_density(canvas, density, energy, count, spacing)
     return {"mean": mean.numpy().T, "factor": factor.numpy().T}
 
 
 StepDone = Callable[[int], None]
-"""``step_done(step)`` every 10 steps of a fit. It may raise an error to end the fit."""
+"""``step_done(step)`` is called every 10 steps of a fit. It may raise an error to end the fit."""
 
 
 def find_density(task: FitTask, settings: Settings, step_done: StepDone | None = None) -> Arrays:
-    """Fit the Gaussians of a window for some steps; return the density that their errors ask for.
+    """Fit the Gaussians of a window for some steps; return the density that their errors suggest.
 
     Returns
     -------
     dict of str to ndarray
-        Mean (n, 2) and factor (n, 3) of the own Gaussians in pixels of the window, their ratio
-        (n, 1), see `PlaceTask`, and the mass (1,) of the density in the core.
+        Mean (n, 2) and factor (n, 3) of the Gaussians of the block in pixels of the window, their
+        ratio (n, 1), see `PlaceTask`, and the mass (1,) of the density in the core.
     """
-    shown = _objective(task, settings)
-    objective, start = _start(task, shown, settings)
-    found = _descend(objective, start, task, settings, step_done)
-    canvas, _, density = _density(shown, settings)
-    owners = Owners.of(found)
-    error = squared_error(found, objective, owners.lists)
+    full = _objective(task, settings)
+    objective, start = _start(task, full, settings)
+    fitted = _descend(objective, start, task, settings, step_done)
+    canvas, _, density = _density(full, settings)
+    owners = Owners.of(fitted)
+    error = squared_error(fitted, objective, owners.lists)
     ratio = density_ratio(owners, error, density)
-    arrays = found.to_arrays()
+    arrays = fitted.to_arrays()
     return {
-        "mean": arrays["mean"][task.own],
-        "factor": arrays["factor"][task.own],
-        "ratio": ratio.numpy()[task.own, None],
+        "mean": arrays["mean"][task.members],
+        "factor": arrays["factor"][task.members],
+        "ratio": ratio.numpy()[task.members, None],
         "mass": np.array([_mass(canvas, density * owners.average(ratio), task.block)]),
     }
 
@@ -244,21 +245,22 @@ def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = No
     Returns
     -------
     dict of str to ndarray
-        Mean, factor and color of the own Gaussians, in pixels of the window.
+        Mean, factor and color of the Gaussians of the block, in pixels of the window.
     """
     objective, start = _start(task, _objective(task, settings), settings)
-    part = Part(task.own, task.block.core)
-    found = _descend(replace(objective, part=part), start, task, settings, step_done)
+    part = Part(task.members, task.block.core)
+    fitted = _descend(replace(objective, part=part), start, task, settings, step_done)
     if task.part.stop == task.iterations:
-        # The last steps may make a set worse that is nearly perfect; earlier ones, any set.
-        before, after = (float(dr.sum(squared_error(g, objective))[0]) for g in (start, found))
-        found = found if after < before else start
-    arrays = found.to_arrays()
-    return {name: arrays[name][task.own] for name in ("mean", "factor", "color")}
+        # Only the last steps are undone if they increase the error, as for a nearly perfect set;
+        # earlier steps may increase it temporarily.
+        before, after = (float(dr.sum(squared_error(g, objective))[0]) for g in (start, fitted))
+        fitted = fitted if after < before else start
+    arrays = fitted.to_arrays()
+    return {name: arrays[name][task.members] for name in ("mean", "factor", "color")}
 
 
 def _start(task: FitTask, objective: Pixels, settings: Settings) -> tuple[Pixels, Gaussians]:
-    """Return what the fixed Gaussians leave to the others, and these with their first colours."""
+    """Return the objective minus the fixed Gaussians, and the others with initial colours."""
     options, channels = settings.options, objective.channels
     background = np.array(settings.background, np.float32)
 
@@ -291,7 +293,7 @@ def _descend(
     settings: Settings,
     step_done: StepDone | None,
 ) -> Gaussians:
-    """Take the steps of a task; nothing moves between them without a part."""
+    """Take the steps of a task, with the controls of the method if the objective has a part."""
     method, seed = settings.options.method.without(Redistribute), settings.options.seed
     if objective.part is None:
         method = replace(method, controls=())
@@ -308,16 +310,16 @@ def _descend(
 
 
 SHORT_ROUNDS, LAST_ROUNDS = 3, 5
-"""Rounds of a descent without relocation, and rounds after the last relocation. More rounds lose
-what the optimiser knows; fewer leave seams. On 1,024x1,024 pixels in blocks of 256, 2 to 4 short
-rounds were alike, and better than 1 or 6."""
+"""Number of rounds of a descent without relocation, and of rounds after the last relocation. More
+rounds lose the state of the optimiser; fewer leave seams. On 1,024x1,024 pixels in blocks of 256, 2
+to 4 short rounds were equally good, and better than 1 or 6."""
 
 
 def rounds(method: Method, iterations: int) -> list[range]:
-    """Return the steps of every round of a descent.
+    """Return the steps of each round of a descent.
 
-    Gaussians relocate before the first step of a round, so that neighbours do so at once and see
-    each other's new places at the end of the round.
+    Gaussians relocate before the first step of a round, so that neighbours relocate at the same
+    time and see each other's new positions at the end of the round.
 
     Examples
     --------

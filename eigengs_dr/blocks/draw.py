@@ -1,4 +1,4 @@
-"""Regions and whole pictures of large sets, drawn part by part, and their PSNR."""
+"""Rendering of regions and full pictures of large sets, part by part, and their PSNR."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from .grid import Block
 from .windows import TILE_SIDE, Source, Window, write_tiles
 
 BAND_PIXELS = 1 << 22
-"""Pixels of a band of a picture that is drawn at once; one takes some 100 bytes."""
+"""Number of pixels of a band that is rendered at once; a pixel takes about 100 bytes."""
 
 Picture = Values
 
 
 def draw(data: SetData, backend: str | None = None) -> Picture:
-    """Draw a set, which may be empty, at its own size, as `eigengs_dr.picture_of` does."""
+    """Render a set, which may be empty, at its native size, as `eigengs_dr.picture_of` does."""
     return picture_of(_load(data, backend))
 
 
 def _load(data: SetData, backend: str | None) -> Gaussians:
-    """Return the set, or one Gaussian without colour for an empty one."""
+    """Return the set; an empty set gets one Gaussian of colour 0."""
     if len(data.arrays["mean"]) == 0:
         channels = len(data.arrays["background"])
         data = data._replace(
@@ -62,9 +62,9 @@ def draw_region(
     backend: str | None = None,
     kind: type[np.generic] = np.uint8,
 ) -> Iterator[Picture]:
-    """Draw a region of a set at any size, in bands of rows from top to bottom.
+    """Render a region of a set at any size, in bands of rows from top to bottom.
 
-    Memory is that of a band and of the set.
+    The memory is that of a band and of the set.
 
     Parameters
     ----------
@@ -75,12 +75,12 @@ def draw_region(
         Width and height of the picture in pixels.
     backend : {"llvm", "cuda"}, optional
     kind : dtype, optional
-        uint8 or uint16 for clamped and rounded sRGB, float32 for light; data stay data.
+        uint8 or uint16 for clamped and rounded sRGB, float32 for light; data is not converted.
 
     Yields
     ------
     ndarray of the dtype `kind`, shape (R, width, C)
-        Every band but the last has a multiple of 256 rows.
+        Every band except the last has a multiple of 256 rows.
     """
     left, top, native_width, native_height = region
     width, height = size
@@ -103,24 +103,25 @@ def save_region(
     progress: Callable[[int, int], None] | None = None,
     bits: int | None = None,
 ) -> None:
-    """Draw a region of a set into a file, completely or not at all.
+    """Render a region of a set into a file atomically.
 
     Parameters
     ----------
     path : Path
         A .tif or .tiff file is written by tiles, in the memory of a band. Other files, see
-        `eigengs_dr.save_image`, need the whole picture: 3 to 12 bytes a pixel.
+        `eigengs_dr.save_image`, need the full picture in memory: 3 to 12 bytes per pixel.
     data, region, size, backend
         See `draw_region`.
     progress : callable, optional
-        ``progress(done, total)`` with rows of the picture.
+        ``progress(done, total)``, counted in rows of the picture.
     bits : int, optional
         See `eigengs_dr.save_image`.
 
     Raises
     ------
     ImageError
-        If the suffix is unknown, the format has no such bits, or the file cannot be written.
+        If the suffix is unknown, the format does not support the bits, or the file cannot be
+        written.
     OSError
         If the .tif file cannot be written.
     """
@@ -148,7 +149,7 @@ def save_region(
 
 
 class CompareTask(NamedTuple):
-    """A part of an image, and the Gaussians that it shows."""
+    """A part of an image, and the Gaussians that touch it."""
 
     block: Block
     window: Window
@@ -159,14 +160,14 @@ class CompareTask(NamedTuple):
 def compare_tasks(
     source: Source, data: SetData, blocks: list[Block], backend: str | None
 ) -> Iterator[CompareTask]:
-    """Yield the comparisons of all blocks of a set with its image."""
-    band, shown = slice(0, 0), data
+    """Yield the comparison of each block of a set with its image."""
+    band, in_band = slice(0, 0), data
     for block in blocks:
-        if block.rows != band:  # few Gaussians to look through for every block of a row
+        if block.rows != band:  # cropping first to a row of blocks is faster
             band = block.rows
-            shown = crop(data, (0, band.start), (source.width, band.stop - band.start))
+            in_band = crop(data, (0, band.start), (source.width, band.stop - band.start))
         size = (block.columns.stop - block.columns.start, band.stop - band.start)
-        part = crop(shown, (block.columns.start, 0), size)
+        part = crop(in_band, (block.columns.start, 0), size)
         yield CompareTask(block, source.window(block.rows, block.columns), part, backend)
 
 
@@ -178,28 +179,28 @@ def compare(
     Parameters
     ----------
     task : CompareTask
-        Its set is in the unit of a fit.
+        Its set is in the unit of the fit.
     affine : Affine
-        That unit.
+        The unit of the fit.
     codes : bool
-        Whether data are codes. The peak of others is their range, and psnr_rgb is NaN.
+        Whether data is in [0, 1]. Otherwise the peak is the range, and psnr_rgb is NaN.
     """
     pixels, data = task.window.read(), task.data
     if data.space != "data":
         scaled = {name: data.arrays[name] * np.float32(affine.scale) for name in COLORS}
         scaled["background"] += np.float32(affine.offset)
-        shown = draw(data._replace(arrays=data.arrays | scaled), task.backend)
-        floats = squared_error(shown, pixels, float_space(data.space))
-        return floats, squared_error(shown, pixels, "rgb")
-    # Differences of the values as they are fitted keep their digits.
-    shown = draw(data, task.backend)
+        rendered = draw(data._replace(arrays=data.arrays | scaled), task.backend)
+        floats = squared_error(rendered, pixels, float_space(data.space))
+        return floats, squared_error(rendered, pixels, "rgb")
+    # Comparing in the unit of the fit avoids cancellation.
+    rendered = draw(data, task.backend)
     values = (pixels - np.float32(affine.offset)) / np.float32(affine.scale)
-    floats = squared_error(shown, values, "data")
+    floats = squared_error(rendered, values, "data")
     if not codes:
         return floats, math.nan
     floats *= affine.scale**2
-    return floats, squared_error(shown * affine.scale + affine.offset, pixels, "rgb")
+    return floats, squared_error(rendered * affine.scale + affine.offset, pixels, "rgb")
 
 
 COLORS = ("color", "background")
-"""What a set has in the unit of its colours."""
+"""Arrays of a set in the unit of its colours."""

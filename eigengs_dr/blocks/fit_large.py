@@ -34,11 +34,11 @@ MIN_SIDE = 32
 """Smallest side of a block in pixels."""
 
 PIXELS_PER_GAUSSIAN = 20
-"""Pixels for a Gaussian by default."""
+"""Default number of pixels per Gaussian."""
 
 MAX_SPACING = 16.0
-"""Largest mean distance of Gaussians in pixels. With fewer, halos would be as large as blocks, and
-a smaller version of the image gives the same set."""
+"""Largest mean distance of Gaussians in pixels. With fewer Gaussians, halos would be as large as
+blocks, and a smaller version of the image gives the same set."""
 
 
 @dataclass(frozen=True)
@@ -48,17 +48,17 @@ class LargeFit:
     Attributes
     ----------
     gaussians : Gaussians
-        The fitted set; its Gaussians follow each other block by block.
+        The fitted set, with its Gaussians block by block.
     psnr_ycbcr, psnr_rgb : float
         PSNR in dB, as in the trace of `eigengs_dr.Fit`, measured block by block.
     blocks : int
         Number of blocks.
     resumed : int
-        Number of blocks, of all rounds, that an earlier call had fitted.
+        Number of block fits, over all rounds, taken from an earlier call.
     iterations : int
         Number of steps of every block.
     seconds : float
-        The whole time of this call.
+        Total time of this call.
     """
 
     gaussians: Gaussians = field(repr=False)
@@ -93,32 +93,33 @@ def fit_large(
     Parameters
     ----------
     image : path-like or array
-        A TIFF file by strips or tiles and a ``.npy`` file are read by windows; other files are
-        decoded whole, into 3 bytes a pixel. Or an array (H, W, 3), (H, W, 1) or (H, W): NumPy's,
-        also memory-mapped, zarr's or Dask's, of which parts are read by slices.
+        A TIFF file with strips or tiles and a ``.npy`` file are read by windows; other files are
+        decoded completely, with 3 bytes per pixel. An array (H, W, 3), (H, W, 1) or (H, W) of
+        NumPy (also memory-mapped), zarr or Dask is read by slices.
     output : path-like, optional
-        The ``.npz`` file of the result. Blocks that are done wait in a folder beside it, of the
-        same name with ".checkpoint" added, until the run succeeds. By default the result and the
+        The ``.npz`` file of the result. Until the run succeeds, finished blocks are stored in a
+        folder beside it, with the same name and ".checkpoint" added. By default the result and the
         blocks stay in memory.
     gaussians : int, optional
-        Number of Gaussians, at least one for 256 pixels; by default one for 20 pixels. The blocks
-        get them where the image needs them.
+        Number of Gaussians, at least one per 256 pixels; by default one per 20 pixels. They are
+        distributed to the blocks according to the image.
     iterations : int, optional
-        Number of steps of every block.
+        Number of steps for each block.
     block : int, optional
         Largest side of a block in pixels, at least 32.
     space, method, seed, backend : optional
-        See `eigengs_dr.fit`. Placement is that of `eigengs_dr.DEFAULT`, whatever the method.
+        See `eigengs_dr.fit`. The placement is always that of `eigengs_dr.DEFAULT`.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
-        ``progress(done, total, row)``: what is done of a stage, in blocks or steps of blocks. The
-        row has the key stage ("survey", "place", "density", "place", "fit", "measure", in
-        this order; the first pair with "density" for long fits alone), and blocks, their number.
+        A function is called as ``progress(done, total, row)``, with the progress of a stage in
+        blocks or in steps of blocks. The row has the keys stage ("survey", "place", "density",
+        "place", "fit", "measure", in this order; the first "place" and "density" only in long
+        fits) and blocks, their number.
     client : distributed.Client, optional
-        Where blocks are fitted; by default in this process.
+        Dask cluster that fits the blocks; by default they are fitted in this process.
     encoding : {"srgb", "linear"}, optional
-        What the pixels are, see `eigengs_dr.fit`. For light above 1, give the space "log" or
-        "radiance": nobody looks at all pixels first.
+        The encoding of the pixels, see `eigengs_dr.fit`. For light above 1, give the space "log" or
+        "radiance", because the image is not scanned first.
 
     Returns
     -------
@@ -134,17 +135,16 @@ def fit_large(
     BackendError
         If the backend is not available.
     ClusterError
-        If the cluster cannot be used or is lost, or a block ends its worker again and again. The
-        same call goes on.
+        If the cluster cannot be used or is lost, or a block repeatedly crashes its worker. The same
+        call continues the run.
     KeyboardInterrupt
-        After Ctrl-C or SIGTERM. The folder keeps the blocks that are done: repeat the call to go
-        on.
+        After Ctrl-C or SIGTERM. The folder keeps the finished blocks: repeat the call to continue.
 
     Notes
     -----
-    One seed gives one result. It does not depend on the order of the blocks, nor on where
-    they are fitted or whether the run was interrupted; a run that goes on beside another processor
-    differs in the last bits.
+    The result is determined by the seed. It does not depend on the order of the blocks, on where
+    they are fitted, or on interruptions; a run that is continued on another processor differs in
+    the last bits.
 
     Examples
     --------
@@ -171,9 +171,9 @@ def fit_large(
         check_suffix(output)
         require_writable(output)
         names = ("iterations", "space", "seed", "encoding")
-        decisive = {name: getattr(options, name) for name in names}
-        decisive |= {"method": repr(method), "gaussians": settings.gaussians, "block": block}
-        keep = open_checkpoint(output, source.identity | decisive, [])
+        stored = {name: getattr(options, name) for name in names}
+        stored |= {"method": repr(method), "gaussians": settings.gaussians, "block": block}
+        keep = open_checkpoint(output, source.identity | stored, [])
     with (
         keep as checkpoint,
         defer_interrupts() if client is None else nullcontext() as interrupted,
@@ -190,12 +190,12 @@ def fit_large(
 
 
 def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Settings]:
-    """Return the blocks of a fit, and what their tasks share.
+    """Return the blocks of a fit, and the settings that their tasks share.
 
     Raises
     ------
     ValueError
-        If the blocks are too small, or the Gaussians too few or too many.
+        If the blocks are too small, or there are too few or too many Gaussians.
     """
     if side < MIN_SIDE:
         raise ValueError(f"block is {side}; it must be at least {MIN_SIDE} pixels")

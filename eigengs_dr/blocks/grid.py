@@ -13,26 +13,26 @@ from ..gaussian.file import CUTOFF, SetData
 from ..gaussian.region import crop, reaches
 
 HALO_SPACINGS = 5.0
-"""Width of a halo, in mean distances of the Gaussians. The Gaussians near a border overlap those of
-some mean distances beyond it, and have to move with them; each row more costs pixels in all blocks.
-"""
+"""Width of a halo, in mean distances of the Gaussians. The Gaussians near a border overlap those up
+to some mean distances beyond it, and have to move with them; every additional row costs pixels in
+all blocks."""
 
 MIN_HALO = 16
-"""Least width of a halo in pixels."""
+"""Smallest width of a halo in pixels."""
 
 
 class Block(NamedTuple):
-    """A part of an image with its surroundings.
+    """A part of an image, with its surroundings.
 
     Attributes
     ----------
     number : int
-        Place in the order of the blocks: row after row, from the left to the right.
+        Index of the block: row after row, from left to right.
     rows, columns : slice
         The core. The cores of all blocks tile the image.
     window_rows, window_columns : slice
-        The core with its halo. All windows of an image have one size, so that all fits have one
-        program; at the edges of the image the halo of the other sides is larger.
+        The core with its halo. All windows of an image have the same size, so that all fits share
+        one program; at an edge of the image, the halo on the opposite side is larger.
     """
 
     number: int
@@ -43,7 +43,7 @@ class Block(NamedTuple):
 
     @property
     def core(self) -> tuple[slice, slice]:
-        """Rows and columns of the core, counted from the corner of the window."""
+        """Rows and columns of the core, relative to the window."""
         top, left = self.window_rows.start, self.window_columns.start
         return (
             slice(self.rows.start - top, self.rows.stop - top),
@@ -82,7 +82,7 @@ def divide(width: int, height: int, side: int, halo: int) -> list[Block]:
     side : int
         Largest side of a core.
     halo : int
-        Pixels around a core that belong to its window too, where the image has them.
+        Width in pixels of the surroundings of a core that belong to its window.
 
     Returns
     -------
@@ -112,15 +112,15 @@ def _parts(length: int, side: int, halo: int) -> list[tuple[slice, slice]]:
     return [(core, slice(start, start + window)) for core, start in zip(cores, starts, strict=True)]
 
 
-def deal(mass: NDArray[np.float64], pixels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Deal Gaussians to blocks in proportion to their masses.
+def allocate(mass: NDArray[np.float64], pixels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Allocate Gaussians to blocks in proportion to their masses.
 
     Parameters
     ----------
     mass : ndarray, shape (B,)
         Integral of the density of Gaussians over each block, up to a common factor.
     pixels : ndarray of int, shape (B,)
-        Pixels of each block; no block gets more Gaussians.
+        Number of pixels of each block, which limits its Gaussians.
     count : int
         Number of Gaussians, from B to the sum of the pixels.
 
@@ -131,36 +131,40 @@ def deal(mass: NDArray[np.float64], pixels: NDArray[np.int64], count: int) -> ND
 
     Examples
     --------
-    >>> deal(np.array([1.0, 2.0, 0.0]), np.array([100, 100, 100]), 31)
+    >>> allocate(np.array([1.0, 2.0, 0.0]), np.array([100, 100, 100]), 31)
     array([10, 20,  1])
     """
-    wanted = np.zeros(len(mass))
+    quota = np.zeros(len(mass))
     full = np.zeros(len(mass), bool)
     share = np.maximum(mass, 1e-12 * mass.sum()) if mass.sum() > 0 else np.ones(len(mass))
     while True:  # each round fills at least one block, or ends
-        left = count - pixels[full].sum()
-        wanted = np.where(full, pixels, share * (left / max(share[~full].sum(), 1e-300)))
-        over = (wanted > pixels) & ~full
+        remaining = count - pixels[full].sum()
+        quota = np.where(full, pixels, share * (remaining / max(share[~full].sum(), 1e-300)))
+        over = (quota > pixels) & ~full
         if not over.any():
             break
         full |= over
-    dealt = np.clip(np.floor(wanted).astype(np.int64), 1, pixels)
-    # The rest goes to the largest fractions; too much, by the blocks that got 1, is taken back.
-    order = np.argsort(dealt - wanted, kind="stable")
-    missing = count - int(dealt.sum())
+    counts = np.clip(np.floor(quota).astype(np.int64), 1, pixels)
+    # The rest goes to the largest fractions; an excess, because each block gets at least 1, is
+    # taken from the smallest.
+    order = np.argsort(counts - quota, kind="stable")
+    missing = count - int(counts.sum())
     while missing:
         step = 1 if missing > 0 else -1
-        able = order[(dealt < pixels)[order]] if step > 0 else order[::-1][(dealt > 1)[order[::-1]]]
-        chosen = able[: abs(missing)]
-        dealt[chosen] += step
-        missing -= step * len(chosen)
-    return dealt
+        if step > 0:
+            available = order[(counts < pixels)[order]]
+        else:
+            available = order[::-1][(counts > 1)[order[::-1]]]
+        changed = available[: abs(missing)]
+        counts[changed] += step
+        missing -= step * len(changed)
+    return counts
 
 
 Arrays = dict[str, NDArray[np.float32]]
 
 COLUMNS = {"mean": 2, "factor": 3, "ratio": 1}
-"""Numbers of a Gaussian in the arrays; a colour has as many as the image has channels."""
+"""Number of columns of the arrays; that of a colour is the number of channels."""
 
 
 class BlockSets:
@@ -172,9 +176,9 @@ class BlockSets:
     counts : ndarray of int, shape (B,)
         Number of Gaussians of each block.
     names : sequence of str
-        The arrays: mean and others.
+        Names of the arrays, with "mean".
     channels : int, optional
-        Channels of a colour.
+        Number of channels of a colour.
     cutoff : float, optional
         Standard deviations at which a Gaussian ends.
 
@@ -198,14 +202,14 @@ class BlockSets:
             name: np.empty((self._ends[-1], COLUMNS.get(name, channels)), np.float32)
             for name in names
         }
-        # What the Gaussians of a block touch: left, top, right, bottom.
+        # Bounding box of the Gaussians of each block: left, top, right, bottom.
         self._boxes = np.empty((len(blocks), 4))
 
-    def put(self, block: Block, found: Arrays) -> None:
-        """Set the rows of a block; its means are in pixels of its window."""
+    def put(self, block: Block, arrays: Arrays) -> None:
+        """Set the rows of a block, from arrays with means in pixels of its window."""
         part = self._part(block)
         for name, rows in self.arrays.items():
-            rows[part] = found[name] + block.corner if name == "mean" else found[name]
+            rows[part] = arrays[name] + block.corner if name == "mean" else arrays[name]
         mean, reach = self.arrays["mean"][part], np.zeros(1)
         if "factor" in self.arrays:
             reach = np.stack(reaches(self._data(part)), axis=1)
@@ -213,13 +217,13 @@ class BlockSets:
         self._boxes[block.number] = np.concatenate(box)
 
     def in_window(self, block: Block) -> tuple[Arrays, slice]:
-        """Return the Gaussians whose means lie in the window of a block, in the window's pixels.
+        """Return the Gaussians whose means lie in the window of a block, in pixels of the window.
 
         Returns
         -------
         arrays : dict of str to ndarray
-        own : slice
-            Those of the block itself: all of them, wherever they lie.
+        members : slice
+            All Gaussians of the block itself, wherever they lie.
         """
         numbers = np.concatenate([inside for inside, _ in self._near(block)])
         first = int(np.searchsorted(numbers, self._part(block).start))
@@ -228,28 +232,28 @@ class BlockSets:
         return arrays, slice(first, first + int(self.counts[block.number]))
 
     def around(self, block: Block) -> Arrays:
-        """Return the other Gaussians that touch the window of a block, in the window's pixels.
+        """Return the other Gaussians that touch the window of a block, in pixels of the window.
 
         Returns
         -------
         dict of str to ndarray
-            Mean, factor and color of those that `in_window` leaves out.
+            Mean, factor and color of Gaussians that are not in the result of `in_window`.
         """
         numbers = np.concatenate([outside for _, outside in self._near(block)])
         (left, top), (width, height) = block.corner.tolist(), block.window_size.tolist()
-        found = crop(self._data(numbers), (left, top), (int(width), int(height))).arrays
-        return {name: found[name] for name in self.arrays}
+        arrays = crop(self._data(numbers), (left, top), (int(width), int(height))).arrays
+        return {name: arrays[name] for name in self.arrays}
 
     def _near(self, block: Block) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Yield the Gaussians of each block near a window: those inside of it, and the others."""
+        """Yield for each block near a window its Gaussians inside and outside of the window."""
         low, high = block.corner, block.corner + block.window_size
         apart = (self._boxes[:, :2] > high) | (self._boxes[:, 2:] < low)
-        is_own = np.arange(len(apart)) == block.number
-        for number in np.flatnonzero(~apart.any(axis=1) | is_own):
+        is_same = np.arange(len(apart)) == block.number
+        for number in np.flatnonzero(~apart.any(axis=1) | is_same):
             part = self._part(self.blocks[number])
             x, y = self.arrays["mean"][part].T  # NumPy reduces rows of two slowly
             inside = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
-            inside |= is_own[number]  # rounding may move an own one across the edge
+            inside |= is_same[number]  # rounding may move a Gaussian of the block across the edge
             yield part.start + np.flatnonzero(inside), part.start + np.flatnonzero(~inside)
 
     def _part(self, block: Block) -> slice:

@@ -1,4 +1,4 @@
-"""The stages of a fit by blocks: survey, placement, fit, and the error that is left."""
+"""The stages of a fit by blocks: survey, placement, fit, and measurement of the error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from .block import (
     survey,
 )
 from .draw import compare, compare_tasks
-from .grid import Arrays, Block, BlockSets, deal
+from .grid import Arrays, Block, BlockSets, allocate
 from .windows import Source, Window
 
 Progress = Callable[[int, int, dict[str, Any]], None]
@@ -42,16 +42,16 @@ class Run:
     image : Source
     blocks : list of Block
     settings : Settings
-        With the unit and the background, after `fit`.
+        The unit and the background are set by `fit`.
     executor : Executor
     checkpoint : Checkpoint or None
-        Where blocks that are done wait for the end of the run.
+        Storage of finished blocks until the end of the run.
     progress : callable or None
         See `eigengs_dr.fit_large`.
     interrupted : callable or None
-        ``interrupted()``: whether the run shall end; None on a cluster.
+        ``interrupted()`` returns whether to end the run; None on a cluster.
     resumed : int
-        Number of blocks, of all rounds, that an earlier call had fitted.
+        Number of block fits, over all rounds, taken from an earlier call.
     """
 
     image: Source
@@ -68,7 +68,7 @@ class Run:
     extent: Extent = field(init=False)
 
     def fit(self) -> SetData:
-        """Place and fit all Gaussians; a long fit places them again where error was left."""
+        """Place and fit all Gaussians; a long fit places them again according to the error."""
         options = self.settings.options
         steps = options.iterations
         first = options.method.first_phase(steps)
@@ -97,27 +97,27 @@ class Run:
         return ycbcr, rgb
 
     def _survey(self) -> NDArray[np.float64]:
-        """Return the masses of all blocks; set the unit, and the background: the mean of the image.
+        """Return the masses of all blocks; set the unit, and the background to the mean colour.
 
-        The image is read twice: it is placed in a unit that all blocks say.
+        The image is read twice, because the unit depends on all blocks.
         """
         self._begin("survey", 2 * len(self.blocks))
         tasks = [PlaceTask(self._window(b), b) for b in self.blocks]
         extents = self._in_order(measure_extent, tasks)
         self.extent = reduce(Extent.joined, extents)
         self.settings = self.settings._replace(affine=self.extent.affine(self.settings.space))
-        found = self._in_order(survey, tasks)
-        figures = np.array([[value.mass, *value.total] for value in found])
+        surveys = self._in_order(survey, tasks)
+        figures = np.array([[value.mass, *value.total] for value in surveys])
         if self.checkpoint is not None:
-            figures = _first_figures(self.checkpoint, figures)
+            figures = _stored_figures(self.checkpoint, figures)
         mean = figures[:, 1:].sum(axis=0) / (self.image.width * self.image.height)
         self.settings = self.settings._replace(background=tuple(mean.tolist()))
         return figures[:, 0]
 
     def _place(self, mass: NDArray[np.float64], old: BlockSets | None = None) -> BlockSets:
-        """Deal the Gaussians to the blocks by their masses, and place them."""
+        """Allocate the Gaussians to the blocks by their masses, and place them."""
         pixels = np.array([block.pixels for block in self.blocks])
-        counts = deal(mass, pixels, self.settings.gaussians)
+        counts = allocate(mass, pixels, self.settings.gaussians)
         placed = BlockSets(self.blocks, counts, ("mean", "factor"))
         self._begin("place", len(self.blocks))
         tasks = (
@@ -129,30 +129,30 @@ class Run:
             )
             for block in self.blocks
         )
-        for block, found in self._map(place, tasks):
-            placed.put(block, found)
+        for block, arrays in self._map(place, tasks):
+            placed.put(block, arrays)
         return placed
 
     def _find_density(self, placed: BlockSets, steps: int) -> tuple[NDArray[np.float64], BlockSets]:
-        """Fit all blocks for some steps; return masses, means and ratios of the wanted density."""
+        """Fit all blocks for some steps; return masses, means and ratios of the new density."""
         old = BlockSets(self.blocks, placed.counts, ("mean", "factor", "ratio"))
         mass = np.empty(len(self.blocks))
         task = partial(self._fit_task, sets=placed, steps=steps, part=range(steps))
         self._begin("density", len(self.blocks) * steps)
-        for block, found in self._fitted("density-", find_density, task, steps):
-            mass[block.number] = found["mass"][0]
-            old.put(block, found)
+        for block, arrays in self._fitted("density-", find_density, task, steps):
+            mass[block.number] = arrays["mass"][0]
+            old.put(block, arrays)
         return mass, old
 
     def _fit_blocks(self, sets: BlockSets, steps: int) -> BlockSets:
         """Fit all blocks, round by round, from sets without colours."""
         parts = rounds(self.settings.options.method, steps)
         self._begin("fit", len(self.blocks) * steps)
-        first = self._kept_round(len(parts))
+        first = self._last_complete_round(len(parts))
         self.resumed += first * len(self.blocks)
         self._advance(len(self.blocks) * parts[first].start)
         for number, part in enumerate(parts[first:], start=first):
-            found = BlockSets(
+            fitted = BlockSets(
                 self.blocks,
                 sets.counts,
                 ("mean", "factor", "color"),
@@ -161,52 +161,52 @@ class Run:
             )
             task = partial(self._fit_task, sets=sets, steps=steps, part=part)
             for block, arrays in self._fitted(f"fit{number}-", fit_block, task, len(part)):
-                found.put(block, arrays)
-            sets = found
+                fitted.put(block, arrays)
+            sets = fitted
             if self.checkpoint is not None:
                 self.checkpoint.remove(f"fit{number - 1}-*")
         return sets
 
-    def _kept_round(self, number: int) -> int:
-        """Return the last of some rounds of which an earlier call has fitted all blocks, or 0."""
-        kept = self.checkpoint
-        whole = [
+    def _last_complete_round(self, number: int) -> int:
+        """Return the last of some rounds in which an earlier call fitted all blocks, or 0."""
+        stored = self.checkpoint
+        complete = [
             k
             for k in range(number)
-            if kept and all(kept.holds(f"fit{k}-{block.number}") for block in self.blocks)
+            if stored and all(stored.holds(f"fit{k}-{block.number}") for block in self.blocks)
         ]
-        return max(whole, default=0)
+        return max(complete, default=0)
 
     def _fit_task(self, block: Block, sets: BlockSets, steps: int, part: range) -> FitTask:
-        """Return the task of a block: its window, all Gaussians in it, and others that touch it."""
-        arrays, own = sets.in_window(block)
+        """Return the task of a block: its window, the Gaussians in it, and others that touch it."""
+        arrays, members = sets.in_window(block)
         fixed = sets.around(block) if "color" in arrays else None
-        return FitTask(self._window(block), block, arrays, own, fixed, steps, part)
+        return FitTask(self._window(block), block, arrays, members, fixed, steps, part)
 
     def _fitted(
         self, stage: str, function: Any, make_task: Callable[[Block], FitTask], steps: int
     ) -> Iterator[tuple[Block, Arrays]]:
-        """Yield the blocks that an earlier call has fitted, then fit the others and keep them."""
+        """Yield the blocks that an earlier call fitted, then fit the others and store them."""
         waiting = []
         for block in self.blocks:
-            found = self.checkpoint.load(f"{stage}{block.number}") if self.checkpoint else None
-            if found is None:
+            arrays = self.checkpoint.load(f"{stage}{block.number}") if self.checkpoint else None
+            if arrays is None:
                 waiting.append(block)
                 continue
             self.resumed += 1
             self._advance(steps)
-            yield block, found
+            yield block, arrays
         if self.interrupted is not None:
             function = partial(function, step_done=self._step_done)
-        for block, found in self._map(function, map(make_task, waiting), steps):
+        for block, arrays in self._map(function, map(make_task, waiting), steps):
             if self.checkpoint is not None:
-                self.checkpoint.save(f"{stage}{block.number}", found)
-            yield block, found
+                self.checkpoint.save(f"{stage}{block.number}", arrays)
+            yield block, arrays
 
     def _in_order(self, function: Any, tasks: Iterable[Any]) -> list[Any]:
         """Run a task of each block, and return the results in the order of the blocks."""
-        found = {block.number: value for block, value in self._map(function, tasks)}
-        return [found[block.number] for block in self.blocks]
+        results = {block.number: value for block, value in self._map(function, tasks)}
+        return [results[block.number] for block in self.blocks]
 
     def _map(
         self, function: Any, tasks: Iterable[Any], steps: int = 1
@@ -215,7 +215,7 @@ class Run:
         with closing(completed(self.executor, function, tasks, self.settings)) as ended:
             for task, value in ended:
                 yield task.block, value
-                self._advance(steps)  # the caller has kept the result: `progress` may raise
+                self._advance(steps)  # `progress` may raise; the caller has stored the result
                 self._stop_if_interrupted()
 
     def _window(self, block: Block) -> Window:
@@ -243,25 +243,26 @@ class Run:
             raise KeyboardInterrupt
 
 
-SAME = 1e-5
-"""Largest relative difference of the figures of one image on two processors: they sum numbers that
+FIGURES_TOLERANCE = 1e-5
+"""Largest relative difference of the figures of an image on two processors, which sum numbers that
 differ in the last bits of single precision."""
 
 
-def _first_figures(checkpoint: Checkpoint, figures: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the figures of the first call, so that a run goes on as it began on any processor.
+def _stored_figures(checkpoint: Checkpoint, figures: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the figures of the first call, so that a run can be continued on any processor.
 
     Raises
     ------
     ValueError
-        If a checkpoint belongs to another image.
+        If the checkpoint belongs to another image.
     """
-    known = checkpoint.load("survey")
-    if known is None:
+    stored = checkpoint.load("survey")
+    if stored is None:
         checkpoint.save("survey", {"figures": figures})
         return figures
-    first: NDArray[np.float64] = known["figures"]
-    if first.shape != figures.shape or not np.allclose(first, figures, SAME, SAME * first.max()):
+    first: NDArray[np.float64] = stored["figures"]
+    tolerances = FIGURES_TOLERANCE, FIGURES_TOLERANCE * first.max()
+    if first.shape != figures.shape or not np.allclose(first, figures, *tolerances):
         raise ValueError(
             f"{checkpoint.folder}: holds an interrupted run of another image; "
             "delete the folder to start again"

@@ -1,4 +1,4 @@
-"""Large images, read by windows: TIFF and ``.npy`` files, arrays, and what Pillow decodes.
+"""Large images that are read by windows: TIFF and ``.npy`` files, arrays, and other decoded files.
 
 Large TIFF files are written by tiles.
 """
@@ -26,22 +26,22 @@ from ..image.remote import is_copied
 from ..image.tiff import has_windows, read_window
 
 Pixels = Values
-"""Pixels (h, w) or (h, w, channels) of any type."""
+"""Pixels (h, w) or (h, w, channels) of any dtype."""
 
 
 class Window(NamedTuple):
-    """A part of an image that is read when it is needed, perhaps in another process.
+    """A part of an image that is read on demand, possibly in another process.
 
     Attributes
     ----------
     load : callable
         Returns the pixels in the dtype of the source. It holds a path, or the pixels.
     keep_grey : bool
-        Whether the image is data, which keep one channel.
+        Whether the image is data, so that a grey one keeps one channel.
     name : str
         The image and the part, for errors.
     encoding : {"srgb", "linear"}
-        What the pixels are.
+        The encoding of the pixels.
     """
 
     load: Callable[[], Pixels]
@@ -50,13 +50,12 @@ class Window(NamedTuple):
     encoding: str = "srgb"
 
     def read(self) -> NDArray[np.float32]:
-        """Return the pixels: float32 of shape (h, w, 3), in sRGB, or data, perhaps (h, w, 1).
+        """Return the pixels in float32: sRGB of shape (h, w, 3), or data of 1 or 3 channels.
 
         Raises
         ------
         ImageError
-            If the file cannot be read, a pixel is not finite, or one of an image is far outside
-            [0, 1].
+            If the file cannot be read, a pixel is not finite, or sRGB is far outside [0, 1].
         """
         pixels = self.load()
         try:
@@ -74,15 +73,15 @@ class Source:
     Attributes
     ----------
     width, height : int
-        Pixels.
+        Size in pixels.
     channels : int
-        Channels of a fit: 1 or 3.
+        Number of channels of a fit: 1 or 3.
     name : str
         The path of the file, or "image".
     identity : dict
-        What tells this image from others, in numbers and texts.
+        Numbers and strings that identify the image.
     pixels : str or array
-        The path of a file that is read by windows; or what ``pixels[rows, columns]`` is a part of.
+        The path of a file that is read by windows; or an array with ``pixels[rows, columns]``.
     keep_grey, encoding
         See `Window`.
     """
@@ -112,16 +111,15 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     Parameters
     ----------
     source : path-like or array
-        A file: TIFF by strips or tiles and ``.npy`` are read by windows. Other files (PNG, JPEG,
-        TIFF of rare kinds) are decoded whole: colours of 8 bits take 10 bytes a pixel meanwhile,
-        and 3 for good.
-        Or an array (H, W, 3), (H, W, 1) or (H, W) of a type that `eigengs_dr.load_image` knows, of
-        which ``source[top:bottom, left:right]`` is a part: NumPy's, also memory-mapped, zarr's,
-        Dask's.
+        TIFF files with strips or tiles and ``.npy`` files are read by windows. Other files (PNG,
+        JPEG, unusual TIFF) are decoded completely: 8-bit colours take 10 bytes per pixel during
+        decoding, and 3 afterwards. An array (H, W, 3), (H, W, 1) or (H, W) has a dtype that
+        `eigengs_dr.load_image` supports, and is read by slices
+        ``source[top:bottom, left:right]``: an array of NumPy (also memory-mapped), zarr or Dask.
     keep_grey : bool, optional
-        Whether the image is data: a grey one has one channel instead of three.
+        Whether the image is data, so that a grey one has one channel instead of three.
     encoding : {"srgb", "linear"}, optional
-        What the pixels are. By default what the image says: "linear" for files of floats.
+        The encoding of the pixels. By default that of the image: "linear" for files of floats.
 
     Returns
     -------
@@ -130,15 +128,15 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     Raises
     ------
     ImageError
-        If there is no such file, it is no image, or the shape or the size is wrong.
+        If there is no such file, it is not an image, or the shape or the size is wrong.
     """
     source = pixels_of(source)
     if isinstance(source, (str, os.PathLike)) and is_copied(source):
         source, encoding = read_file(str(source), keep_grey, encoding)
     if isinstance(source, (str, os.PathLike)):
         name, identity = str(source), _identity(Path(source))
-        shape, pixels, said = _open_file(Path(source), keep_grey)
-        encoding = encoding or said
+        shape, pixels, file_encoding = _open_file(Path(source), keep_grey)
+        encoding = encoding or file_encoding
     elif hasattr(source, "shape") and hasattr(source, "dtype"):
         name, shape, pixels = "image", tuple(int(side) for side in source.shape), source
         identity = {"shape": list(shape), "dtype": np.dtype(source.dtype).str}
@@ -154,13 +152,13 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
 
 
 def _identity(path: Path) -> Record:
-    """Return what tells a file from others, and from itself when it has changed."""
+    """Return properties that identify the current version of a file."""
     try:
         state = path.stat()
     except OSError as error:
         raise ImageError(f"{path}: {error.strerror or error}; check the path") from None
     if path.is_dir():
-        raise ImageError(f"{path}: is a folder; name an image file in it")
+        raise ImageError(f"{path}: is a folder; give an image file in it")
     return {
         "file": os.path.abspath(path),
         "bytes": state.st_size,
@@ -190,19 +188,19 @@ def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixe
             warn(f"{path}: {note}")
         return shape, absolute, header.encoding
     header.check_memory(path, as_floats=False)
-    pixels, encoding = decode(path, header, keep_grey)  # 8 bits stay 8 bits
+    pixels, encoding = decode(path, header, keep_grey)  # 8-bit files are not converted to floats
     return shape, pixels, encoding
 
 
 def _check_sides(name: str, shape: tuple[int, ...]) -> None:
     if not all(1 <= side <= MAX_SET_SIDE for side in shape[:2]):
         raise ImageError(
-            f"{name}: {shape[1]}x{shape[0]} pixels; sides go from 1 to {MAX_SET_SIDE:,}"
+            f"{name}: {shape[1]}x{shape[0]} pixels; sides must be from 1 to {MAX_SET_SIDE:,}"
         )
 
 
 def _read_part(path: str, rows: slice, columns: slice) -> Pixels:
-    """Read a part of a file that is read by windows; maps of the file end with the call."""
+    """Read a part of a file that is read by windows; the file is not mapped after the call."""
     if path.lower().endswith(".npy"):
         return np.array(np.load(path, mmap_mode="r", allow_pickle=False)[rows, columns])
     return read_window(path, rows, columns)
@@ -213,9 +211,9 @@ TILE_SIDE = 256
 
 
 def image_size(path: Path | str) -> tuple[int, int, int] | None:
-    """Return height, width and channels, 1 or 3, from the header of an image file.
+    """Return height, width and channels (1 or 3) from the header of an image file.
 
-    None for a URL or a pipe, which is read once, and for a file that is no image.
+    None for a URL or a pipe, which can be read only once, and for a file that is not an image.
     """
     if is_copied(path):
         return None
@@ -238,9 +236,9 @@ def write_tiles(
     ----------
     path : path-like
     shape : (int, int, int)
-        Height, width and channels, 1 or 3.
+        Height, width and number of channels, 1 or 3.
     bands : iterator of ndarray, shape (R, W, C)
-        From top to bottom; every band but the last has a multiple of `TILE_SIDE` rows.
+        From top to bottom; every band except the last has a multiple of `TILE_SIDE` rows.
     dtype : dtype, optional
         Type of the bands: uint8, uint16 or float32.
 
@@ -265,7 +263,7 @@ def write_tiles(
 
 
 def _tiles(bands: Iterator[Pixels], width: int) -> Iterator[Pixels]:
-    """Cut bands into tiles; tifffile fills up those at the edges."""
+    """Cut bands into tiles; tifffile pads those at the edges."""
     for band in bands:
         for top in range(0, len(band), TILE_SIDE):
             for left in range(0, width, TILE_SIDE):

@@ -1,1 +1,1 @@
-"""The command line: what a command parses, calls and prints."""
+"""The command line: each command parses its options, calls the package and prints the result."""

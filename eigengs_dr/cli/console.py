@@ -1,4 +1,4 @@
-"""Messages of the command line: one line for an error or a note, a bar for progress; a cluster."""
+"""Output of the command line, one line per error or note; progress bars; cluster connection."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ MISSED = 1
 """Exit code if the target PSNR cannot be reached."""
 
 FAILED = 2
-"""Exit code after an error, also of one of several images."""
+"""Exit code after an error, also if only one of several images failed."""
 
 
 class Program(click.Group):
-    """A group of commands that reports an error in one line and exits with code 2.
+    """A group of commands that reports errors in one line and exits with code 2.
 
     ``context.obj`` holds the list of arguments, for reports.
     """
@@ -37,19 +37,20 @@ class Program(click.Group):
         arguments = sys.argv[1:] if args is None else list(args)
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
-                stream.reconfigure(errors="backslashreplace")  # what the terminal cannot show
+                # Escape characters that the terminal cannot show.
+                stream.reconfigure(errors="backslashreplace")
         extra.update(prog_name=NAME, standalone_mode=False, obj=list(arguments))
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("always", UserWarning)
-                # One line for each, without the line of code that raised it.
-                warnings.showwarning = lambda message, *_: say(f"note: {message}")
+                # One line per warning, without the line of code that issued it.
+                warnings.showwarning = lambda message, *_: print_message(f"note: {message}")
                 sys.exit(super().main(arguments, *rest, **extra))
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
         except ERRORS as error:
             _end_if_interrupted(error)
-            say(f"error: {_message(error)}")
+            print_message(f"error: {_message(error)}")
         except BaseException as error:
             _end_if_interrupted(error)
             raise
@@ -69,20 +70,20 @@ def _message(error: Exception) -> str:
 
 
 def _end_if_interrupted(error: BaseException | None) -> None:
-    """End the program if a chain of errors began with Ctrl-C.
+    """Exit if a chain of errors began with Ctrl-C.
 
-    It does in a block that cleans up by itself, see `terminate_as_interrupt`. Click, Dr.Jit and
-    imports make other errors of it.
+    This happens in blocks that clean up by themselves, see `terminate_as_interrupt`. Click, Dr.Jit
+    and imports convert a `KeyboardInterrupt` to other errors.
     """
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
-            say("interrupted")
+            print_message("interrupted")
             sys.exit(INTERRUPTED)
         error = error.__cause__ or error.__context__
 
 
-def say(text: str) -> None:
-    """Write one line to standard error, above a bar; several lines are joined to one."""
+def print_message(text: str) -> None:
+    """Print one line to standard error, above a progress bar; line breaks become blanks."""
     from tqdm import tqdm
 
     with tqdm.external_write_mode(file=sys.stderr, nolock=True):
@@ -91,13 +92,13 @@ def say(text: str) -> None:
 
 @contextmanager
 def bar(quiet: bool) -> Iterator[Callable[..., None]]:
-    """Show a bar while a block runs for long, if somebody sees standard error.
+    """Show a progress bar if a block takes long and standard error is visible.
 
     Yields
     ------
     callable
-        ``show(label, done, total, row)``: the task, the number of finished steps, the number of
-        all steps and, optionally, a row of figures. The bar shows ``psnr_rgb`` of the row. A new
+        ``show(label, done, total, row)``: the task, the number of finished steps, the total number
+        of steps and, optionally, a row of figures. The bar shows ``psnr_rgb`` of the row. A new
         label restarts the bar.
     """
     with progress_bar(False if quiet else None) as show:
@@ -110,8 +111,8 @@ def bar(quiet: bool) -> Iterator[Callable[..., None]]:
 
 
 @contextmanager
-def about(name: Path | str) -> Iterator[None]:
-    """Put the name of a file before the errors of values in a block, unless they begin with it."""
+def prefix_errors(name: Path | str) -> Iterator[None]:
+    """Put the name of a file before each `ValueError` in a block, unless it begins with it."""
     try:
         yield
     except ValueError as error:
@@ -120,7 +121,7 @@ def about(name: Path | str) -> Iterator[None]:
 
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows of cells as lines, with the first column to the left and others to the right."""
+    """Format rows of cells as lines; the first column is left-aligned, the others right-aligned."""
     rows = [[printable(cell) for cell in row] for row in rows]
     first, *others = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
@@ -136,7 +137,7 @@ def open_cluster(cluster: str | None) -> Iterator[Any]:
     Parameters
     ----------
     cluster : str or None
-        See `eigengs_dr.cluster.executor.connect`; None is this process.
+        See `eigengs_dr.cluster.executor.connect`; None stands for this process.
 
     Yields
     ------
@@ -147,7 +148,7 @@ def open_cluster(cluster: str | None) -> Iterator[Any]:
     ClusterError
         If Dask is missing, or the scheduler does not answer.
     ValueError
-        If the word is unknown.
+        If the text is no valid cluster.
     """
     if cluster is None:
         yield None
@@ -158,6 +159,6 @@ def open_cluster(cluster: str | None) -> Iterator[Any]:
         raise ClusterError(
             f"--cluster needs {error.name}; type: pip install 'eigengs-dr[cluster]'"
         ) from None
-    # Schedulers of batch jobs send SIGTERM; the workers of ``local`` have to end too.
+    # Batch schedulers send SIGTERM; the workers of ``local`` have to end too.
     with terminate_as_interrupt(), connect(cluster) as client:
         yield client

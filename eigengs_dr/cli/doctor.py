@@ -1,4 +1,4 @@
-"""The command ``eigengs-dr doctor``: what works on this machine, and whether its GPU is right."""
+"""The command ``eigengs-dr doctor``: which backends work, and whether the GPU is correct."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from . import options
 
 if TYPE_CHECKING:
     import eigengs_dr as eg
-from .console import MISSED, say, table
+from .console import MISSED, print_message, table
 
 
 @click.command()
 @options.as_json
-@click.option("--gpu", is_flag=True, help="Compare the GPU with llvm, in a few minutes.")
+@click.option("--gpu", is_flag=True, help="Compare the GPU with llvm; takes a few minutes.")
 @click.option("--trial", type=click.Choice(list(ALLOWED)), hidden=True)
-@options.choice("--backend", BACKENDS, "GPU to compare, or where a trial runs.", True)
+@options.choice("--backend", BACKENDS, "Backend of the GPU to compare with llvm.", True)
 @click.pass_context
 def doctor(
     context: click.Context, as_json: bool, gpu: bool, trial: str | None, backend: str | None
 ) -> None:
-    """Show what works on this machine and what to install.
+    """Show which backends work on this machine and what to install.
 
-    With --gpu, a small fit, gradients, textures and a scene run on the GPU and on llvm; the page
-    that follows tells their times and how far they differ, and is made to be pasted into a report.
-    The exit code is 1 if no backend works, or if the GPU differs.
+    With --gpu, a small fit, gradients, textures and a scene run on the GPU and on llvm. The table
+    that follows shows their times and differences, ready to be pasted into a report. The exit code
+    is 1 if no backend works, or if the results of the GPU differ.
 
     \b
     Examples:
@@ -54,7 +54,7 @@ def doctor(
     if gpu and not facts[device]["works"]:
         raise click.ClickException(f"--gpu: {device} does not work: {facts[device]['problem']}")
     for name in ALLOWED if gpu else ():
-        say(f"{name}: on llvm and on {device}")
+        print_message(f"{name}: on llvm and on {device}")
         comparisons.append(compare(name, device))
     if as_json:
         rows = [{**row._asdict(), "agrees": row.agrees} for row in comparisons]
@@ -68,7 +68,7 @@ def doctor(
 
 
 def _describe(comparisons: list[Comparison], device: str) -> list[str]:
-    """Return the trials as lines: times, differences, and what has failed."""
+    """Format the trials as lines: times, differences and failures."""
     rows = [["trial", "llvm, s", f"{device}, s", "difference", "allowed", ""]]
     problems = []
     for row in comparisons:
@@ -82,12 +82,12 @@ def _describe(comparisons: list[Comparison], device: str) -> list[str]:
 
 
 # ---------------------------------------------------------------------------------------------
-#  Trials: each returns figures that a GPU must have too
+#  Trials: each returns figures that a GPU must reproduce
 # ---------------------------------------------------------------------------------------------
 
 
 def _run_trial(name: str, backend: str) -> Record:
-    """Run a trial twice, the second time with compiled programs; return its time and figures."""
+    """Run a trial twice, the second time with compiled programs; return time and figures."""
     trials: dict[str, Callable[[str], ArrayLike]] = {
         "fit": _fit,
         "gradients": _gradients,
@@ -101,7 +101,7 @@ def _run_trial(name: str, backend: str) -> Record:
 
 
 def _picture() -> Floats:
-    """Return a picture of waves and an edge, (48, 64, 3) in [0, 1]."""
+    """Return an image of waves and an edge, shape (48, 64, 3), in [0, 1]."""
     y, x = np.mgrid[0:48, 0:64] / 64
     waves = [0.5 + 0.4 * np.sin(a * x + b * y) for a, b in ((9, 4), (5, -13), (17, 3))]
     return np.stack(waves, axis=-1) * np.where(x + y > 0.9, 0.6, 1.0)[..., None]
@@ -116,7 +116,7 @@ def _fit(backend: str) -> list[float]:
 
 
 def _set(backend: str) -> eg.Gaussians:
-    """Return a set that is not fitted, so that it is the same on every backend."""
+    """Return a random set, not a fitted one, so that it is the same on every backend."""
     import eigengs_dr as eg
 
     random = np.random.default_rng(0)
@@ -134,7 +134,7 @@ def _set(backend: str) -> eg.Gaussians:
 
 
 def _gradients(backend: str) -> Floats:
-    """Return the derivatives of a weighted sum of the pixels by all parameters."""
+    """Return the gradient of a weighted sum of the pixels with respect to all parameters."""
     import drjit as dr
 
     import eigengs_dr as eg
@@ -150,7 +150,7 @@ def _gradients(backend: str) -> Floats:
 
 def _mitsuba(backend: str) -> ModuleType:
     """Import Mitsuba with the plugins, and set the variant of a backend."""
-    from ..plugins import register_plugins  # first: its error says what to install
+    from ..plugins import register_plugins  # first, because its error names what to install
 
     # isort: split
     import mitsuba as mi
@@ -161,7 +161,7 @@ def _mitsuba(backend: str) -> ModuleType:
 
 
 def _texture(backend: str) -> Floats:
-    """Return lookups of a texture, at points and filtered."""
+    """Return lookups of a texture, without and with a prefilter."""
     mi = _mitsuba(backend)
     import drjit as dr
 
@@ -170,14 +170,14 @@ def _texture(backend: str) -> Floats:
     random = np.random.default_rng(1)
     si = dr.zeros(mi.SurfaceInteraction3f, 200)
     si.uv = mi.Point2f(*(mi.Float(row.astype(np.float32)) for row in random.uniform(size=(2, 200))))
-    si.t, si.wi = 2.0, mi.Vector3f(0.6, 0.0, 0.8)  # what a camera sees in a slanted pixel
+    si.t, si.wi = 2.0, mi.Vector3f(0.6, 0.0, 0.8)  # as seen by a camera at an angle
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     textures = [mi.load_dict(texture_of(_set(backend), prefilter=p)) for p in (0.0, 0.05)]
     return np.concatenate([np.ravel(texture.eval(si).numpy()) for texture in textures])
 
 
 def _scene(backend: str) -> Floats:
-    """Return the pixels of a rectangle with the texture, under an even light."""
+    """Return the pixels of a textured rectangle under constant light."""
     mi = _mitsuba(backend)
     from ..plugins import texture_of
 

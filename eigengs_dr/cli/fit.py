@@ -1,4 +1,4 @@
-"""The command ``eigengs-dr fit``: one image, several, the maps of a material, or by blocks."""
+"""The command ``eigengs-dr fit``: one image, several images, or the maps of a material."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from ..backend.selection import select
 from ..image.color import SPACES, rendered_as
 from ..image.metrics import float_space, target_key
 from . import options
-from .console import FAILED, INTERRUPTED, MISSED, about, bar, open_cluster, say
+from .console import FAILED, INTERRUPTED, MISSED, bar, open_cluster, prefix_errors, print_message
 from .options import MapFile
-from .outputs import check_outputs, check_replaceable, claim, name_outputs, name_pictures
+from .outputs import check_outputs, check_replaceable, lock_outputs, name_outputs, name_pictures
 
 if TYPE_CHECKING:
     from ..fitting.method import Method
@@ -31,39 +31,50 @@ Record = dict[str, Any]
 """The figures of one image, for its lines in the terminal and for the report."""
 
 INITS = ("adaptive", "grid", "random")
-"""Names of placements."""
+"""Names of the initial placements."""
 
 PRESETS = ("default", "gaussianimage", "eigengs")
-"""Names of methods: ours, and those of two papers."""
+"""Names of the methods: ours, and those of two papers."""
 
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
 
-NOT_OF_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster")
-"""Options of the command that maps do not take."""
+EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster")
+"""Options that cannot be combined with maps."""
 
 
 @click.command()
 @click.argument("images", nargs=-1, type=options.images, metavar="IMAGE...")
 @options.output(".npz file or folder.  [default: the current folder]", "OUT", required=False)
-@options.maps("A map of a material by name, instead of IMAGE; repeat for more.")
+@options.maps("A map of a material, instead of IMAGE; repeat the option for more maps.")
 @options.number("--gaussians", "Number of Gaussians.  [default: 5000]")
-@options.value("--target-psnr", "DB", float, "Find the fewest for this PSNR.")
-@options.choice("--target-space", ["rgb", "ycbcr"], "Space of --target-psnr.", True)
-@options.number("--max-gaussians", "Limit for --target-psnr.")
-@options.value("--blocks", "SIZE", int, "Fit by blocks.  [default: 1024 where memory needs it]")
-@options.level_counts("Levels of detail, each 4 times larger, or the Gaussians up to each.")
-@options.number("--iterations", "Steps of optimisation.", 1000)
+@options.value("--target-psnr", "DB", float, "Use the fewest Gaussians that reach this PSNR.")
+@options.choice("--target-space", ["rgb", "ycbcr"], "Colour space of --target-psnr.", True)
+@options.number("--max-gaussians", "Largest number of Gaussians for --target-psnr.")
+@options.value(
+    "--blocks", "SIZE", int, "Fit blocks of this side.  [default: 1024 if memory is short]"
+)
+@options.level_counts(
+    "Number of levels of detail, each 4 times as large, or the number of Gaussians up to each."
+)
+@options.number("--iterations", "Number of optimisation steps.", 1000)
 @options.choice("--init", INITS, "Initial placement.  [default: adaptive]", True)
 @options.value("--basis", "NAME|FILE", str, "Model to start from: natural, or a file.")
-@options.choice("--preset", PRESETS, "Our method, or that of a paper.")
+@options.choice("--preset", PRESETS, "Our method, or the method of a paper.")
 @options.choice(
-    "--space", SPACES, "Textures take linear, light above 1 log, normal maps normal, values data."
+    "--space",
+    SPACES,
+    "Colour space: linear for textures, log for light above 1, normal for normal maps, data for "
+    "other values.",
 )
 @options.encoding
-@options.number("--seed", "Seed of all random numbers.", 0)
-@options.value("--preview", "FILE", options.path, "Picture (or folder) of photo, fit and outlines.")
-@click.option("--overwrite", is_flag=True, help="Of several images, fit all again.")
+@options.number("--seed", "Seed of the random numbers.", 0)
+@options.value(
+    "--preview", "FILE", options.path, "Picture, or folder, that shows photo, fit and outlines."
+)
+@click.option(
+    "--overwrite", is_flag=True, help="Also fit images again whose results exist, if several."
+)
 @options.shared("cluster", "backend", "report", "quiet")
 def fit(
     run: options.Run,
@@ -76,28 +87,30 @@ def fit(
     overwrite: bool,
     **choices: Any,
 ) -> None:
-    """Fit images by sums of Gaussians.
+    """Fit sums of Gaussians to images.
 
     An IMAGE may be a folder of images, a pattern in quotes, or a URL. For several images, -o and
-    --preview name folders, and the files in them have the names of the images; manifest.jsonl has a
-    row for each. An image that cannot be fitted is left out; the exit code is then 2. With
-    --cluster the processes of a Dask cluster fit the images, with the same results.
+    --preview name folders. Files in these folders are named after the images, and manifest.jsonl
+    has one row per image. If an image cannot be fitted, the others still are, and the exit code is
+    2. With --cluster, the processes of a Dask cluster fit the images, with the same results.
 
-    The result of one image is written anew. Of several images, those whose results exist are
-    skipped, so that the same command continues a run; other options than those of the results are
-    refused, and --overwrite fits all again. A file that is no set of Gaussians is never replaced.
+    The result of a single image is replaced if it exists. Of several images, those whose results
+    exist are skipped, so that the same command continues a run. Options that differ from those of
+    existing results are an error; --overwrite fits all images again. A file that is not a set of
+    Gaussians is never replaced.
 
-    Ctrl-C writes the best fit so far of one image, or ends after the last complete one of several,
-    and exits with code 130. If --target-psnr cannot be reached, the command says so, writes the
-    best fit and exits with code 1.
+    Ctrl-C writes the best fit so far of a single image, or stops after the last complete one of
+    several images, with exit code 130. If --target-psnr cannot be reached, the command reports it,
+    writes the best fit and exits with code 1.
 
-    An image that is too large for this machine is fitted by blocks, with one Gaussian for 20 pixels
-    by default. Ctrl-C then keeps the blocks that are done, and the same command goes on.
+    An image that is too large for the memory of this machine is fitted by blocks, by default with
+    one Gaussian per 20 pixels. Ctrl-C then keeps the finished blocks, and the same command
+    continues.
 
-    With --map, several maps of one size, such as albedo, roughness and normal, share one set of
-    shapes; -o names the file. Maps named albedo, color and the like are fitted in linear light,
-    normal as normals, and others as data; --map height:data=FILE says the space. --target-psnr then
-    holds for each map.
+    With --map, several maps of the same size, such as albedo, roughness and normal, share one set
+    of shapes, and -o names the file. Maps with names such as albedo or color are fitted in linear
+    light, normal as normals, and others as data; --map height:data=FILE sets the space of a map.
+    --target-psnr then applies to each map.
 
     \b
     Examples:
@@ -118,15 +131,15 @@ def fit(
     if maps:
         _check_maps(run.context, images, output)
     elif not images:
-        raise click.UsageError("no image is given; name image files, or maps with --map")
+        raise click.UsageError("no image is given; give image files, or maps with --map")
     files = [m.path for m in maps.values()] or [f for given in images for f in _expand(given)]
     settings = _settings(choices, basis, run.backend, files[0], bool(maps))
     several = not maps and (len(files) > 1 or files != list(images))
     if run.cluster and (preview or not (several or blocks)):
         raise ValueError("--cluster takes several images, or --blocks, and no --preview")
-    named = files if several else files[:1]
-    outputs = name_outputs(named, output, [".npz"], several)
-    pictures = name_pictures(named, preview, several)
+    inputs = files if several else files[:1]
+    outputs = name_outputs(inputs, output, [".npz"], several)
+    pictures = name_pictures(inputs, preview, several)
     check_outputs([*outputs, *pictures, run.report], [*files, *([basis] if basis else [])])
     if several and blocks:
         raise ValueError("--blocks fits one image; run the command for each image")
@@ -136,34 +149,34 @@ def fit(
         blocks = blocks or _plan_memory(run, files[0], settings, preview)
     if blocks and not _has_blocks(settings, preview):
         raise ValueError(
-            "--blocks needs the preset and the init that are the default; leave --target-psnr, "
-            "--levels and --preview out"
+            "--blocks needs the default preset and init; leave out --target-psnr, --levels and "
+            "--preview"
         )
     if not run.cluster:
         select(run.backend)
     if settings.method.needs_model:
-        say("note: the file holds the Gaussians alone; the mean image stays in the basis")
+        print_message("note: the file holds only the Gaussians; the mean image stays in the basis")
     with open_cluster(run.cluster) as client:
         if several:
             records = _fit_several(run, files, outputs, pictures, settings, overwrite, client)
         elif blocks:
             records = [_fit_by_blocks(run, files[0], outputs[0], blocks, settings, client)]
         else:
-            records = [_fit_whole(run, maps or files[0], outputs[0], pictures[0], settings)]
-    decisive = dict(choices)
+            records = [_fit_at_once(run, maps or files[0], outputs[0], pictures[0], settings)]
+    used = dict(choices)
     if settings.start is not None:
-        decisive["basis"] = basis or DEFAULT_BASIS
+        used["basis"] = basis or DEFAULT_BASIS
     figures = {"images": records} if several else records[0]
-    run.write_report(decisive | {"block": blocks} | figures)
-    run.context.exit(_exit_code(records, len(named), settings))
+    run.write_report(used | {"block": blocks} | figures)
+    run.context.exit(_exit_code(records, len(inputs), settings))
 
 
 def _check_maps(context: click.Context, images: Sequence[Path | str], output: Path | None) -> None:
-    """Refuse images and options that do not go with maps."""
+    """Reject images and options that cannot be combined with maps."""
     if images:
-        raise ValueError(f"{images[0]}: an image without a name; with --map give names to all")
+        raise ValueError(f"{images[0]}: the image has no name; with --map, name all images")
     default = click.core.ParameterSource.DEFAULT
-    for name in NOT_OF_MAPS:
+    for name in EXCLUDED_BY_MAPS:
         if context.get_parameter_source(name) is not default:
             raise ValueError(
                 f"--{name} and --map exclude each other; --map NAME:SPACE=FILE sets a space"
@@ -175,9 +188,9 @@ def _check_maps(context: click.Context, images: Sequence[Path | str], output: Pa
 def _settings(
     choices: dict[str, Any], basis: str | None, backend: str | None, first: Path | str, maps: bool
 ) -> FitOptions:
-    """Return the options of a fit for the words of the command line.
+    """Return the options of a fit for the options of the command line.
 
-    `first` is the first image: levels by their number count on its size.
+    `first` is the first image, whose size determines the levels if only their number is given.
     """
     from ..fitting.options import FitOptions
 
@@ -217,7 +230,7 @@ def _settings(
 
 
 def _method(preset: str, init: str | None) -> Method:
-    """Return the method of a name, perhaps with the placement of another name."""
+    """Return the method of a preset, optionally with another initial placement."""
     from ..fitting.place import Adaptive, Grid, Placement, Random
     from ..paper.eigengs import EIGENGS
     from ..paper.gaussianimage import GAUSSIANIMAGE
@@ -228,7 +241,7 @@ def _method(preset: str, init: str | None) -> Method:
 
 
 def _default_count(path: Path | str) -> int:
-    """Return the default number of Gaussians for an image, by the header of its file."""
+    """Return the default number of Gaussians for an image, from the header of its file."""
     from ..blocks.windows import image_size
     from ..fitting.options import DEFAULT_COUNT, default_count
 
@@ -237,7 +250,7 @@ def _default_count(path: Path | str) -> int:
 
 
 def _expand(source: Path | str) -> Sequence[Path | str]:
-    """Replace a folder, a pattern or a URL by the images that it stands for."""
+    """Expand a folder, a pattern or a URL to its images."""
     from ..image.folder import list_images
 
     single = isinstance(source, Path) and source.exists() and not source.is_dir()
@@ -245,33 +258,33 @@ def _expand(source: Path | str) -> Sequence[Path | str]:
 
 
 # ---------------------------------------------------------------------------------------------
-#  One image, or maps on one set of shapes
+#  One image, or maps that share one set of shapes
 # ---------------------------------------------------------------------------------------------
 
 
-def _fit_whole(
+def _fit_at_once(
     run: options.Run,
     source: Path | str | dict[str, MapFile],
     output: Path,
     picture: Path | None,
     settings: FitOptions,
 ) -> Record:
-    """Fit one image or maps, write its files, and return its figures."""
+    """Fit one image, or maps, without blocks; write its files, and return its figures."""
     started = time.perf_counter()
-    claim(output)
+    lock_outputs(output)
     maps = source if isinstance(source, dict) else {}
     name = (output if isinstance(source, dict) else Path(source)).name
-    with bar(run.quiet) as show, about("--map" if maps else str(source)):
+    with bar(run.quiet) as show, prefix_errors("--map" if maps else str(source)):
         show(f"{name}: load", 0, 1)
         image = load_images(source, settings.space or "ycbcr", settings.encoding)
-        loaded, given = time.perf_counter(), image
+        loaded, target = time.perf_counter(), image
         if maps:
-            given = {key: eg.Map(image[key], m.space) for key, m in maps.items()}
+            target = {key: eg.Map(image[key], m.space) for key, m in maps.items()}
         try:
-            result = eg.fit(given, progress=partial(show, name), **vars(settings))
+            result = eg.fit(target, progress=partial(show, name), **vars(settings))
         except eg.FitInterrupted as interrupt:
             result = interrupt.result
-            say(f"interrupted; the best fit so far is in {output}")
+            print_message(f"interrupted; the best fit so far is in {output}")
         replace(result, source=name).save(output)
         show(f"{name}: measure", 0, 1)
         record = {"input": {name: m.path for name, m in maps.items()} or source, "output": output}
@@ -285,7 +298,7 @@ def _fit_whole(
 
 
 def load_images(source: Path | str | dict[str, MapFile], space: str, encoding: str | None) -> Any:
-    """Read an image, or the images of maps by their names; grey data keep one channel."""
+    """Read an image, or the images of maps by name; grey data keeps one channel."""
     from ..gaussian.channels import usual_space
     from ..image.io import read_file
 
@@ -297,22 +310,22 @@ def load_images(source: Path | str | dict[str, MapFile], space: str, encoding: s
     return read_file(source, rendered_as(space) is None, encoding)
 
 
-NO_FIGURES = ("gaussians", "image", "mean_image", "maps", "source", "resumed")
-"""Attributes of results that are no figures of a report."""
+UNREPORTED = ("gaussians", "image", "mean_image", "maps", "source", "resumed")
+"""Attributes of results that are not figures of a report."""
 
 
 def _figures(result: eg.Fit | eg.LargeFit) -> Record:
-    """Return the figures that a result has."""
+    """Return the figures of a result."""
     g = result.gaussians
-    found = {"gaussians": len(g), "width": g.width, "height": g.height, "space": g.space}
-    found |= {name: value for name, value in vars(result).items() if name not in NO_FIGURES}
+    figures = {"gaussians": len(g), "width": g.width, "height": g.height, "space": g.space}
+    figures |= {name: value for name, value in vars(result).items() if name not in UNREPORTED}
     if maps := getattr(result, "maps", {}):
-        found["maps"] = [m._asdict() | maps[m.name] for m in g.maps]
-    return found
+        figures["maps"] = [m._asdict() | maps[m.name] for m in g.maps]
+    return figures
 
 
 def _similarity(image: Any, result: eg.Fit) -> Record:
-    """Compare a fit with its image, where both are shown as codes; maps have no figures."""
+    """Return SSIM and MS-SSIM of a fit of colours; nothing for maps and other data."""
     from ..fitting.objective import is_codes
     from ..viewer.pictures import displayed
 
@@ -328,7 +341,7 @@ def _similarity(image: Any, result: eg.Fit) -> Record:
 
 
 def _comparison(image: Any, result: eg.Fit) -> Any:
-    """Show image, fit and outlines side by side, a row for each map."""
+    """Return a picture of image, fit and outlines side by side, with a row for each map."""
     import numpy as np
 
     from ..viewer.pictures import comparison, displayed
@@ -338,15 +351,15 @@ def _comparison(image: Any, result: eg.Fit) -> Any:
         return comparison(displayed(image, gaussians.space), result.image, gaussians)
     rows = []
     for m in gaussians.maps:
-        shown = displayed(image[m.name], m.space)[..., : m.channels]
-        rows.append(comparison(shown, result.image[m.name], gaussians[m.name]))
+        original = displayed(image[m.name], m.space)[..., : m.channels]
+        rows.append(comparison(original, result.image[m.name], gaussians[m.name]))
     return np.concatenate(rows)
 
 
 def _summary(
     name: str, record: Record, settings: FitOptions, picture: Path | None = None
 ) -> list[str]:
-    """Describe a fit for a terminal."""
+    """Format the summary of a fit for the terminal."""
     blocks = f" in {record['blocks']} blocks" if "blocks" in record else ""
     size, count = f"{record['width']}x{record['height']}", record["gaussians"]
     lines = [
@@ -354,7 +367,7 @@ def _summary(
         f"{record['iterations']} iterations in {record['seconds']:.1f} s"
     ]
     if "seconds_total" in record:
-        lines[0] += f" ({record['seconds_total']:.1f} s with loading and measuring)"
+        lines[0] += f" ({record['seconds_total']:.1f} s including loading and measuring)"
     for m in record.get("maps", []):
         figure, value = _target_figure(m, settings)
         lines.append(
@@ -372,19 +385,19 @@ def _summary(
 
 def _psnrs(space: str, floats: float, rgb: float) -> str:
     line = f"  psnr_{float_space(space)} {floats:.2f} dB"
-    # Data that are no codes have no PSNR of 8 bits.
+    # Data outside of [0, 1] has no PSNR of 8-bit values.
     return line if math.isnan(rgb) else f"{line}, psnr_rgb {rgb:.2f} dB"
 
 
 def _target_figure(record: Record, settings: FitOptions) -> tuple[str, float]:
-    """Return the name and the value of the PSNR that a target means."""
+    """Return the name and the value of the PSNR to which a target refers."""
     key = target_key(record["space"], settings.goal.space if settings.goal else "rgb")
     name = key if key == "psnr_rgb" else f"psnr_{float_space(record['space'])}"
     return name, record[key]
 
 
 def _exit_code(records: list[Record], expected: int, settings: FitOptions) -> int:
-    """Say which fits missed the target; return the exit code of the command."""
+    """Report fits that missed the target, and return the exit code of the command."""
     stops = [record["stopped"] for record in records]
     if "interrupted" in stops or len(records) < expected:
         return INTERRUPTED
@@ -394,12 +407,12 @@ def _exit_code(records: list[Record], expected: int, settings: FitOptions) -> in
         if record["stopped"] != "out of reach":
             continue
         spaces = record.get("maps") or [{"space": settings.space} | record]
-        found = [(*_target_figure(m, settings), m.get("name")) for m in spaces]
-        figure, value, name = min(found, key=lambda entry: entry[1])
+        psnrs = [(*_target_figure(m, settings), m.get("name")) for m in spaces]
+        figure, value, name = min(psnrs, key=lambda entry: entry[1])
         assert settings.goal
-        say(
-            f"{record['output' if name else 'input']}: {settings.goal.psnr:g} dB {figure} are "
-            f"out of reach: {record['gaussians']} Gaussians have {value:.2f}"
+        print_message(
+            f"{record['output' if name else 'input']}: {figure} of {settings.goal.psnr:g} dB is "
+            f"out of reach: {record['gaussians']} Gaussians reach {value:.2f}"
             + (f" in {name}" if name else "")
             + "; lower --target-psnr, or raise --max-gaussians or --iterations"
         )
@@ -420,14 +433,14 @@ def _fit_several(
     overwrite: bool,
     client: Any,
 ) -> list[Record]:
-    """Fit images into a folder; return the records of what is done. What failed is said at once."""
+    """Fit images into a folder, report failures at once, and return the finished records."""
     started, folder = time.perf_counter(), outputs[0].parent
-    given = _given(run.context, settings)
+    given = _given_options(run.context, settings)
     picture_of = {path.stem: picture for path, picture in zip(outputs, pictures, strict=True)}
 
     def note(done: int, total: int | None, row: eg.ImageRow) -> None:
         if row.error:
-            say(f"error: {row.error}")
+            print_message(f"error: {row.error}")
         picture = picture_of[row.name]
         if picture and row.result and row.input:
             image = load_images(row.input, settings.space or "ycbcr", settings.encoding)
@@ -442,35 +455,35 @@ def _fit_several(
         except eg.RunInterrupted as stop:
             rows = stop.rows
             done = f"{len(rows)} of {len(files)} images are done"
-            say(f"interrupted; {done}; the same command fits the others")
+            print_message(f"interrupted; {done}; repeat the command to fit the others")
     space, seconds = settings.space or "ycbcr", time.perf_counter() - started
     run.tell(*_summary_of_all(rows, folder, seconds, space))
     known = [{k: v for k, v in vars(row).items() if v not in (None, "")} for row in rows]
     return [{"stopped": record["status"]} | record for record in known]
 
 
-def _given(context: click.Context, settings: FitOptions) -> dict[str, Any]:
-    """Return the options that the command line gives, and what stands for the others."""
+def _given_options(context: click.Context, settings: FitOptions) -> dict[str, Any]:
+    """Return the fields of `FitOptions` that were set on the command line."""
     default = click.core.ParameterSource.DEFAULT
-    words = [n for n in context.params if context.get_parameter_source(n) is not default]
-    names = {FIELD_OF.get(word, word) for word in words}
+    given = [n for n in context.params if context.get_parameter_source(n) is not default]
+    names = {FIELD_OF_OPTION.get(name, name) for name in given}
     if settings.start is not None:
         names.add("start")
     return {name: value for name, value in vars(settings).items() if name in names}
 
 
-FIELD_OF = {
+FIELD_OF_OPTION = {
     "levels": "gaussians",
     "init": "method",
     "preset": "method",
     "target_space": "target_psnr",
     "max_gaussians": "target_psnr",
 }
-"""The field of `FitOptions` that an option of the command line changes, if it has another name."""
+"""Field of `FitOptions` for options of the command line that have another name."""
 
 
 def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space: str) -> list[str]:
-    """Describe a run for a terminal."""
+    """Format the summary of a run for the terminal."""
     fitted = [row for row in rows if row.status == "done"]
     counts = Counter(row.status for row in rows)
     others = "".join(f", {counts[k]} {k}" for k in ("skipped", "failed") if counts[k])
@@ -482,41 +495,41 @@ def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space
         text += f" ({len(fitted) / seconds:.2g} images/s)"
         lines.append(f"  mean{_psnrs(space, floats, rgb)[1:]}")
     if counts["skipped"]:
-        lines.append("  --overwrite fits the skipped images, whose results exist, again")
+        lines.append("  the results of skipped images exist; --overwrite fits them again")
     if fitted:
         lines.append(f"  wrote {folder}")
     return [text, *lines]
 
 
 # ---------------------------------------------------------------------------------------------
-#  A large image by blocks, and the memory of a fit before the image is read
+#  A large image by blocks, and the estimated memory of a fit
 # ---------------------------------------------------------------------------------------------
 
-NOTABLE = 1_000_000_000
-"""Bytes from which on a fit says its memory."""
+REPORTED_BYTES = 1_000_000_000
+"""Estimated memory from which a fit reports it, in bytes."""
 
-COMFORTABLE = 0.5
-"""Share of the usable memory up to which an image is fitted as a whole."""
+MAX_MEMORY_SHARE = 0.5
+"""Share of the usable memory up to which an image is fitted without blocks."""
 
 
 def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
-    """Return whether these options have a fit by blocks."""
-    usual = settings.method == eg.DEFAULT and settings.start is None
-    return usual and settings.goal is None and not settings.levels and preview is None
+    """Return whether a fit by blocks supports these options."""
+    default = settings.method == eg.DEFAULT and settings.start is None
+    return default and settings.goal is None and not settings.levels and preview is None
 
 
 def _plan_memory(
     run: options.Run, path: Path | str, settings: FitOptions, preview: Path | None
 ) -> int | None:
-    """Return the side of blocks where a fit of the whole image takes too much memory, else None.
+    """Return the side of blocks if a fit of the full image takes too much memory, else None.
 
-    Say how much a notable fit takes, from the header of its file. What is wrong with the file, its
-    reader says later.
+    A large fit reports its memory, estimated from the header of the file. Errors in the file are
+    left to its reader.
 
     Raises
     ------
     ValueError
-        If this process may use too little memory, and the options have no fit by blocks.
+        If this process may not use enough memory, and the options do not allow blocks.
     """
     from ..blocks.fit_large import BLOCK_SIDE
     from ..blocks.windows import image_size
@@ -532,20 +545,22 @@ def _plan_memory(
     count = settings.first_try(pixels, channels) if first else settings.count_for(pixels)
     problem = width, height, channels, count
     needed, usable = memory.estimate_memory(*problem), memory.usable_memory()
-    if usable and needed > COMFORTABLE * usable and _has_blocks(settings, preview):
-        say(f"{path}: a fit of the whole takes too much memory; it is fitted by blocks")
+    if usable and needed > MAX_MEMORY_SHARE * usable and _has_blocks(settings, preview):
+        print_message(
+            f"{path}: a fit of the full image takes too much memory; it is fitted by blocks"
+        )
         return BLOCK_SIDE
-    with about(path):
+    with prefix_errors(path):
         line = memory.check_memory(*problem)
-    if needed >= NOTABLE and not run.quiet:
-        say(line)
+    if needed >= REPORTED_BYTES and not run.quiet:
+        print_message(line)
     return None
 
 
 def _fit_by_blocks(
     run: options.Run, path: Path | str, output: Path, side: int, settings: FitOptions, client: Any
 ) -> Record:
-    """Fit one image by blocks into a file; after an interrupt, blocks that are done wait there."""
+    """Fit one image by blocks into a file; an interrupt keeps the finished blocks beside it."""
     names = ("gaussians", "iterations", "space", "method", "seed", "backend", "encoding")
     choices = {name: getattr(settings, name) for name in names}
     with bar(run.quiet) as show:
@@ -558,8 +573,9 @@ def _fit_by_blocks(
                 path, output, block=side, progress=progress, client=client, **choices
             )
         except KeyboardInterrupt:
-            say(
-                f"interrupted; finished blocks are in {output}.checkpoint; the same command goes on"
+            print_message(
+                f"interrupted; finished blocks are in {output}.checkpoint; repeat the command to "
+                "continue"
             )
             return {"input": path, "output": output, "stopped": "interrupted"}
     record = {"input": path, "output": output, "stopped": "iterations", **_figures(result)}

@@ -19,9 +19,9 @@ from ..gaussian.file import SetData
 from ..gaussian.packed import is_packed
 from ..storage import npz
 from . import options
-from .console import about, table
+from .console import prefix_errors, table
 from .outputs import check_outputs, name_pictures
-from .scene import explained, load_mitsuba
+from .scene import load_mitsuba, scene_errors
 
 Facts = Record
 
@@ -30,26 +30,30 @@ Facts = Record
 @click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE")
 @options.as_json
 @options.value("--preview", "FILE", options.path, "Picture of the contents.")
-@click.option("--texture", is_flag=True, help="Also load it in Mitsuba, for its bytes in memory.")
+@click.option(
+    "--texture",
+    is_flag=True,
+    help="Also load the file as a texture in Mitsuba, and show its memory.",
+)
 def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None:
     """Show the contents of a fitted image, a material or a model.
 
     NAME is a basis of the package, such as natural. For a fitted image, bpp is the size of the
-    file in bits per pixel, and a table shows what each array takes. The PSNR, the steps and the
-    source are those of the fit. For a packed image, the command also shows the steps of the
-    quantisation.
+    file in bits per pixel, and a table shows the size of each array. The PSNR, the number of steps
+    and the source are those of the fit. For a packed image, the command also shows the quantisation
+    steps.
 
-    For a material, a table shows its maps; bpp is for all of them together.
+    For a material, a table shows its maps; bpp refers to all maps together.
 
     For a model, a table shows the first components of all channels in order of variance: their
-    share of the variance, and the PSNR of PCA with them, for the training images and for the
-    images held out.
+    share of the variance, and the PSNR of PCA with these components, for the training images and
+    for the held-out images.
 
-    With --texture, texture_bytes is what a gaussian_texture of the file holds in memory for lookups
-    at points, and prefilter_bytes what it holds with a prefilter.
+    With --texture, texture_bytes is the memory of a gaussian_texture of the file for lookups at
+    points, and prefilter_bytes its memory with a prefilter.
 
-    The preview shows the rendered image, or the mean image, some components and the outlines of
-    the Gaussians of a model.
+    The preview shows the rendered image or, for a model, the mean image, some components and the
+    outlines of the Gaussians.
 
     \b
     Examples:
@@ -67,11 +71,12 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
 
     file = SHIPPED.get(str(file), file)
     packed = is_packed(file)
-    found = set_file.FORMAT if packed else npz.format_of(file)
+    file_format = set_file.FORMAT if packed else npz.format_of(file)
     kinds = {set_file.FORMAT: "image", set_file.MATERIAL: "material", model_file.FORMAT: "model"}
-    if found not in kinds:
-        raise ValueError(f"{file}: format is {found[:40]!r}, expected one of {', '.join(kinds)}")
-    kind = "material" if packed and set_file.maps_of(file) else kinds[found]
+    if file_format not in kinds:
+        expected = ", ".join(kinds)
+        raise ValueError(f"{file}: format is {file_format[:40]!r}, expected one of {expected}")
+    kind = "material" if packed and set_file.maps_of(file) else kinds[file_format]
     facts: Facts = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
     if kind == "model":
         facts |= _describe_model(eg.EigenGS.load(file))
@@ -92,7 +97,7 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
 
 
 def _describe_set(data: SetData) -> Facts:
-    """Describe a set; maps have spaces of their own."""
+    """Describe a set; each map has its own space."""
     count, channels = data.arrays["color"].shape
     facts: Facts = {"gaussians": count, "width": data.size[0], "height": data.size[1]}
     facts |= {"channels": channels, "cutoff": data.cutoff}
@@ -102,7 +107,7 @@ def _describe_set(data: SetData) -> Facts:
 
 
 def _describe_fit(file: Path) -> Facts:
-    """Describe a set, which is read whole: what can be described can be loaded. And its fit."""
+    """Describe a set and its fit. The set is read completely, to check that it can be loaded."""
     data = set_file.read(file)
     facts = _describe_set(data)
     if not data.maps and (figures := set_file.read_figures(file)):
@@ -114,15 +119,15 @@ def _describe_fit(file: Path) -> Facts:
 
 
 def _describe_packed(file: Path) -> Facts:
-    """Describe a packed set, the Gaussians of each section and the quantisation steps."""
+    """Describe a packed set, with the Gaussians of each section and the quantisation steps."""
     from ..codec import egs
 
-    found = egs.read(file)
-    data = found.set_data()
-    with about(file):
+    packed = egs.read(file)
+    data = packed.set_data()
+    with prefix_errors(file):
         set_file.check(data)
-    facts = _describe_set(data) | {"sections": [len(part.cell) for part in found.sections]}
-    steps = {f"{name}_step": float(f"{x:.4g}") for name, x in found.steps._asdict().items()}
+    facts = _describe_set(data) | {"sections": [len(part.cell) for part in packed.sections]}
+    steps = {f"{name}_step": float(f"{x:.4g}") for name, x in packed.steps._asdict().items()}
     return facts | steps
 
 
@@ -155,14 +160,14 @@ def _truncation(model: eg.EigenGS) -> list[Facts]:
 
 
 def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
-    """Return the bytes that textures of a file hold, without and with a prefilter."""
+    """Return the memory of textures of a file in bytes, without and with a prefilter."""
     mi = load_mitsuba(None, quiet=True)
     from ..plugins import resident_bytes
 
     source = {"type": "gaussian_texture", key: file} | ({"map": maps[0]["name"]} if maps else {})
-    with explained(Path(file)):  # one at a time: textures of a file share what they hold
-        found = [resident_bytes(mi.load_dict({**source, "prefilter": a})) for a in (0.0, 1e-3)]
-    return dict(zip(("texture_bytes", "prefilter_bytes"), found, strict=True))
+    with scene_errors(Path(file)):  # one at a time: textures of a file share memory
+        sizes = [resident_bytes(mi.load_dict({**source, "prefilter": a})) for a in (0.0, 1e-3)]
+    return dict(zip(("texture_bytes", "prefilter_bytes"), sizes, strict=True))
 
 
 def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:
@@ -181,8 +186,8 @@ def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) 
             counts = row["components"]
             name = f"{sum(counts)} = {'+'.join(map(str, counts))}"
             psnrs = [row["psnr_training"], row.get("psnr_held_out")]
-            shown = ["-" if value is None else f"{value:.2f} dB" for value in psnrs]
-            rows.append((name, f"{row['variance']:.2%}", shown[0], shown[1]))
+            cells = ["-" if value is None else f"{value:.2f} dB" for value in psnrs]
+            rows.append((name, f"{row['variance']:.2%}", cells[0], cells[1]))
         lines += ["", *table(rows)]
     return "\n".join(lines)
 
@@ -192,12 +197,12 @@ def _draw(file: Path, kind: str, picture: Path) -> None:
     from ..image.sheet import join_pictures
     from ..viewer.pictures import component_sheet
 
-    shown: Any
+    pixels: Any
     if kind == "model":
-        shown = component_sheet(eg.EigenGS.load(file))
+        pixels = component_sheet(eg.EigenGS.load(file))
     else:
-        shown = eg.picture_of(eg.Gaussians.load(file))
+        pixels = eg.picture_of(eg.Gaussians.load(file))
     if kind == "material":
-        in_rgb = [image.repeat(3 // image.shape[2], axis=2) for image in shown.values()]
-        shown = join_pictures(in_rgb, 1)
-    eg.save_image(picture, shown)
+        in_rgb = [image.repeat(3 // image.shape[2], axis=2) for image in pixels.values()]
+        pixels = join_pictures(in_rgb, 1)
+    eg.save_image(picture, pixels)

@@ -1,6 +1,6 @@
 """The program ``eigengs-dr``: each command calls one function of the package.
 
-Commands import heavy modules when they run, so that ``--help`` and mistakes answer at once.
+Commands import heavy modules when they run, so that ``--help`` and usage errors are fast.
 """
 
 from importlib.metadata import entry_points
@@ -25,7 +25,7 @@ class Benchmarks(click.Group):
     Examples:
       eigengs-dr bench kernels
       eigengs-dr bench tables data/ -o results/ --set natural256 --images 3
-    """  # the benchmarks are loaded when one of their commands is used
+    """  # benchmarks are loaded only when one of their commands is used
 
     def list_commands(self, context: click.Context) -> list[str]:
         """Return the names of the commands."""
@@ -40,7 +40,7 @@ bench = Benchmarks("bench", help=Benchmarks.__doc__)
 
 
 def _load() -> click.Group:
-    """Load the group of commands that the installed benchmarks offer."""
+    """Load the commands of the benchmarks, if they are installed."""
     for entry in entry_points(group="eigengs_dr.commands", name="bench"):
         group: click.Group = entry.load()
         return group
@@ -59,9 +59,9 @@ def main() -> None:
     Examples, in the order to run them first:
       eigengs-dr doctor                                     Check this machine.
       eigengs-dr fit photo.jpg --preview fit.png            Write photo.npz.
-      eigengs-dr info photo.npz                             Show what it holds.
+      eigengs-dr info photo.npz                             Show its contents.
       eigengs-dr render photo.npz -o large.png --scale 2    Render it larger.
-      eigengs-dr pack photo.npz -o photo.egs                Make it small.
+      eigengs-dr pack photo.npz -o photo.egs                Compress it.
       eigengs-dr view photo.npz --open                      Look at it in the browser.
 
     "eigengs-dr COMMAND --help" describes a command.

@@ -1,4 +1,4 @@
-"""Estimate of the memory of a fit, before it starts."""
+"""Estimate of the memory that a fit takes, made before it starts."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ largest resident memory of processes that fit a mosaic of photos with the backen
 | 4,096x4,096 | 3 | 1,280,000 | 2.62 GB | 2.69 GB |"""
 
 BYTES_PER_PIXEL = 24.0
-"""Memory of the density and of the lists of tiles, for each pixel."""
+"""Memory of the density and of the tile lists, per pixel."""
 
 BYTES_PER_VALUE = 27.0
-"""Memory of the images, for each pixel and channel: nearly 7 images in single precision."""
+"""Memory of the images, per pixel and channel: nearly 7 images in single precision."""
 
 BYTES_PER_GAUSSIAN = 600.0
-"""Memory of the parameters, of the colour solve and of the lists, for each Gaussian. A fit of
-130,000 Gaussians on 2,048x2,048 pixels takes 65 MB more with as many in addition than without."""
+"""Memory of the parameters, of the colour solve and of the lists, per Gaussian. A fit of 130,000
+Gaussians on 2,048x2,048 pixels takes 65 MB more with a surplus of as many than without."""
 
 
 def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> int:
-    """Estimate the largest memory of a process that fits one image.
+    """Estimate the peak memory of a process that fits one image.
 
     Parameters
     ----------
@@ -43,8 +43,9 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
     Returns
     -------
     int
-        Bytes, to about a sixth for sets that `eigengs_dr.fit` places. Large Gaussians touch more
-        tiles and take more. It counts the largest surplus, which short fits do not have.
+        Bytes, accurate to about a sixth for sets that `eigengs_dr.fit` places. Large Gaussians
+        touch more tiles and take more. The largest surplus is included, which short fits do not
+        reach.
     """
     pixels = width * height
     surplus = Surplus()
@@ -57,14 +58,14 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
 
 
 def check_memory(width: int, height: int, channels: int, gaussians: int) -> str:
-    """Say in one line how much memory a fit takes.
+    """Return a line with the estimated memory of a fit, and check that there is enough.
 
     For the parameters see `estimate_memory`.
 
     Raises
     ------
     ValueError
-        If this process may use less memory: one line that says so and what to do.
+        If this process may use less memory; the message is one line with advice.
     """
     needed, usable = estimate_memory(width, height, channels, gaussians), usable_memory()
     line = (
@@ -73,7 +74,7 @@ def check_memory(width: int, height: int, channels: int, gaussians: int) -> str:
     )
     if usable is not None and needed > usable:
         raise ValueError(
-            f"{line}, this process may use {usable / 1e9:.1f} GB: "
+            f"{line}, but this process may use {usable / 1e9:.1f} GB; "
             "scale the image down or use fewer Gaussians"
         )
     return line

@@ -1,4 +1,4 @@
-"""Options of several commands, and what their texts may be."""
+"""Options that several commands share, and the types of their values."""
 
 import glob
 import re
@@ -21,24 +21,25 @@ from .outputs import describe_run, write_json
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 
 MAX_PIXELS = 1 << 29
-"""Pixels of the largest picture to render, except into TIFF files; it takes 3 bytes a pixel."""
+"""Largest number of pixels of a rendered picture, except in TIFF files; it takes 3 bytes per
+pixel."""
 
 MAX_RENDERED_SIDE = 1 << 17
-"""Longest side of a picture to render into a TIFF file."""
+"""Largest side in pixels of a picture that is rendered into a TIFF file."""
 
 Command = Callable[..., object]
 
 Kind = click.ParamType | type | Callable[[str], object]
-"""What a value of an option is."""
+"""The type of an option's value."""
 
 Option = Callable[[Command], Command]
-"""What adds an option to a command."""
+"""A decorator that adds an option to a command."""
 
-# Each function below parses the text of an option or an argument; its name stands in the help.
+# Each function below parses the text of an option or an argument; click shows its name in errors.
 
 
 def path(text: str) -> Path:
-    """Parse a file or a folder to write; a URL would become a strange folder of this one."""
+    """Parse a file or a folder to write; reject URLs, which would become local folders."""
     refuse_url(text)
     return Path(text)
 
@@ -49,7 +50,7 @@ def image(text: str) -> Path | str:
 
 
 def images(text: str) -> Path | str:
-    """Parse an image file, a folder of images, a pattern such as "a/*.png", or their URL."""
+    """Parse an image file, a folder of images, a pattern such as "a/*.png", or a URL of these."""
     if is_url(text):
         return text
     pattern = glob.has_magic(text) and not Path(text).exists()
@@ -57,44 +58,44 @@ def images(text: str) -> Path | str:
 
 
 def folder(text: str) -> Path | str:
-    """Parse a folder that exists, or its URL."""
+    """Parse an existing folder, or its URL."""
     kind = click.Path(exists=True, file_okay=False, path_type=Path)
     return text if is_url(text) else kind.convert(text, None, None)
 
 
 def size(text: str) -> tuple[int, int]:
-    """Parse width and height in pixels, as in "1024x768"."""
+    """Parse width and height in pixels, such as "1024x768"."""
     width, height = _numbers(text, r"\d+x\d+", "width and height, such as 1024x768")
     return check_pixels(width, height, by_parts=True)
 
 
 def scale(text: str) -> float:
-    """Parse a factor on a size."""
+    """Parse the factor of a size."""
     if not 0 < (factor := float(text)) <= MAX_RENDERED_SIDE:
         raise click.BadParameter(f"{text}: expected a number above 0, such as 2 or 0.5")
     return factor
 
 
 def region(text: str) -> tuple[int, ...]:
-    """Parse a part of an image, in pixels."""
+    """Parse a region of an image, in pixels."""
     expected = "left, top, width and height, such as 100,50,640,480"
     return _numbers(text, r"\d+,\d+,0*[1-9]\d*,0*[1-9]\d*", expected)
 
 
 def counts(text: str) -> int | tuple[int, ...]:
-    """Parse one number for all channels, or three."""
+    """Parse one number for all channels, or one for each of three."""
     expected = "a number above 0, or three such as 230,60,60"
     return _one_or_more(_numbers(text, r"(?=.*[1-9])\d+(,\d+,\d+)?", expected))
 
 
 def levels(text: str) -> int | tuple[int, ...]:
-    """Parse a number of levels, or the numbers of Gaussians up to each."""
+    """Parse the number of levels, or the number of Gaussians up to each."""
     expected = "a number, or several such as 5000,7000,9000"
     return _one_or_more(_numbers(text, r"\d{1,18}(,\d{1,18})*", expected))
 
 
 def _numbers(text: str, pattern: str, expected: str) -> tuple[int, ...]:
-    """Parse whole numbers with a sign between them, whose text matches a pattern."""
+    """Parse whole numbers separated by "," or "x", if the text matches a pattern."""
     if not re.fullmatch(pattern, text):
         raise click.BadParameter(f"{text}: expected {expected}")
     return tuple(map(int, re.split("[,x]", text)))
@@ -105,7 +106,7 @@ def _one_or_more(numbers: tuple[int, ...]) -> int | tuple[int, ...]:
 
 
 class MapFile(NamedTuple):
-    """The image file of a map, and its space if it is not the usual one."""
+    """The image file of a map, and its space if it is not the default of its name."""
 
     name: str
     path: Path | str
@@ -113,7 +114,7 @@ class MapFile(NamedTuple):
 
 
 def map_file(text: str) -> MapFile:
-    """Parse a name and a file, as in "albedo=bark.jpg", or a name, a space and a file."""
+    """Parse a name and a file, such as "albedo=bark.jpg", optionally with a space."""
     from ..gaussian.channels import NAME
 
     left, sign, file = text.partition("=")
@@ -130,7 +131,7 @@ def map_file(text: str) -> MapFile:
 def by_name(
     context: click.Context, parameter: click.Parameter, maps: tuple[MapFile, ...]
 ) -> dict[str, MapFile]:
-    """Return maps by their names; a name may occur once."""
+    """Return maps by name; each name may occur once."""
     names = [item.name for item in maps]
     if twice := [name for name in names if names.count(name) > 1]:
         raise click.UsageError(f"--map {twice[0]} is given twice; give each name once")
@@ -138,63 +139,71 @@ def by_name(
 
 
 def check_pixels(width: int, height: int, by_parts: bool = False) -> tuple[int, int]:
-    """Return the width and height of a picture; refuse one that is too large to render.
+    """Return the width and height of a picture; reject one that is too large to render.
 
-    A picture that is written by parts may be larger than one that is held in memory.
+    A picture that is written in parts may be larger than one that is held in memory.
     """
     if not (1 <= width <= MAX_RENDERED_SIDE and 1 <= height <= MAX_RENDERED_SIDE):
         raise click.UsageError(
             f"{width}x{height}: expected sides of 1 to {MAX_RENDERED_SIDE:,} pixels"
         )
     if width * height > MAX_PIXELS and not by_parts:
-        most = f"at most {MAX_PIXELS:,} pixels, or a .tif file"
-        raise click.UsageError(f"{width}x{height}: expected {most}")
+        limit = f"at most {MAX_PIXELS:,} pixels, or a .tif file"
+        raise click.UsageError(f"{width}x{height}: expected {limit}")
     return width, height
 
 
 def value(name: str, metavar: str | None, kind: Kind, text: str, default: object = None) -> Option:
-    """Make an option that takes a value of a type of click, or one that a function parses."""
+    """Make an option whose value has a type of click or is parsed by a function."""
     return click.option(name, metavar=metavar, type=kind, help=text, default=default)
 
 
 def choice(name: str, values: Iterable[str], text: str, optional: bool = False) -> Option:
-    """Make an option that takes one of several words; by default the first, or None."""
+    """Make an option that takes one of several words; the default is the first, or None."""
     words = list(values)
     return value(name, None, click.Choice(words), text, None if optional else words[0])
 
 
-def number(name: str, text: str, default: int | None = None, least: int | None = None) -> Option:
-    """Make an option that takes a whole number, from `least` on if that is given."""
-    return value(name, "N", int if least is None else click.IntRange(min=least), text, default)
+def number(name: str, text: str, default: int | None = None, minimum: int | None = None) -> Option:
+    """Make an option that takes a whole number, optionally with a minimum."""
+    return value(name, "N", int if minimum is None else click.IntRange(min=minimum), text, default)
 
 
 def output(text: str, metavar: str, required: bool = True) -> Option:
-    """Make the option of the file or folder to write."""
+    """Make the option for the file or folder to write."""
     return click.option("-o", "--output", required=required, type=path, metavar=metavar, help=text)
 
 
 def maps(text: str) -> Option:
-    """Make the option that names image files of maps."""
+    """Make the option for the image files of maps."""
     many: Record = {"multiple": True, "type": map_file, "callback": by_name}
     return click.option("--map", "maps", metavar="NAME[:SPACE]=FILE", help=text, **many)
 
 
 def level_counts(text: str) -> Option:
-    """Make the option of the levels of detail."""
+    """Make the option for the levels of detail."""
     return value("--levels", "N|N,N,...", levels, text)
 
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 encoding = choice(
-    "--encoding", ENCODINGS, "What pixels are.  [default: linear in float files, else srgb]", True
+    "--encoding",
+    ENCODINGS,
+    "Encoding of the pixels.  [default: linear for files of floats, else srgb]",
+    True,
 )
 
 SHARED: dict[str, Option] = {
     "cluster": value(
-        "--cluster", "local[:N]|tcp://HOST:PORT|FILE", str, "N processes here, or a Dask cluster."
+        "--cluster",
+        "local[:N]|tcp://HOST:PORT|FILE",
+        str,
+        "Run on N local processes, or on a Dask cluster.",
     ),
-    "backend": choice("--backend", BACKENDS, "Processor.  [default: cuda if present]", True),
-    "report": value("--report", "FILE", path, "JSON file of all figures."),
+    "backend": choice(
+        "--backend", BACKENDS, "Backend of Dr.Jit.  [default: cuda if present]", True
+    ),
+    "report": value("--report", "FILE", path, "Write all figures to a JSON file."),
     "quiet": click.option("--quiet", is_flag=True, help="Show no progress and no summary."),
 }
 """Options that become fields of a `Run`."""
@@ -210,18 +219,18 @@ class Run(NamedTuple):
     cluster: str | None = None
 
     def tell(self, *lines: str) -> None:
-        """Write the summary of a command, unless it is quiet."""
+        """Print the summary of a command, unless it is quiet."""
         if not self.quiet:
             click.echo("\n".join(map(printable, lines)))
 
     def write_report(self, figures: dict[str, object], backend: str | None = None) -> None:
-        """Write the figures and the machine, on a backend or that of the option, as JSON."""
+        """Write figures, the command and the machine as JSON; `backend` overrides the option."""
         if self.report:
             write_json(self.report, describe_run(self.context, backend or self.backend) | figures)
 
 
 def shared(*names: str) -> Option:
-    """Add options of `SHARED` to a command, which gets them as its first argument, a `Run`."""
+    """Add options of `SHARED` to a command, which receives them in a `Run`, its first argument."""
 
     def decorate(command: Command) -> Command:
         @click.pass_context

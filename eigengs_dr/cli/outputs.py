@@ -1,4 +1,4 @@
-"""Names of output files, checked before the work starts, and reports of all figures as JSON."""
+"""Names of output files, which are checked before work starts, and JSON reports."""
 
 import json
 import os
@@ -29,12 +29,12 @@ def name_outputs(
     inputs : sequence of Path or str
         The input files, or their URLs.
     output : Path or None
-        The output file or folder. Several inputs need a folder; it is created if it is missing.
-        Files in a folder have the names of the inputs. None is the current folder.
+        The output file or folder. Several inputs need a folder, which is created if it is missing.
+        Files in a folder are named after the inputs. None is the current folder.
     suffixes : sequence of str
-        Valid suffixes of the file; files in a folder get the first.
+        Valid suffixes of the file; files in a folder get the first one.
     folder : bool, optional
-        Whether one input needs a folder too, as several inputs do.
+        Whether a single input needs a folder too.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def name_outputs(
     ------
     ValueError
         If the file has another suffix, the output of several inputs is a file, or two inputs have
-        one output.
+        the same output.
     OSError
         If the folder cannot be created.
     """
@@ -67,7 +67,7 @@ def name_outputs(
 def name_pictures(
     inputs: Sequence[Path | str], output: Path | None, folder: bool = False
 ) -> list[Path | None]:
-    """Name a picture for each input, as `name_outputs`; None for each without an output."""
+    """Name a picture for each input, as `name_outputs` does; None for each without an output."""
     from ..image.formats import PICTURE_SUFFIXES
 
     if output is None:
@@ -78,7 +78,7 @@ def name_pictures(
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) -> None:
     """Check that every output can be written and overwrites neither an input nor another output.
 
-    What killed runs left beside the outputs goes.
+    Files that killed runs left beside the outputs are deleted.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
     Raises
     ------
     ValueError
-        If one file occurs twice.
+        If a file occurs twice.
     OSError
         If a file cannot be written.
     """
@@ -104,7 +104,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
             raise ValueError(f"{output}: {uses[real]} too; write to another file")
         uses[real] = "is written"
         folder = os.path.dirname(real)
-        is_first = folder not in folders  # one look at a folder, of perhaps 100,000 files
+        is_first = folder not in folders  # each folder is checked once, for 100,000 files too
         if is_first or (os.path.exists(real) and not os.path.isfile(real)):
             require_writable(output)
         if is_first:
@@ -112,8 +112,8 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
             remove_stale(Path(folder))
 
 
-def claim(*outputs: Path) -> None:
-    """Let no other run write outputs until the command ends; see `lock_output`."""
+def lock_outputs(*outputs: Path) -> None:
+    """Lock outputs against other runs until the command ends; see `lock_output`."""
     for output in outputs:
         click.get_current_context().with_resource(lock_output(output))
 
@@ -124,7 +124,7 @@ def check_replaceable(output: Path, maps: bool) -> None:
     Raises
     ------
     ValueError
-        If the file is something else than such a result. It is never replaced.
+        If the file is not such a result. It is never replaced.
     """
     if not output.exists():
         return
@@ -134,30 +134,30 @@ def check_replaceable(output: Path, maps: bool) -> None:
         kind = ""
     if kind != (MATERIAL if maps else FORMAT):
         name = "material" if maps else "set of Gaussians"
-        raise ValueError(f"{output}: exists and is no {name}; choose another name with -o")
+        raise ValueError(f"{output}: exists and is not a {name}; choose another name with -o")
 
 
 def describe_run(context: click.Context, backend: str | None) -> dict[str, object]:
-    """Return the command as typed and the machine, for a report."""
+    """Return the command line and the machine, for a report."""
     return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
 
 
 def write_json(path: Path, figures: dict[str, object]) -> None:
-    """Write figures as JSON, all or nothing; see `plain`.
+    """Write figures as JSON atomically; see `plain`.
 
     Raises
     ------
     OSError
-        If the file cannot be written; an existing file is then unchanged.
+        If the file cannot be written; an existing file does not change.
     """
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(plain(figures), indent=2) + "\n", encoding="utf-8")
 
 
 def plain(value: object) -> Any:
-    """Convert a value to types of JSON: arrays to lists, paths to texts, infinity and NaN to None.
+    """Convert a value to JSON types: arrays to lists, paths to strings, infinity and NaN to None.
 
-    Infinity is the PSNR of two equal images; JSON has neither.
+    JSON has neither infinity, the PSNR of two equal images, nor NaN.
     """
     text = json.dumps(value, default=lambda v: v.tolist() if hasattr(v, "tolist") else str(v))
     return json.loads(text, parse_constant=lambda name: None)

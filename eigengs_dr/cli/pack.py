@@ -11,25 +11,25 @@ import eigengs_dr as eg
 
 from ..backend.selection import select
 from . import options
-from .console import about
-from .outputs import check_outputs, claim, name_outputs
+from .console import prefix_errors
+from .outputs import check_outputs, lock_outputs, name_outputs
 
 SUFFIX, BUDGET = ".egs", 0.5
-"""Suffix of packed files and default loss in dB; copies, because `eigengs_dr.codec` imports
+"""Suffix of packed files and default loss in dB, repeated here because `eigengs_dr.codec` imports
 Dr.Jit."""
 
 COMPARED_IN = {"linear": "sRGB", "radiance": "PU21"}
-"""What the PSNR of a set of light compares; of other sets, their space."""
+"""Space in which the PSNR of a set of light is measured; other sets use their own space."""
 
 
 @click.command()
 @click.argument("file", type=options.EXISTING, metavar="X.npz")
 @options.output("File to write.", "Y.egs")
-@options.value("--image", "IMAGE", options.image, "The original image, to measure the loss with.")
-@options.maps("The image of a map of a material; repeat for all of them.")
+@options.value("--image", "IMAGE", options.image, "The original image, for measuring the loss.")
+@options.maps("The image of a map of a material; repeat the option for all maps.")
 @options.encoding
 @options.value("--max-psnr-drop", "DB", float, "Allowed loss of PSNR.", BUDGET)
-@options.level_counts("Levels of the fit, to keep: readers may stop after any and have a picture.")
+@options.level_counts("Levels of the fit to keep, so that readers may stop after any level.")
 @options.shared("backend", "report", "quiet")
 def pack(
     run: options.Run,
@@ -41,11 +41,11 @@ def pack(
     max_psnr_drop: float,
     levels: int | tuple[int, ...] | None,
 ) -> None:
-    """Compress a fitted image to few bytes.
+    """Compress a fitted image or a material.
 
     The command quantises the parameters as coarsely as the allowed loss of PSNR permits, and
-    codes them. Every command that reads the .npz file of an image reads .egs files too. Without
-    --image, the command assumes that the fit has 40 dB. A material takes --map instead.
+    entropy-codes them. Every command that reads the .npz file of an image reads .egs files too.
+    Without --image, the command assumes that the fit has 40 dB. A material takes --map instead.
 
     \b
     Examples:
@@ -57,17 +57,17 @@ def pack(
     [target] = name_outputs([file], output, [SUFFIX])
     inputs = [file, *([image] if image else []), *(m.path for m in maps.values())]
     check_outputs([target, run.report], inputs)
-    claim(target)
+    lock_outputs(target)
     select(run.backend)
     gaussians = eg.Gaussians.load(file, run.backend)
     if maps and not gaussians.maps:
         raise ValueError(f"{file}: holds one image and no maps; give --image instead of --map")
     if image and gaussians.maps:
-        raise ValueError(f"{file}: holds a material; give its images by --map NAME=FILE")
+        raise ValueError(f"{file}: holds a material; give its images with --map NAME=FILE")
     if levels is not None and gaussians.maps:
-        raise ValueError(f"{file}: a material has no levels in .egs files; leave --levels out")
+        raise ValueError(f"{file}: a material has no levels in .egs files; leave out --levels")
     images: Any = {name: m.path for name, m in maps.items()} or image
-    with about(file):
+    with prefix_errors(file):
         counts = eg.level_counts(len(gaussians), 1 if levels is None else levels)
         sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
         packed = eg.pack(gaussians, target, images, max_psnr_drop, sections, encoding=encoding)
@@ -77,12 +77,12 @@ def pack(
     run.write_report(figures | {"max_psnr_drop": max_psnr_drop})
     against = "the original" if images else "the rendering of the input"
     psnr = packed.psnr if isinstance(packed.psnr, dict) else {"": packed.psnr}
-    shown = ", ".join(f"{name} {value:.2f} dB".strip() for name, value in psnr.items())
+    values = ", ".join(f"{name} {value:.2f} dB".strip() for name, value in psnr.items())
     figure = COMPARED_IN.get(gaussians.space, f"psnr in {gaussians.space}")
     if gaussians.maps:
         figure = "psnr_rgb"
     run.tell(
         f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes",
         f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel",
-        f"  lost {packed.psnr_drop:.2f} dB; {figure} against {against}: {shown}",
+        f"  lost {packed.psnr_drop:.2f} dB; {figure} against {against}: {values}",
     )

@@ -8,21 +8,24 @@ import click
 from ..backend.selection import select
 from . import options
 from .console import bar
-from .outputs import check_outputs, claim, name_outputs
+from .outputs import check_outputs, lock_outputs, name_outputs
 
 
 @click.command()
 @click.argument("file", type=options.EXISTING, metavar="X.npz")
 @options.output("Picture to write.", "Y.png")
-@click.option("--map", "name", metavar="NAME", help="The map of a material to draw.")
+@click.option("--map", "name", metavar="NAME", help="The map of a material to render.")
 @options.value(
-    "--region", "X,Y,W,H", options.region, "Left, top, width, height: a part of the image."
+    "--region", "X,Y,W,H", options.region, "Region of the image: left, top, width, height."
 )
-@options.value("--scale", "S", options.scale, "Factor on the native size, such as 0.5.")
+@options.value("--scale", "S", options.scale, "Scale factor of the native size, such as 0.5.")
 @options.value("--size", "WxH", options.size, "Width and height in pixels, such as 1024x768.")
-@options.number("--first", "Draw the first N Gaussians alone; for fits with --levels.", least=1)
+@options.number("--first", "Render only the first N Gaussians; for fits with --levels.", minimum=1)
 @options.choice(
-    "--bits", ["8", "16", "32"], "Bits of a value.  [default: 32 in .exr, .hdr, .pfm, else 8]", True
+    "--bits",
+    ["8", "16", "32"],
+    "Bits per value.  [default: 32 in .exr, .hdr, .pfm, else 8]",
+    True,
 )
 @options.shared("backend", "quiet")
 def render(
@@ -39,9 +42,9 @@ def render(
     """Render a fitted image at any size, or a region of it.
 
     Without --scale and --size, the picture has the native size of the image or of the region.
-    Files of 8 and 16 bits hold sRGB, clamped; files of floats (.exr, .hdr, .pfm, and .tif with
+    Files of 8 and 16 bits hold clamped sRGB; files of floats (.exr, .hdr, .pfm, and .tif with
     --bits 32) hold linear light. A fit of data is written unchanged; one channel gives a grey
-    picture. Large pictures are drawn in bands; a .tif file takes no more memory than a band.
+    picture. Large pictures are rendered in bands; a .tif file takes no more memory than a band.
 
     \b
     Examples:
@@ -61,7 +64,7 @@ def render(
     [output] = name_outputs([file], output, SUFFIXES)
     depth = bits_of(output, int(bits) if bits else None)
     check_outputs([output], [file])
-    claim(output)
+    lock_outputs(output)
     select(run.backend)
     from ..blocks.draw import save_region
     from ..gaussian.file import read_map

@@ -1,4 +1,4 @@
-"""The commands of Mitsuba scenes.
+"""The commands for Mitsuba scenes.
 
 ``eigengs-dr scene`` renders scenes that use the plugins, and ``eigengs-dr convert`` replaces the
 bitmaps of a scene by Gaussians.
@@ -23,7 +23,7 @@ from ..backend.types import Record
 from ..storage.atomic import atomic_write
 from . import options
 from .console import MISSED, bar, table
-from .outputs import check_outputs, claim, name_outputs
+from .outputs import check_outputs, lock_outputs, name_outputs
 
 if TYPE_CHECKING:
     from ..scene.convert import ConvertedScene
@@ -35,7 +35,7 @@ SUFFIXES = (".png", ".exr")
 
 
 def definition(text: str) -> tuple[str, str]:
-    """Parse a parameter of a scene and its value, as in "spp=16"."""
+    """Parse a parameter of a scene and its value, such as "spp=16"."""
     key, sign, value = text.partition("=")
     if not (key and sign):
         raise click.BadParameter(f"{text}: expected a name and a value, such as spp=16")
@@ -43,13 +43,13 @@ def definition(text: str) -> tuple[str, str]:
 
 
 def integrator(text: str) -> Record:
-    """Parse the type of an integrator and its parameters, as in "path,max_depth=4"."""
+    """Parse the type of an integrator and its parameters, such as "path,max_depth=4"."""
     kind, *settings = text.split(",")
     return {"type": kind, **{key: _value(value) for key, value in map(definition, settings)}}
 
 
 def _value(text: str) -> object:
-    """Return a number or a boolean; other texts are as they are."""
+    """Parse a number or a boolean; other text is returned unchanged."""
     try:
         return json.loads(text)
     except ValueError:
@@ -57,11 +57,19 @@ def _value(text: str) -> object:
 
 
 variant_option = options.value(
-    "--variant", "NAME", str, "Of Mitsuba.  [default: cuda_ad_rgb with a GPU, else llvm_ad_rgb]"
+    "--variant",
+    "NAME",
+    str,
+    "Variant of Mitsuba.  [default: cuda_ad_rgb with a GPU, else llvm_ad_rgb]",
 )
 many: Record = {"multiple": True, "callback": lambda context, option, given: dict(given)}
 definitions_option = click.option(
-    "-D", "definitions", type=definition, metavar="KEY=VALUE", help="Set a <default>.", **many
+    "-D",
+    "definitions",
+    type=definition,
+    metavar="KEY=VALUE",
+    help="Set a <default> of the scene.",
+    **many,
 )
 
 
@@ -69,11 +77,13 @@ definitions_option = click.option(
 @click.argument("scenes", nargs=-1, required=True, type=options.EXISTING, metavar="SCENE.xml...")
 @options.output(".png or .exr file, or a folder.", "OUT")
 @variant_option
-@options.number("--spp", "Samples per pixel.  [default: from the scene]", least=1)
+@options.number("--spp", "Samples per pixel.  [default: from the scene]", minimum=1)
 @options.value(
     "--camera", "ID|N|all", str, "Camera to render; all writes OUT-ID for each.  [default: 1]"
 )
-@options.value("--integrator", "TYPE[,KEY=VALUE...]", integrator, "Replaces that of the scene.")
+@options.value(
+    "--integrator", "TYPE[,KEY=VALUE...]", integrator, "Integrator to use instead of the scene's."
+)
 @definitions_option
 @options.shared("quiet")
 def scene(
@@ -88,9 +98,9 @@ def scene(
 ) -> None:
     """Render Mitsuba scenes with Gaussian textures.
 
-    The mitsuba executable does not know the texture gaussian_texture, because it is a plugin in
-    Python; this command does. For several scenes, -o names a folder, and the pictures have the
-    names of the scenes. An EXR file has AOVs and layers by their names; a PNG file has the colours.
+    The mitsuba executable does not know the texture gaussian_texture, because it is a Python
+    plugin; this command does. For several scenes, -o names a folder, and the pictures are named
+    after the scenes. An EXR file has all AOVs and layers by name; a PNG file has the colours only.
     Textures whose prefilter is true follow the camera.
 
     \b
@@ -104,12 +114,12 @@ def scene(
     """
     outputs = name_outputs(scenes, output, SUFFIXES)
     check_outputs(outputs, scenes)
-    claim(*outputs)
+    lock_outputs(*outputs)
     mi = load_mitsuba(variant, run.quiet)
     from ..scene.rendering import render_in_passes
 
     for path, target in zip(scenes, outputs, strict=True):
-        with explained(path):
+        with scene_errors(path):
             loaded = mi.load_file(str(path), **definitions)
             if not isinstance(loaded, mi.Scene):
                 raise ValueError("it holds no scene; its root must be <scene version='3.0.0'>")
@@ -120,13 +130,15 @@ def scene(
         files = _files(target, cameras, scenes) if camera == "all" else [target]
         for (number, name), file in zip(cameras.items(), files, strict=True):
             started = time.perf_counter()
-            with explained(path), bar(run.quiet) as show:
-                seen = render_in_passes(loaded, number, spp, partial(show, str(path)), renderer)
-                left_out = _write(mi, file, seen)
-            height, width = seen.pixels.shape[:2]
-            by = f", camera {name}" if len(loaded.sensors()) > 1 else ""
+            with scene_errors(path), bar(run.quiet) as show:
+                rendering = render_in_passes(
+                    loaded, number, spp, partial(show, str(path)), renderer
+                )
+                left_out = _write(mi, file, rendering)
+            height, width = rendering.pixels.shape[:2]
+            label = f", camera {name}" if len(loaded.sensors()) > 1 else ""
             run.tell(
-                f"{path}{by}: {width}x{height}, samples per pixel: {seen.spp}, "
+                f"{path}{label}: {width}x{height}, samples per pixel: {rendering.spp}, "
                 f"{time.perf_counter() - started:.1f} s",
                 f"  wrote {file}" + f", without {', '.join(left_out)}" * bool(left_out),
             )
@@ -140,7 +152,7 @@ def _cameras(ids: list[str], wanted: str | None) -> dict[int, str]:
     Returns
     -------
     dict of int to str
-        The name of each by its place: its id if files may have it in their names, or its number.
+        Index and name of each: its id if that is valid in a file name, else its number.
     """
     names = [name if re.fullmatch(r"[\w.-]+", name) else f"{k}" for k, name in enumerate(ids, 1)]
     if wanted is None or wanted == "all":
@@ -153,17 +165,17 @@ def _cameras(ids: list[str], wanted: str | None) -> dict[int, str]:
 
 
 def _files(target: Path, cameras: dict[int, str], scenes: Sequence[Path]) -> list[Path]:
-    """Name a picture for each camera, and claim it."""
+    """Name a picture for each camera, and lock it."""
     files = [target.with_stem(f"{target.stem}-{name}") for name in cameras.values()]
     check_outputs(files, scenes)
-    claim(*files)
+    lock_outputs(*files)
     return files
 
 
 def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
     """Import Mitsuba, set a variant and register the plugins."""
     module = select(backend_of(variant) if variant else None)
-    from ..plugins import register_plugins  # first: its error says what to install
+    from ..plugins import register_plugins  # first, because its error names what to install
 
     # isort: split
     import mitsuba as mi
@@ -179,29 +191,30 @@ def load_mitsuba(variant: str | None, quiet: bool) -> ModuleType:
     return mi
 
 
-def _write(mi: ModuleType, path: Path, seen: Rendering) -> list[str]:
-    """Write a picture, all or nothing; return the names of channels that it leaves out."""
+def _write(mi: ModuleType, path: Path, rendering: Rendering) -> list[str]:
+    """Write a picture atomically; return the names of channels that it leaves out."""
     left_out = []
     if path.suffix.lower() == ".png":
-        colors = seen.picture()
+        colors = rendering.picture()
         if not colors.size:
-            raise ValueError(f"it shows no colours but {', '.join(seen.channels)}; write .exr")
-        left_out = [name for name in seen.channels if name not in {*"RGBAY"}]
+            channels = ", ".join(rendering.channels)
+            raise ValueError(f"it has no colours, only {channels}; write an .exr file")
+        left_out = [name for name in rendering.channels if name not in {*"RGBAY"}]
         bitmap = mi.Bitmap(colors)
         bitmap = bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
     else:
-        kind = mi.Bitmap.PixelFormat.MultiChannel  # else four AOVs count as RGBA
-        bitmap = mi.Bitmap(seen.pixels, kind, list(seen.channels))
+        kind = mi.Bitmap.PixelFormat.MultiChannel  # otherwise four AOVs would be taken for RGBA
+        bitmap = mi.Bitmap(rendering.pixels, kind, list(rendering.channels))
     with atomic_write(path) as temporary:
         bitmap.write(str(temporary))
     return left_out
 
 
 @contextmanager
-def explained(path: Path) -> Iterator[None]:
-    """Reduce an error of Mitsuba in a block to one line that says what is wrong.
+def scene_errors(path: Path) -> Iterator[None]:
+    """Convert errors of Mitsuba in a block to a `ValueError` of one line.
 
-    Mitsuba raises many types for mistakes in a scene; only the message tells them apart.
+    Mitsuba raises many types for mistakes in a scene; only the messages differ.
     """
     try:
         yield
@@ -222,11 +235,20 @@ def explained(path: Path) -> Iterator[None]:
 @click.argument("scene", type=options.EXISTING, metavar="SCENE.xml")
 @options.output("New or empty folder.", "FOLDER")
 @click.option(
-    "--target-psnr", "--psnr", "target_psnr", metavar="DB", default=40.0, help="As cameras see it."
+    "--target-psnr",
+    "--psnr",
+    "target_psnr",
+    metavar="DB",
+    default=40.0,
+    help="PSNR of the renderings.",
 )
-@options.number("--iterations", "Steps of optimisation for each number of Gaussians.", 100, 0)
-@options.number("--spp", "Samples a pixel; 0 renders nothing.  [default: from the scene]", least=0)
-@click.option("--replace-all", is_flag=True, help="Also bitmaps that are smaller or faster.")
+@options.number("--iterations", "Optimisation steps for each number of Gaussians.", 400, 0)
+@options.number(
+    "--spp", "Samples per pixel; 0 renders nothing.  [default: from the scene]", minimum=0
+)
+@click.option(
+    "--replace-all", is_flag=True, help="Also replace bitmaps that are smaller or faster."
+)
 @variant_option
 @definitions_option
 @options.shared("report", "quiet")
@@ -244,12 +266,12 @@ def convert(
     """Replace the bitmaps of a Mitsuba scene by as many Gaussians as its cameras resolve.
 
     FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
-    after, and 8 times their difference. If a rendering misses the PSNR, the command says so and
-    exits with code 1. A bitmap that takes less memory than its Gaussians, or an eighth of their
-    time, stays; the command shows both. Environment maps, bump maps with which the renderings would
-    miss the PSNR, images of two values such as masks, data beyond 0 and 1, and images that no
-    camera sees stay too; the command says why. Other files stay where they are, and the new scene
-    names them relative to FOLDER.
+    after, and 8 times their difference. If a rendering misses the PSNR, the command reports it and
+    exits with code 1. A bitmap is kept if it takes less memory than its Gaussians, or an eighth of
+    their time; the command shows both. Environment maps, bump maps with which the renderings would
+    miss the PSNR, images of two values such as masks, data outside of 0 to 1, and images that no
+    camera sees are kept too; the command shows the reason. Other files are not moved, and the new
+    scene refers to them relative to FOLDER.
 
     \b
     Examples:
@@ -262,30 +284,30 @@ def convert(
     from ..scene.convert import convert_scene
 
     started = time.perf_counter()
-    with explained(scene), bar(run.quiet) as show:
-        found = convert_scene(
+    with scene_errors(scene), bar(run.quiet) as show:
+        converted = convert_scene(
             scene, output, target_psnr, iterations, spp, definitions, replace_all, progress=show
         )
-    before = sum(texture.bytes for texture in found.textures)
-    after = sum(texture.gaussian_bytes for texture in found.textures)
-    figures: dict[str, object] = {"output": found.scene, "bytes_before": before, "bytes": after}
-    figures["textures"] = [texture._asdict() for texture in found.textures]
-    figures["better"] = [texture._asdict() for texture in found.better]
-    figures["left"] = [{"name": name, "reason": reason} for name, reason in found.left]
-    figures["psnr_rgb"] = found.psnr
+    before = sum(texture.bytes for texture in converted.textures)
+    after = sum(texture.gaussian_bytes for texture in converted.textures)
+    figures: dict[str, object] = {"output": converted.scene, "bytes_before": before, "bytes": after}
+    figures["textures"] = [texture._asdict() for texture in converted.textures]
+    figures["better"] = [texture._asdict() for texture in converted.better]
+    figures["left"] = [{"name": name, "reason": reason} for name, reason in converted.left]
+    figures["psnr_rgb"] = converted.psnr
     run.write_report(figures, mi.variant().partition("_")[0])
     seconds = time.perf_counter() - started
-    run.tell(*_table(found, before, after), f"wrote {found.scene} in {seconds:.1f} s")
-    if any(psnr < target_psnr for psnr in found.psnr):
+    run.tell(*_table(converted, before, after), f"wrote {converted.scene} in {seconds:.1f} s")
+    if any(psnr < target_psnr for psnr in converted.psnr):
         run.context.exit(MISSED)
 
 
-def _table(found: ConvertedScene, before: int, after: int) -> list[str]:
-    """Lay out the textures, what stayed, and how close the renderings are."""
+def _table(converted: ConvertedScene, before: int, after: int) -> list[str]:
+    """Format the replaced textures, those that were kept, and the PSNRs of the renderings."""
     rows: list[Sequence[str]] = [
         ("texture", "texels", "bytes", "ns", "Gaussians", "bytes", "ns", "PSNR seen")
     ]
-    for t in [*found.textures, *found.better]:
+    for t in [*converted.textures, *converted.better]:
         bitmap = f"{t.width}x{t.height}", f"{t.bytes:,}", f"{t.lookup_ns:.1f}"
         gaussians = f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.gaussian_lookup_ns:.1f}"
         rows.append((t.names[0], *bitmap, *gaussians, f"{t.psnr:.1f} dB"))
@@ -293,8 +315,8 @@ def _table(found: ConvertedScene, before: int, after: int) -> list[str]:
     lines = table(rows)
     if before:
         lines.append(f"memory: {after:,} of {before:,} bytes ({after / before:.3f})")
-    lines += [f"stays, the bitmap is better: {name}" for t in found.better for name in t.names]
-    lines += [f"left alone: {name}: {reason}" for name, reason in found.left]
-    psnrs = enumerate(found.psnr, 1)
+    lines += [f"kept, the bitmap is better: {name}" for t in converted.better for name in t.names]
+    lines += [f"left alone: {name}: {reason}" for name, reason in converted.left]
+    psnrs = enumerate(converted.psnr, 1)
     lines += [f"camera {k}: psnr_rgb {psnr:.1f} dB between the renderings" for k, psnr in psnrs]
     return lines

@@ -8,41 +8,52 @@ import click
 from ..backend.selection import select
 from ..backend.types import Record
 from . import options
-from .console import INTERRUPTED, bar, open_cluster, say
+from .console import INTERRUPTED, bar, open_cluster, print_message
 from .outputs import check_outputs, name_outputs, name_pictures
 
 FREQUENCY_AWARE: dict[str, bool | str] = {"auto": "auto", "yes": True, "no": False}
-"""Values of the option, by the word on the command line."""
+"""Values of the option by their names on the command line."""
 
-MEASURED = ("psnr_pca", "psnr_init", "psnr_solved")
-"""Figures of the images held out; null in the report if there are none."""
+HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
+"""Figures of the held-out images; null in the report if there are none."""
 
 
 @click.command()
 @click.argument("folder", type=options.folder, metavar="FOLDER")
 @options.output("Model to write.", "MODEL.npz")
-@options.value("--size", "WxH", options.size, "Crop and resize to this.", "256x256")
-@options.value("--components", "K|Y,CB,CR", options.counts, "Limit, or one per channel.", "300")
-@options.value("--energy", "SHARE", float, "Keep this share of variance.")
-@options.value("--target-psnr", "DB", float, "Keep the fewest for this mean PSNR.")
-@options.number("--gaussians", "Up to one per pixel.  [default: 5000]", least=1)
-@options.choice("--frequency-aware", FREQUENCY_AWARE, "Reserve a tenth for the first components.")
-@options.choice("--preset", ["default", "eigengs"], "Solve, or train (paper).")
-@options.number("--iterations", "Training steps.  [default: 0; eigengs: 15000]", least=0)
-@options.choice("--space", ["ycbcr", "rgb"], "Space of the components.")
-@options.number("--seed", "Seed of random numbers.", 0, least=0)
+@options.value("--size", "WxH", options.size, "Crop and resize the images to this size.", "256x256")
+@options.value(
+    "--components", "K|Y,CB,CR", options.counts, "Largest number of components per channel.", "300"
+)
+@options.value("--energy", "SHARE", float, "Keep components with this share of the variance.")
+@options.value("--target-psnr", "DB", float, "Keep the fewest components for this mean PSNR.")
+@options.number(
+    "--gaussians", "Number of Gaussians, at most one per pixel.  [default: 5000]", minimum=1
+)
+@options.choice(
+    "--frequency-aware",
+    FREQUENCY_AWARE,
+    "Reserve a tenth of the Gaussians for the first components.",
+)
+@options.choice("--preset", ["default", "eigengs"], "Solve for the weights, or train as the paper.")
+@options.number(
+    "--iterations", "Number of training steps.  [default: 0; eigengs: 15000]", minimum=0
+)
+@options.choice("--space", ["ycbcr", "rgb"], "Colour space of the components.")
+@options.number("--seed", "Seed of the random numbers.", 0, minimum=0)
 @options.value("--preview", "FILE", options.path, "Picture of the components.")
 @options.shared("cluster", "backend", "report", "quiet")
 def train(
     run: options.Run, folder: Path | str, output: Path, preview: Path | None, **choices: Any
 ) -> None:
-    """Train a model on a folder of images, or on its URL.
+    """Train a model on the images in a folder, or at its URL.
 
     A model is one set of Gaussians that renders all principal components of the images. One image
-    in ten is held out and measured at the end. --energy counts the variance of each channel of
-    the training images; --target-psnr measures PCA, in --space, of the images held out. After
-    Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint. With --cluster
-    the processes of a Dask cluster find components and weights; all see FOLDER and MODEL.npz.
+    in ten is held out and measured at the end. --energy refers to the variance of each channel of
+    the training images; --target-psnr to the PSNR of PCA, in --space, for the held-out images.
+    After Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint. With
+    --cluster, the processes of a Dask cluster compute components and weights; they all need access
+    to FOLDER and MODEL.npz.
 
     \b
     Examples:
@@ -71,23 +82,24 @@ def train(
         with open_cluster(run.cluster) as client, bar(run.quiet) as show:
             result = training.train(folder, output, settings, run.backend, show, client)
     except training.Interrupted as error:
-        say(f"interrupted; {error}")
+        print_message(f"interrupted; {error}")
         run.write_report(vars(settings) | {"input": folder, "stopped": "interrupted"})
         run.context.exit(INTERRUPTED)
     if picture:
         save_image(picture, component_sheet(result.model, result.basis))
-    found: Record = dict.fromkeys(MEASURED) | result.figures
-    record = {"input": folder, "output": output, "most_components": settings.components} | found
+    figures: Record = dict.fromkeys(HELD_OUT_FIGURES) | result.figures
+    record = {"input": folder, "output": output, "most_components": settings.components} | figures
     run.write_report(vars(settings) | record)
-    components = "+".join(map(str, found["components"]))
-    split = "split" if found["frequency_aware"] else "not split"
-    if found["psnr_pca"] is None:
+    components = "+".join(map(str, figures["components"]))
+    split = "split" if figures["frequency_aware"] else "not split"
+    if figures["psnr_pca"] is None:
         measured = "no image was held out, so no psnr was measured; use at least 10 images"
     else:
-        measured = "held out: " + ", ".join(f"{name} {found[name]:.2f} dB" for name in MEASURED)
+        psnrs = (f"{name} {figures[name]:.2f} dB" for name in HELD_OUT_FIGURES)
+        measured = "held out: " + ", ".join(psnrs)
     run.tell(
-        f"{folder}: {found['images']} images, {components} components, "
-        f"{found['gaussians']} Gaussians in {found['seconds']:.1f} s; "
+        f"{folder}: {figures['images']} images, {components} components, "
+        f"{figures['gaussians']} Gaussians in {figures['seconds']:.1f} s; "
         f"{split}",
         f"  {measured}",
         f"  wrote {output}" + (f" and {picture}" if picture else ""),

@@ -15,21 +15,24 @@ from ..gaussian import file as set_file
 from ..gaussian.packed import is_packed
 from ..storage import npz
 from . import options
-from .console import about
-from .outputs import check_outputs, claim, name_outputs
+from .console import prefix_errors
+from .outputs import check_outputs, lock_outputs, name_outputs
 
 SUFFIXES = (".html", ".htm")
 
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE")
-@options.output("Page.  [default: in this folder]", "PAGE.html", required=False)
+@options.output("Page to write.  [default: in the current folder]", "PAGE.html", required=False)
 @options.value(
-    "--image", "IMAGE", options.image, "A photo to compare with, or for a model to move."
+    "--image",
+    "IMAGE",
+    options.image,
+    "A photo to compare with; for a model, the photo to start from.",
 )
 @options.encoding
 @click.option("--map", "name", metavar="NAME", help="The map of a material to show.")
-@options.level_counts("Levels of the fit, as for fit.  [default: the sections of an .egs file]")
+@options.level_counts("Levels of the fit, as in fit.  [default: the sections of an .egs file]")
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @options.shared("backend", "quiet")
 def view(
@@ -45,9 +48,10 @@ def view(
     """Make a page for the browser that draws a fitted image or a model.
 
     NAME is a basis of the package, such as natural. The page is one file and needs no network. It
-    draws as "render" does, at any zoom. It shows outlines, the first Gaussians alone, and the
-    parameters of the one under the pointer. With --image, a divider wipes between the Gaussians
-    and the photo. For a model, it has sliders for the first components, and draws random images.
+    draws the same picture as "render", at any zoom. It can show outlines, only the first Gaussians,
+    and the parameters of the Gaussian under the pointer. With --image, a divider wipes between the
+    Gaussians and the photo. For a model, it has sliders for the first components, and draws random
+    images.
 
     \b
     Examples:
@@ -59,14 +63,14 @@ def view(
     """
     [page] = name_outputs([file], output, SUFFIXES)
     check_outputs([page], [file, *([image] if image else [])])
-    claim(page)
+    lock_outputs(page)
     select(run.backend)
     source, counts = _load(file, name, levels, run.backend)
     photo: Any = image
-    with about(file):
-        made = eg.view(source, photo, levels=counts, title=file.stem, encoding=encoding)
-    made.save(page)
-    run.tell(f"{file}: wrote {page} ({len(made.html):,} bytes)")
+    with prefix_errors(file):
+        result = eg.view(source, photo, levels=counts, title=file.stem, encoding=encoding)
+    result.save(page)
+    run.tell(f"{file}: wrote {page} ({len(result.html):,} bytes)")
     if opens:
         click.launch(str(page))
 
@@ -76,7 +80,7 @@ def _load(
 ) -> tuple[eg.Gaussians | eg.EigenGS, list[int]]:
     """Return the set or the model of a file or a name, and the Gaussians up to each level.
 
-    The file may be hostile: a set is counted before it is read.
+    The file need not be trusted: the number of Gaussians is checked before they are read.
     """
     from ..codec import egs
     from ..eigenbasis import model_file
@@ -87,12 +91,12 @@ def _load(
     sections = egs.section_counts(file) if is_packed(file) else []
     if not sections and npz.format_of(file) == model_file.FORMAT:
         if levels is not None or name is not None:
-            raise ValueError(f"{file}: is a model; leave --levels and --map out")
+            raise ValueError(f"{file}: is a model; leave out --levels and --map")
         return eg.EigenGS.load(file, backend), []
-    with about(file):
+    with prefix_errors(file):
         check_count(sum(sections) or set_file.read_head(file).gaussians)
         gaussians = eg.Gaussians.from_data(set_file.read_map(file, name, "--map"), backend)
         if levels is not None:
             return gaussians, eg.level_counts(len(gaussians), levels)
-    is_whole = len(sections) < 2 or set_file.maps_of(file)
-    return gaussians, [] if is_whole else list(accumulate(sections))
+    has_levels = len(sections) > 1 and not set_file.maps_of(file)
+    return gaussians, list(accumulate(sections)) if has_levels else []

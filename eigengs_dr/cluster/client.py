@@ -1,4 +1,4 @@
-"""Which executor a client has. It imports Dask for a client of Dask alone."""
+"""The executor of a client. Dask is imported only for a Dask client."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def executor_for(client: object = None) -> Executor:
     Raises
     ------
     TypeError
-        If no executor is known for the type of the client.
+        If the type of the client is not supported.
     ClusterError
         If the workers of the client cannot be used.
     """

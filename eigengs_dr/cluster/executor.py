@@ -1,7 +1,7 @@
-"""Dask: a client from words, and the executor of a client. Tasks are drawn as workers become free.
+"""Dask: connection to a cluster, and an executor that submits tasks as workers become free.
 
-What a cluster has is left as it is: its plugins, its configuration, the limits of its workers. What
-a task needs, `eigengs_dr.cluster.worker` sets for the time of the task.
+A cluster is not changed: neither its plugins and its configuration nor the limits of its workers.
+`eigengs_dr.cluster.worker` sets what a task needs for the duration of the task.
 """
 
 from __future__ import annotations
@@ -32,21 +32,27 @@ from .local import local_cluster
 from .worker import package_versions, run_task, share
 
 CONNECT_SECONDS = 30.0
-"""Time for the scheduler to answer."""
+"""Time limit for connecting to the scheduler."""
 
-PATIENCE = {"distributed.deploy.lost-worker-timeout": "52w"}
-"""Setting of Dask for the workers of ``local``. After that time, 15 s by default, from any end of a
-worker, Dask looks whether the worker is there. If it starts slowly, or has just ended once more,
-Dask ends the nanny that is about to restart it, and the cluster stays smaller for ever."""
+LOST_WORKER_SETTING = {"distributed.deploy.lost-worker-timeout": "52w"}
+"""Dask setting for the workers of ``local``. This time after a worker ended, by default 15 s, Dask
+checks whether the worker is back. If it starts slowly, or has just ended again, Dask closes the
+nanny that is about to restart it, and the cluster stays smaller for good."""
 
-LARGE_TASKS = {"distributed.admin.large-graph-warning-threshold": "1GiB"}
-"""Setting of Dask: tasks hold images, and Dask warns of large tasks."""
+LARGE_TASK_SETTING = {"distributed.admin.large-graph-warning-threshold": "1GiB"}
+"""Dask setting that avoids warnings about large tasks, because tasks hold images."""
 
 _SUBMIT_LOCK = threading.Lock()
-"""For `LARGE_TASKS`: of two threads, one would restore what the other has set."""
+"""Protects `LARGE_TASK_SETTING`: one thread would reset what another has set."""
 
-LOGGERS = ("distributed", "distributed.client", "distributed.gc", "tornado.application", "asyncio")
-"""What says the same as our line, in many: that a connection was lost."""
+SILENCED_LOGGERS = (
+    "distributed",
+    "distributed.client",
+    "distributed.gc",
+    "tornado.application",
+    "asyncio",
+)
+"""Loggers that report a lost connection in many lines; this package reports it in one."""
 
 
 @contextmanager
@@ -56,29 +62,29 @@ def connect(cluster: str) -> Iterator[Client]:
     Parameters
     ----------
     cluster : str
-        ``local`` or ``local:N``: N processes of one thread on this machine, by default one for each
-        core. ``tcp://HOST:PORT``: the address of a scheduler. Else the file of a scheduler, which
-        ``dask scheduler --scheduler-file FILE`` writes.
+        ``local`` or ``local:N``: N single-threaded processes on this machine, by default one per
+        core. ``tcp://HOST:PORT``: the address of a scheduler. Otherwise the file of a scheduler,
+        which ``dask scheduler --scheduler-file FILE`` writes.
 
     Yields
     ------
     distributed.Client
-        It is closed after the block; so are the workers of ``local``.
+        It is closed after the block, and so are the workers of ``local``.
 
     Raises
     ------
     ClusterError
         If the scheduler does not answer.
     ValueError
-        If the word is none of these.
+        If `cluster` is none of these.
     KeyboardInterrupt
         After Ctrl-C or SIGTERM while the workers start.
     """
     with ExitStack() as stack:
-        stack.enter_context(_quiet())
+        stack.enter_context(_silenced_loggers())
         if match := re.fullmatch(r"local(?::([1-9]\d*))?", cluster):
-            stack.enter_context(dask.config.set(PATIENCE))
-            with defer_interrupts() as interrupted:  # Dask does not end what begins to start
+            stack.enter_context(dask.config.set(LOST_WORKER_SETTING))
+            with defer_interrupts() as interrupted:  # Dask does not stop workers that are starting
                 workers = local_cluster(int(match[1] or 0) or dask.system.CPU_COUNT)
                 client = stack.enter_context(Client(stack.enter_context(workers)))
             if interrupted():
@@ -90,20 +96,20 @@ def connect(cluster: str) -> Iterator[Client]:
                     f"cluster {cluster!r} is unknown; use local, local:N, tcp://HOST:PORT, or the "
                     "file of a scheduler"
                 )
-            place = {"address" if is_address else "scheduler_file": cluster}
+            location = {"address" if is_address else "scheduler_file": cluster}
             try:
-                client = stack.enter_context(Client(**place, timeout=CONNECT_SECONDS))
+                client = stack.enter_context(Client(**location, timeout=CONNECT_SECONDS))
             except OSError as error:
                 raise ClusterError(f"{cluster}: no scheduler answers; start it first") from error
         yield client
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Dask from writing lines during a block."""
-    levels = {name: logging.getLogger(name).level for name in LOGGERS}
+def _silenced_loggers() -> Iterator[None]:
+    """Silence Dask's loggers during a block."""
+    levels = {name: logging.getLogger(name).level for name in SILENCED_LOGGERS}
     try:
-        for name in LOGGERS:
+        for name in SILENCED_LOGGERS:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         yield
     finally:
@@ -111,11 +117,11 @@ def _quiet() -> Iterator[None]:
             logging.getLogger(name).setLevel(level)
 
 
-AHEAD = 2
-"""Tasks under way for each worker: one that runs, and one that waits there."""
+TASKS_PER_WORKER = 2
+"""Number of submitted tasks per worker: one that runs, and one that waits there."""
 
 NO_WORKER_SECONDS = 60.0
-"""Time without any worker after which a run ends. A nanny restarts a worker in some seconds."""
+"""Time without any worker after which a run ends. A nanny restarts a worker within seconds."""
 
 
 class ClusterExecutor:
@@ -128,18 +134,18 @@ class ClusterExecutor:
     Attributes
     ----------
     workers : int
-        Number of workers when the executor was made, at least 1.
+        Number of workers when the executor was created, at least 1.
 
     Raises
     ------
     ClusterError
-        If no worker comes within `NO_WORKER_SECONDS`, or one lacks this version of the package.
+        If there is no worker within `NO_WORKER_SECONDS`, or one lacks this version of the package.
     """
 
     def __init__(self, client: Client) -> None:
         self.client = client
         self.address = client.scheduler.address if client.scheduler else "?"
-        with self._explained():
+        with self._cluster_errors():
             self._require_worker(f"the scheduler {self.address} has no workers; start some")
             self._require_package()
             self.workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
@@ -149,17 +155,19 @@ class ClusterExecutor:
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`.
 
-        A worker that ends takes all of its tasks with it. So tasks that Dask gives up are tried
-        again at the end, one at a time; a task is lost for its own fault only.
+        If a worker crashes, all of its tasks are lost. Tasks that Dask gives up are therefore tried
+        again at the end, one at a time, so that no task fails because of another.
         """
         suspects: deque[Task] = deque()
-        with self._explained(), terminate_as_interrupt():
-            # A task, not `scatter`: the scheduler repeats it if the workers that hold it are lost.
+        with self._cluster_errors(), terminate_as_interrupt():
+            # A task instead of `scatter`: the scheduler repeats it if its workers are lost.
             constant = self._submit("share", share, dumps((function, shared)), package_versions())
             name = funcname(function)
-            with closing(self._run(name, tasks, constant, AHEAD * self.workers)) as ended:
+            with closing(
+                self._run(name, tasks, constant, TASKS_PER_WORKER * self.workers)
+            ) as ended:
                 for done in ended:
-                    if done.lost:  # perhaps by the fault of another task of that worker
+                    if done.lost:  # perhaps because of another task of that worker
                         suspects.append(done.task)
                     else:
                         yield done
@@ -169,49 +177,53 @@ class ClusterExecutor:
     def _run(
         self, name: str, tasks: Iterable[object], constant: Future, limit: int
     ) -> Generator[Done, None, None]:
-        """Run tasks, `limit` of them at once."""
-        under_way: dict[Future, object] = {}
+        """Run tasks, at most `limit` of them at the same time."""
+        submitted: dict[Future, object] = {}
         waiting = iter(tasks)
-        ended = self._watch(under_way)
+        ended = self._watch(submitted)
         try:
             while True:
-                for task in islice(waiting, limit - len(under_way)):
+                for task in islice(waiting, limit - len(submitted)):
                     future = self._submit(name, run_task, dumps(task), constant)
-                    under_way[future] = task
+                    submitted[future] = task
                     ended.add(future)
                 try:
                     future = next(ended)
                 except StopIteration:
                     return
-                except TimeoutError:  # after a time that counts from the first task
+                except TimeoutError:  # this time is counted from the first task
                     self._require_worker(
                         "no worker is left; start some, and the same call continues the run"
                     )
-                    ended = self._watch(under_way)
+                    ended = self._watch(submitted)
                     continue
-                yield _done(under_way.pop(future), future)
+                yield _done(submitted.pop(future), future)
                 future.release()
         finally:
-            if under_way and self.client.status == "running":
-                self.client.cancel(list(under_way))
+            if submitted and self.client.status == "running":
+                self.client.cancel(list(submitted))
 
     def _watch(self, futures: Iterable[Future]) -> as_completed:
         return as_completed(list(futures), loop=self.client.loop, timeout=NO_WORKER_SECONDS)
 
     def _submit(self, name: str, function: Callable, *arguments: object) -> Future:
-        """Submit a task; Dask learns from those of the same name how long it takes."""
-        with _SUBMIT_LOCK, dask.config.set(LARGE_TASKS):
+        """Submit a task. Dask estimates its duration from tasks of the same name."""
+        with _SUBMIT_LOCK, dask.config.set(LARGE_TASK_SETTING):
             return self.client.submit(function, *arguments, key=f"{name}-{uuid4()}")
 
-    def _require_worker(self, otherwise: str) -> None:
-        """Wait until there is a worker."""
+    def _require_worker(self, message: str) -> None:
+        """Wait until there is a worker; raise an error with the message if there is none."""
         try:
             self.client.wait_for_workers(1, timeout=NO_WORKER_SECONDS)
         except TimeoutError:
-            raise ClusterError(otherwise) from None
+            raise ClusterError(message) from None
 
     def _require_package(self) -> None:
-        """Ask the workers by a function of Python: what they cannot load ends their connection."""
+        """Check the version of the package on all workers.
+
+        The call uses a function of the standard library, because a function that workers cannot
+        load closes their connection.
+        """
         answers = self.client.run(resolve_name, "eigengs_dr:__version__", on_error="return")
         for address, answer in answers.items():
             if isinstance(answer, ModuleNotFoundError):
@@ -223,8 +235,8 @@ class ClusterExecutor:
                 )
 
     @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Say in one line that the cluster is gone, or what its workers lack."""
+    def _cluster_errors(self) -> Iterator[None]:
+        """Convert errors about a lost cluster or a missing package to a one-line `ClusterError`."""
         try:
             yield
         except (CancelledError, CommClosedError) as error:
@@ -234,12 +246,12 @@ class ClusterExecutor:
             ) from error
         except ModuleNotFoundError as error:
             raise ClusterError(
-                f"a worker has no {error.name}; install there what this process has"
+                f"a worker lacks {error.name}; install the packages of this process there"
             ) from None
 
 
 def _done(task: object, future: Future) -> Done:
-    """Return what became of a task; one whose worker ended with the result runs again."""
+    """Return the result of a task; waits if it runs again because its worker was lost."""
     try:
         return Done(task, loads(future.result()))
     except KilledWorker:

@@ -1,6 +1,6 @@
-"""Workers on this machine that a run starts for itself, and set up as Dr.Jit needs it.
+"""Workers on this machine that a run starts for itself, with the settings that Dr.Jit needs.
 
-Dask loads this module in them before their first task.
+Dask loads this module in the workers before their first task.
 """
 
 from __future__ import annotations
@@ -13,50 +13,51 @@ from pathlib import Path
 import dask
 from distributed import LocalCluster, Worker
 
-MALLOC = {
+MALLOC_SETTING = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 27,
     "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
 }
-"""Setting of Dask: the C library, if it is glibc, reuses freed memory. Dask sets 64 KiB for the
-first one. Every large array then gets new pages from the kernel, and a fit of 256x256 pixels takes
-a tenth longer."""
+"""Dask setting that makes glibc reuse freed memory. Dask's value of the first variable is 64 KiB.
+Every large array then gets new pages from the kernel, and a fit of 256x256 pixels takes a tenth
+longer."""
 
 
 def local_cluster(workers: int, **settings: object) -> LocalCluster:
-    """Start worker processes of one thread on this machine.
+    """Start single-threaded worker processes on this machine.
 
     Parameters
     ----------
     workers : int
-        Number of processes. They are spawned, never forked: Dr.Jit's threads do not survive that.
+        Number of processes. They are spawned, never forked, because Dr.Jit's threads do not survive
+        a fork.
     settings : object
-        More arguments of `distributed.LocalCluster`.
+        Further arguments of `distributed.LocalCluster`.
     """
     preload = [*dask.config.get("distributed.worker.preload"), __name__]
     options = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL, **settings}
     options |= {"n_workers": workers, "threads_per_worker": 1, "processes": True}
-    with dask.config.set(MALLOC):
+    with dask.config.set(MALLOC_SETTING):
         return LocalCluster(preload=preload, **options)
 
 
 def dask_setup(worker: Worker) -> None:
-    """Set up the process of a worker; Dask calls this function before its first task."""
+    """Set up the process of a worker; Dask calls this function before the first task."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes
     choose_gpu(worker.name)
-    # Dr.Jit keeps memory for reuse during a task, so a wait gains nothing, nor does a disk. At 95 %
-    # of its limit a worker is restarted. A configuration would not reach the new process.
+    # Dr.Jit keeps memory for reuse during a task, so neither pausing nor spilling to disk helps. At
+    # 95 % of its limit a worker is restarted. A configuration would not reach the new process.
     worker.memory_manager.memory_pause_fraction = False
     worker.memory_manager.memory_spill_fraction = False
     worker.memory_manager.memory_target_fraction = False
 
 
 def choose_gpu(name: object) -> None:
-    """Give each worker of a machine one of its GPUs, unless CUDA_VISIBLE_DEVICES is set.
+    """Assign one GPU of the machine to each worker, unless CUDA_VISIBLE_DEVICES is set.
 
     Parameters
     ----------
     name : object
-        Name of the worker. Workers of a `distributed.LocalCluster` are called 0, 1, 2.
+        Name of the worker. Workers of a `distributed.LocalCluster` are named 0, 1, 2.
     """
     count = len(list(Path("/proc/driver/nvidia/gpus").glob("*")))
     if count > 1 and isinstance(name, int):

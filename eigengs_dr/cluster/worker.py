@@ -1,8 +1,8 @@
-"""What runs on a worker: one task at a time, which leaves the process as it was.
+"""Execution of tasks on a worker: one at a time, each restoring the state of the process.
 
-Dask copies, prints and drops what tasks take and return, in threads of its own. If those were
-arrays of Dr.Jit, these threads would use Dr.Jit beside a task, and hang with it. So Dask sees
-bytes alone. The thread of the task makes values of them, and frees these.
+Dask copies, prints and drops the arguments and results of tasks in threads of its own. If those
+were Dr.Jit arrays, these threads would use Dr.Jit at the same time as a task, and hang. So Dask
+only sees bytes. The thread of the task unpickles and frees the values.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from ..backend.selection import BackendError, describe
 
 
 class Shared:
-    """What all tasks of a run use, as bytes, and as a value while a worker holds it.
+    """Data that all tasks of a run use, as bytes and, on a worker, as a cached value.
 
     Parameters
     ----------
     data : bytes
         The function and its second argument, from `distributed.protocol.pickle.dumps`.
     versions : dict of str to str
-        The versions that all workers of the run need.
+        The package versions that all workers of the run must have.
     """
 
     def __init__(self, data: bytes, versions: dict[str, str]) -> None:
@@ -47,7 +47,7 @@ class Shared:
         return Shared, (self.data, self.versions)
 
     def __sizeof__(self) -> int:
-        return len(self.data)  # Dask asks how much memory it holds
+        return len(self.data)  # Dask uses it as the memory of the object
 
     def __del__(self) -> None:
         with release_later(self.__dict__.pop("value", None)):  # Dask drops it in its own thread
@@ -55,14 +55,14 @@ class Shared:
 
 
 def share(data: bytes, versions: dict[str, str]) -> Shared:
-    """Begin a run on the first worker; the others need its LLVM.
+    """Begin a run on the first worker; the other workers must have the same LLVM.
 
     Parameters
     ----------
     data : bytes
         See `Shared`.
     versions : dict of str to str
-        Those of the client, from `package_versions`.
+        The versions of the client, from `package_versions`.
     """
     check_versions(versions)
     return Shared(data, versions | {"LLVM": _llvm_version()})
@@ -76,10 +76,10 @@ def run_task(task: bytes, shared: Shared) -> bytes:
     ClusterError
         If this worker has other versions than the rest of the run.
     Exception
-        What the function raises.
+        The exception of the function, if it raises one.
     """
     worker = get_worker()
-    with _unwatched(worker), limited_threads(worker.state.nthreads):
+    with _unprofiled(worker), limited_threads(worker.state.nthreads):
         check_versions(shared.versions)
         function, constant = shared.value
         try:
@@ -97,11 +97,11 @@ def _clear_frames(error: BaseException | None) -> None:
 
 
 @contextmanager
-def _unwatched(worker: Worker) -> Iterator[None]:
+def _unprofiled(worker: Worker) -> Iterator[None]:
     """Hide this thread from Dask's profiler during a block.
 
-    The profiler takes the frames of all tasks a hundred times a second. A function that returns
-    meanwhile leaves its variables to it, and so Dask's thread frees arrays of Dr.Jit.
+    The profiler accesses the frames of all tasks a hundred times per second. If a function returns
+    at that moment, the profiler keeps its variables, so that Dask's thread frees Dr.Jit arrays.
     """
     thread = threading.get_ident()
     with worker.active_threads_lock:
@@ -115,13 +115,14 @@ def _unwatched(worker: Worker) -> Iterator[None]:
 
 @contextmanager
 def limited_threads(count: int) -> Iterator[None]:
-    """Let BLAS and Dr.Jit use so many threads during a block, and Dr.Jit keep no memory after it.
+    """Limit the threads of BLAS and Dr.Jit during a block, then free Dr.Jit's cached memory.
 
-    The block is `exclusive`: numbers of threads belong to the process, as all workers in it do.
+    The block is `exclusive`, because thread counts apply to the process, which may hold several
+    workers.
 
-    Dr.Jit's pool ignores OMP variables and takes every core, so two workers would use each core
-    twice. It keeps freed memory for reuse, and a worker that Dask pauses for its memory, by default
-    at 80 % of its limit, would never go on.
+    Dr.Jit's pool ignores OMP variables and uses every core, so two workers would use each core
+    twice. It keeps freed memory for reuse, so that a worker that Dask pauses because of its memory,
+    by default at 80 % of its limit, would never continue.
     """
     import drjit as dr
 
@@ -136,7 +137,7 @@ def limited_threads(count: int) -> Iterator[None]:
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of packages that must be equal everywhere, for equal bits."""
+    """Return the versions of the packages that determine the bits of results."""
     return {name: version(name) for name in ("drjit", "numpy")}
 
 
@@ -148,25 +149,25 @@ def _llvm_version() -> str:
         return "none"
 
 
-def check_versions(wanted: dict[str, str]) -> None:
-    """Compare the versions of this worker with others.
+def check_versions(expected: dict[str, str]) -> None:
+    """Check that this worker has the expected versions.
 
     Parameters
     ----------
-    wanted : dict of str to str
-        From `package_versions`, and perhaps ``LLVM``.
+    expected : dict of str to str
+        From `package_versions`, optionally with ``LLVM``.
 
     Raises
     ------
     ClusterError
-        If one differs.
+        If a version differs.
     """
-    here = package_versions()
-    if "LLVM" in wanted:
-        here["LLVM"] = _llvm_version()
-    for name, needed in wanted.items():
-        if here[name] != needed:
+    installed = package_versions()
+    if "LLVM" in expected:
+        installed["LLVM"] = _llvm_version()
+    for name, needed in expected.items():
+        if installed[name] != needed:
             raise ClusterError(
-                f"worker {get_worker().address} has {name} {here[name]}, and the run began with "
-                f"{needed}; install equal versions"
+                f"worker {get_worker().address} has {name} {installed[name]}, and the run began "
+                f"with {needed}; install equal versions"
             )

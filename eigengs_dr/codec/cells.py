@@ -1,9 +1,9 @@
-"""The cells of Gaussians: their places on a Hilbert curve, or the cells without an order.
+"""The cells of Gaussians: their coding without an order, and their order on a Hilbert curve.
 
 Without an order, N Gaussians take ``log2(N!)`` bits less. A square is halved until its parts are
-single cells, once across and once along in turn. The number of Gaussians in a half, of n in both,
-follows a beta-binomial distribution: Gaussians of a fit keep their distance, so halves have more
-equal numbers than by chance. The counts of large parts also tell where Gaussians are dense.
+single cells, alternately in x and in y. The number of Gaussians in one half, of n in both, follows
+a beta-binomial distribution: Gaussians of a fit keep their distance, so that the numbers in the two
+halves are more equal than by chance. The counts of large parts also show where Gaussians are dense.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from ..backend.types import Integers
 from .range_coder import Coder, categorical
 
 EVENNESS = (1, 2, 4, 8, 16, 64)
-"""Parameters of the distribution that a file may name: 1 for any number, 64 nearly for halves."""
+"""Possible parameters of the distribution: 1 is uniform, 64 gives nearly equal halves."""
 
 MAX_MODELLED = 15
-"""Largest number of Gaussians whose halves have that distribution; larger ones are rare."""
+"""Largest number of Gaussians to which the distribution applies; larger numbers are rare."""
 
 
 def code_cells(coder: Coder, cells: Integers, levels: int, evenness: int) -> Integers:
@@ -30,9 +30,9 @@ def code_cells(coder: Coder, cells: Integers, levels: int, evenness: int) -> Int
     ----------
     coder : Encoder or Decoder
     cells : ndarray of int64, shape (N, 2)
-        Column and row of each cell; a decoder takes their number only.
+        Column and row of each cell; a decoder uses only their number.
     levels : int
-        The square has ``2^levels`` cells a side.
+        The square has ``2^levels`` cells per side.
     evenness : int
         One of `EVENNESS`.
 
@@ -52,7 +52,7 @@ def code_cells(coder: Coder, cells: Integers, levels: int, evenness: int) -> Int
 
 
 def _code_halves(coder: Coder, number: Integers, evenness: int, upper: Integers) -> Integers:
-    """Code how many of each `number` of Gaussians lie in the second half."""
+    """Code how many Gaussians of each `number` lie in the second half."""
     result = np.zeros_like(number)
     kind = np.where(number > MAX_MODELLED, 1, number)
     for n in range(1, MAX_MODELLED + 1):
@@ -69,14 +69,14 @@ def _any_number(coder: Coder, number: Integers, upper: Integers) -> Integers:
     if number.max() < 1 << 20:
         return coder.uniform(number + 1, upper)
     result, factor = np.zeros_like(number), 1
-    while factor <= number.max():  # digits of 16 bits; damaged ones are clipped
+    while factor <= number.max():  # 16-bit digits; damaged ones are clipped
         digit = upper // factor & 0xFFFF
         result += factor * coder.uniform(np.full(len(number), 1 << 16), digit)
         factor <<= 16
     return np.minimum(result, number)
 
 
-@cache  # a tree of cells asks for small n again and again
+@cache  # a tree of cells needs the models of small n repeatedly
 def _beta_binomial(n: int, evenness: int) -> stream.model.Model:
     """Return the model of the number of n Gaussians in a half."""
     chances = [1.0]
@@ -86,7 +86,7 @@ def _beta_binomial(n: int, evenness: int) -> stream.model.Model:
 
 
 def morton_encode(cells: Integers, levels: int) -> Integers:
-    """Return the bits of columns and rows (N, 2) in turn, highest first, as integers (N,)."""
+    """Return the interleaved bits of columns and rows (N, 2), highest first, as integers (N,)."""
     code = np.zeros(len(cells), np.int64)
     for level in range(levels):
         x, y = (cells >> level & 1).T
@@ -102,19 +102,19 @@ def morton_decode(codes: Integers, levels: int) -> Integers:
     return np.stack([x, y], axis=1)
 
 
-# The order in which a Hilbert curve visits the quarters of a square, by state: as it is (0), with
-# columns and rows swapped (1), with both counted from the other side (2), or both changes (3).
+# The order in which a Hilbert curve visits the quarters of a square, by state: unchanged (0), with
+# columns and rows swapped (1), with both reversed (2), or with both changes (3).
 _RIGHT = np.array([[0, 0, 1, 1], [0, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 1]])
 
 _STATE = np.arange(4, dtype=np.int8)[:, None] ^ np.array([1, 0, 0, 3], np.int8)
 """The state of the curve inside each quarter, in the order of the curve."""
 
 _PLACE = np.argsort(2 * _RIGHT + _RIGHT[[1, 0, 3, 2]], axis=1)
-"""The place in this order of the quarter in column ``right`` and row ``low``, by state and
+"""Position in this order of the quarter in column ``right`` and row ``low``, by state and
 ``2 right + low``."""
 
 MAX_LEVELS = 24
-"""Largest number of levels of `hilbert_encode`; an index then fits 48 bits."""
+"""Largest number of levels of `hilbert_encode`; an index then fits into 48 bits."""
 
 
 def hilbert_encode(points: Integers, levels: int) -> Integers:

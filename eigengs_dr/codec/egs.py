@@ -3,8 +3,8 @@
 All numbers are little endian. The file starts with a header (`_HEADER`), the background and a
 checksum; the header of a set with maps is followed by their table.
 
-The sections follow, each coded for itself. A section starts with its number of Gaussians, its
-length and its checksum (`HEAD`). Its body holds a byte (`RICH` and an index in `EVENNESS`), the
+The sections follow, each coded separately. A section starts with its number of Gaussians, its
+length and its checksum (`HEAD`). Its body holds a byte (`RICH` and an index into `EVENNESS`), the
 weights of a model (`eigengs_dr.codec.weights`), and the words of a range coder: the cells
 (`eigengs_dr.codec.cells`), then all other integers (`eigengs_dr.codec.gaussian_model`).
 """
@@ -39,8 +39,8 @@ from .range_coder import Decoder, Encoder
 SUFFIX = ".egs"
 
 VERSION, MAPS_VERSION = 3, 4
-"""Versions of the format, for a set without maps and with a table of maps. Versions 1
-and 2, of packages before release, are not read."""
+"""Versions of the format, for a set without maps and with a table of maps. Versions 1 and 2 were
+never released, and are not read."""
 
 MAX_SECTIONS = 1 << 12
 
@@ -49,16 +49,16 @@ _HEADER = struct.Struct("<4sBBBBHIIiiffd")
 and row of the first cell, the steps, and the cutoff."""
 
 _MAP = struct.Struct("<BBBd")
-"""A map in the table, before its name; see `_map_table`."""
+"""An entry of the table of maps, without its name; see `_map_table`."""
 
 HEAD = struct.Struct("<III")
 """Number of Gaussians, number of bytes that follow, and the CRC-32 of that number and the bytes."""
 
 DECODING, DECODING_CHANNEL = 384, 20
-"""Bytes of memory that decoding takes for a Gaussian, and for each of its channels: measured."""
+"""Memory that decoding takes in bytes, per Gaussian and for each of its channels, as measured."""
 
 RICH = 0x80
-"""Flag of a section that stores all weights, not only the first ones."""
+"""Flag of a section that stores all weights, not just the first ones."""
 
 
 class EgsContent(NamedTuple):
@@ -77,8 +77,8 @@ class EgsContent(NamedTuple):
     cutoff : float
         Radius of a Gaussian in standard deviations.
     maps : tuple of TextureMap
-        The maps of a set, whose colours and background are multiplied by their weights; empty
-        for an image.
+        The maps of a set, whose colours and background are multiplied by their weights; empty for
+        an image.
     """
 
     sections: list[Symbols]
@@ -91,21 +91,21 @@ class EgsContent(NamedTuple):
 
     def set_data(self) -> SetData:
         """Return the set, in single precision."""
-        values = {**dequantize(self.whole(), self.steps), "background": self.background}
+        values = {**dequantize(self.all_symbols(), self.steps), "background": self.background}
         with np.errstate(over="ignore"):
             arrays = {name: value.astype(np.float32) for name, value in values.items()}
         scale = np.array(channel_weights(self.maps) or 1, np.float32)
         arrays |= {name: arrays[name] / scale for name in ("color", "background")}
         return SetData(arrays, self.size, self.space, self.cutoff, self.maps)
 
-    def whole(self) -> Symbols:
+    def all_symbols(self) -> Symbols:
         """Return the Gaussians of all sections."""
         return Symbols(*map(np.concatenate, zip(*self.sections, strict=True)))
 
 
 def to_bytes(packed: EgsContent) -> bytes:
-    """Return the bytes of a file; sort the Gaussians of each section in Hilbert-curve order."""
-    cells = packed.whole().cell
+    """Return the bytes of a file, with the Gaussians of each section in Hilbert-curve order."""
+    cells = packed.all_symbols().cell
     corner = cells.min(axis=0)
     levels = int((cells - corner).max()).bit_length()
     head = _HEADER.pack(
@@ -132,9 +132,9 @@ def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
     Raises
     ------
     ValueError
-        If `Gaussians.load` would refuse the set.
+        If `Gaussians.load` would reject the set.
     OSError
-        If the file cannot be written; an existing file then stays unchanged.
+        If the file cannot be written; an existing file does not change.
     """
     try:
         check(packed.set_data())
@@ -146,10 +146,10 @@ def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
 
 
 def _map_table(maps: Sequence[TextureMap]) -> bytes:
-    """Return the table of maps; nothing for an image.
+    """Return the table of maps; empty for an image.
 
-    A byte holds the number of maps. Each map has the length of its name, the index of its space,
-    its number of channels (a byte each), its weight (float64), and its name in ASCII.
+    The first byte is the number of maps. Each map has the length of its name, the index of its
+    space and its number of channels (one byte each), its weight (float64), and its name in ASCII.
     """
     parts = [bytes([len(maps)])] if maps else []
     for m in maps:
@@ -159,7 +159,7 @@ def _map_table(maps: Sequence[TextureMap]) -> bytes:
 
 
 def section_to_bytes(section: Symbols, steps: Steps, corner: Integers, levels: int) -> bytes:
-    """Return the bytes of a section; sort its Gaussians in Hilbert-curve order.
+    """Return the bytes of a section, with its Gaussians in Hilbert-curve order.
 
     Parameters
     ----------
@@ -171,30 +171,30 @@ def section_to_bytes(section: Symbols, steps: Steps, corner: Integers, levels: i
         The square of cells has ``2^levels`` columns and rows.
     """
     cells, count = section.cell - corner, len(section.cell)
-    # Gaussians in one cell are sorted too, so that equal sets in any order give equal files.
-    rest = np.column_stack(section[1:])
-    order = np.lexsort([*rest.T[::-1], hilbert_encode(cells, levels)])
-    given = section._replace(cell=cells).select(order)
+    # Gaussians in one cell are sorted too, so that the order of the set does not change the file.
+    numbers = np.column_stack(section[1:])
+    order = np.lexsort([*numbers.T[::-1], hilbert_encode(cells, levels)])
+    symbols = section._replace(cell=cells).select(order)
     evenness = min(range(len(EVENNESS)), key=lambda k: len(_cells(cells, levels, k).to_bytes()))
-    ways = [True, False] if count < weights.SMALL else [True]
-    body = min((_body(given, steps, levels, evenness, rich) for rich in ways), key=len)
-    body = body.ljust(count, b"\0")  # a reader expects a byte for a Gaussian, or more
+    choices = [True, False] if count < weights.MIN_RICH_COUNT else [True]
+    body = min((_body(symbols, steps, levels, evenness, rich) for rich in choices), key=len)
+    body = body.ljust(count, b"\0")  # a reader expects at least one byte per Gaussian
     return HEAD.pack(count, len(body), section_check(count, body)) + body
 
 
 def _cells(cells: Integers, levels: int, evenness: int) -> Encoder:
-    """Return an encoder that has coded cells, with one of the parameters `EVENNESS`."""
+    """Return an encoder that has coded cells with the given entry of `EVENNESS`."""
     coder = Encoder()
     code_cells(coder, cells, levels, EVENNESS[evenness])
     return coder
 
 
-def _body(given: Symbols, steps: Steps, levels: int, evenness: int, rich: bool) -> bytes:
-    """Return the body of a section, with all weights or with the first ones."""
-    coder = _cells(given.cell, levels, evenness)
-    walk = GaussianCoder(coder, given.cell, rich=rich)
-    walk.code(given, steps)
-    head = bytes([evenness | RICH * rich]) + weights.to_bytes(walk.model, rich)
+def _body(symbols: Symbols, steps: Steps, levels: int, evenness: int, rich: bool) -> bytes:
+    """Return the body of a section, with all weights or only the first ones."""
+    coder = _cells(symbols.cell, levels, evenness)
+    gaussian_coder = GaussianCoder(coder, symbols.cell, rich=rich)
+    gaussian_coder.code(symbols, steps)
+    head = bytes([evenness | RICH * rich]) + weights.to_bytes(gaussian_coder.model, rich)
     return head + coder.to_bytes()
 
 
@@ -204,7 +204,7 @@ def section_check(count: int, body: bytes) -> int:
 
 
 def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsContent:
-    """Read a packed set; the file may be hostile.
+    """Read a packed set; the file need not be trusted.
 
     Parameters
     ----------
@@ -219,8 +219,8 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
     Raises
     ------
     ValueError
-        If the file is no packed set, is damaged, cut off or newer than this package, or has fewer
-        sections.
+        If the file is not a packed set, is damaged, truncated or newer than this package, or has
+        fewer sections.
     OSError
         If the file cannot be opened.
     """
@@ -249,13 +249,13 @@ def read_set(path: Path, sections: int | None = None) -> SetData:
 
 
 def maps_of(path: str | os.PathLike[str]) -> tuple[TextureMap, ...]:
-    """Return the maps of a packed set, without its Gaussians; errors as `read`."""
+    """Return the maps of a packed set, without its Gaussians; errors as for `read`."""
     with _opened(path) as file:
         return _read_header(file)[3].maps
 
 
 def section_counts(path: str | os.PathLike[str]) -> list[int]:
-    """Return the number of Gaussians of each section, without decoding them; errors as `read`."""
+    """Return the number of Gaussians per section, without decoding them; errors as for `read`."""
     with _opened(path) as file:
         _, count, *_ = _read_header(file)
         return [read_body(file, k + 1)[1] for k in range(count)]
@@ -263,7 +263,7 @@ def section_counts(path: str | os.PathLike[str]) -> list[int]:
 
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a file, which errors name."""
+    """Open a file, and put its name into errors."""
     with open(path, "rb") as file:
         try:
             yield file
@@ -272,14 +272,14 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
-    """Return the levels, the number of sections, the first cell, and a content without sections.
+    """Return the levels, the number of sections, the first cell, and the content without sections.
 
-    Headers that `to_bytes` never writes are refused; `Gaussians.load` checks the rest.
+    Headers that `to_bytes` never writes are rejected; `Gaussians.load` checks the rest.
     """
     head = exactly(file, _HEADER.size)
     magic, version, space, channels, levels, count, *rest = _HEADER.unpack(head)
     if magic != MAGIC:
-        raise BadValue("not a packed set of Gaussians; it may be damaged or something else")
+        raise BadValue("not a packed set of Gaussians; it may be damaged or of another kind")
     if version not in (VERSION, MAPS_VERSION):
         raise BadValue(
             f"version is {version}, but this package reads versions {VERSION} and {MAPS_VERSION}; "
@@ -325,12 +325,12 @@ def read_body(file: BinaryIO, number: int) -> tuple[bytes, int]:
     Raises
     ------
     BadValue
-        If the section is cut off or damaged.
+        If the section is truncated or damaged.
     """
     splats, length, check = HEAD.unpack(exactly(file, HEAD.size))
     if length > os.fstat(file.fileno()).st_size - file.tell():
-        raise BadValue(f"section {number} is cut off; copy the file again")
-    # Every Gaussian takes at least one byte, so the length of the file bounds the memory.
+        raise BadValue(f"section {number} is truncated; copy the file again")
+    # Every Gaussian takes at least one byte, so the size of the file bounds the memory.
     if not 1 <= splats <= length:
         raise BadValue(
             f"section {number} claims {splats} Gaussians in {length} bytes; copy the file again"
@@ -342,23 +342,24 @@ def read_body(file: BinaryIO, number: int) -> tuple[bytes, int]:
 
 
 def decode_body(body: bytes, splats: int, channels: int, levels: int, steps: Steps) -> Symbols:
-    """Return the Gaussians of a section; the body may be hostile although the checksum is right.
+    """Return the Gaussians of a section; the body need not be trusted, despite the checksum.
 
     Raises
     ------
     BadValue
-        If the body is none that `section_to_bytes` writes.
+        If `section_to_bytes` cannot have written the body.
     """
     rich, evenness = bool(body[0] & RICH), body[0] & ~RICH
     if evenness >= len(EVENNESS):
         raise BadValue("the first byte is unknown")
     model, codes = weights.from_bytes(body[1:], channels, rich)
-    coder = Decoder(codes[: len(codes) // 4 * 4])  # a short body is filled up with bytes
-    with np.errstate(all="ignore"):  # the weights may be hostile
-        one, two = np.zeros(splats, np.int64), np.zeros((splats, 2), np.int64)
-        cells = code_cells(coder, two, levels, EVENNESS[evenness])
+    coder = Decoder(codes[: len(codes) // 4 * 4])  # a short body is padded
+    with np.errstate(all="ignore"):  # the weights are not trusted
+        scalars, pairs = np.zeros(splats, np.int64), np.zeros((splats, 2), np.int64)
+        cells = code_cells(coder, pairs, levels, EVENNESS[evenness])
         cells = cells[np.argsort(hilbert_encode(cells, levels), kind="stable")]
-        unknown = Symbols(cells, two, np.zeros((splats, channels), np.int64), one, one, one)
+        colors = np.zeros((splats, channels), np.int64)
+        unknown = Symbols(cells, pairs, colors, scalars, scalars, scalars)
         return GaussianCoder(coder, cells, model).code(unknown, steps)
 
 
@@ -366,5 +367,5 @@ def exactly(file: BinaryIO, count: int) -> bytes:
     """Read `count` bytes, or raise BadValue."""
     data = file.read(count)
     if len(data) < count:
-        raise BadValue("the file is cut off; copy it again")
+        raise BadValue("the file is truncated; copy it again")
     return data

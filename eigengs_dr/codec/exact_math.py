@@ -1,7 +1,7 @@
-"""Elementary functions with the same bits on every machine.
+"""Elementary functions whose results are bit-identical on every machine.
 
-The decoder of a range coder must find the very numbers that the encoder found. Libraries of
-mathematics round exponentials and angles differently. The functions here use only sums, products,
+The decoder of a range coder must compute exactly the same numbers as the encoder. Mathematical
+libraries round exponentials and angles differently. The functions here use only sums, products,
 quotients, square roots and shifts of exponents, which IEEE 754 rounds correctly everywhere.
 """
 
@@ -38,7 +38,7 @@ _SIN = (
 
 
 def in_order(rows: Doubles) -> Doubles:
-    """Return the sum of rows (K, n), one after another, as libraries do not promise."""
+    """Return the sum of rows (K, n), added one after another, which libraries do not guarantee."""
     total = np.zeros(rows.shape[1])
     for row in rows:
         total = total + row
@@ -48,12 +48,12 @@ def in_order(rows: Doubles) -> Doubles:
 def exp2(x: Doubles) -> Doubles:
     """Return ``2^x`` with a relative error of 1e-11; x is clipped to +-1000."""
     x = np.clip(x, -1000.0, 1000.0)
-    whole = np.rint(x)
-    return np.ldexp(_polynomial(_EXP2, x - whole), whole.astype(np.int32))
+    integer = np.rint(x)
+    return np.ldexp(_polynomial(_EXP2, x - integer), integer.astype(np.int32))
 
 
 def log2(x: Doubles) -> Doubles:
-    """Return the logarithm to base 2 of numbers above 0 with an error of 1e-10."""
+    """Return the base-2 logarithm of positive numbers with an error of 1e-10."""
     mantissa, exponent = np.frexp(x)
     low = mantissa < 0.7071067811865476
     mantissa, exponent = np.where(low, 2 * mantissa, mantissa), exponent - low
@@ -76,8 +76,8 @@ def cos_turns(x: Doubles) -> Doubles:
 
 def angle_in_turns(y: Doubles, x: Doubles) -> Doubles:
     """Return the angle of (x, y) in turns, in [-0.5, 0.5], with an error of 1e-10."""
-    far, near = np.maximum(np.abs(x), np.abs(y)), np.minimum(np.abs(x), np.abs(y))
-    t = near / np.where(far > 0, far, 1.0)
+    larger, smaller = np.maximum(np.abs(x), np.abs(y)), np.minimum(np.abs(x), np.abs(y))
+    t = smaller / np.where(larger > 0, larger, 1.0)
     for _ in range(2):  # tan(a / 2) from tan(a), twice
         t = t / (1 + np.sqrt(1 + t * t))
     terms = [(-1) ** k / (2 * k + 1) for k in range(12)]  # for t up to tan(pi / 16)

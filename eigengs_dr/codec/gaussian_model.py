@@ -1,14 +1,14 @@
-"""The probabilities of the integers of a Gaussian, given those that are decoded before.
+"""The probabilities of the integers of a Gaussian, given those that were decoded before.
 
 A number is predicted by a weighted sum of features: its mean over neighbours, other numbers of the
-same Gaussian, and how near other Gaussians are. Another weighted sum, of features above 0, gives
-the width of the distribution of the error. The encoder finds the weights by least squares and
-stores them in the file. Chroma follows luma and the other chroma by the slope that the neighbours
-have: this saves a third of the bits of chroma.
+same Gaussian, and the density of Gaussians. Another weighted sum, of positive features, gives the
+width of the distribution of the error. The encoder fits the weights by least squares and stores
+them in the file. Chroma is predicted from luma and from the other chroma by the regression slope of
+the neighbours, which saves a third of the bits of chroma.
 
 Gaussians are in the order of a Hilbert curve through their cells. Their parameters are coded in
-passes: every 16th Gaussian, then those half way between, and so on. So each Gaussian but the first
-ones has known neighbours on both sides, and a pass takes few calls. All numbers here are the same
+passes: every 16th Gaussian, then those halfway between, and so on. So each Gaussian, except in the
+first pass, has known neighbours on both sides, and a pass takes few calls. All numbers are the same
 on every machine, see `eigengs_dr.codec.exact_math`.
 """
 
@@ -36,13 +36,13 @@ from .range_coder import Coder, categorical
 from .weights import CLASSES, MIN_WIDTH, Model, Weights, fit_weights
 
 STRIDES = (8, 4, 2, 1)
-"""Distances of the passes after the first one, along the curve."""
+"""Distances along the curve, in Gaussians, of the passes after the first one."""
 
-PLACES = np.array([-3, -1, 1, 3])
-"""Known neighbours, in strides."""
+NEIGHBOUR_OFFSETS = np.array([-3, -1, 1, 3])
+"""Positions of the known neighbours, in strides."""
 
-COARSE = 16
-"""Bound of the number of squares for each Gaussian, where a window counts Gaussians."""
+MAX_SQUARES_PER_GAUSSIAN = 16
+"""Largest number of squares per Gaussian in the grid that counts Gaussians."""
 
 
 class Pass(NamedTuple):
@@ -54,7 +54,7 @@ class Pass(NamedTuple):
     known : ndarray of int64, shape (K, n)
         Neighbours that earlier passes coded; none in the first pass.
     weight : ndarray of float64, shape (K, n)
-        Weights of the neighbours, whose sum is 1: they fall with the square of the distance.
+        Weights of the neighbours, with sum 1: inverse to the square of the distance.
     """
 
     rows: Integers
@@ -62,36 +62,36 @@ class Pass(NamedTuple):
     weight: Doubles
 
     def mean(self, values: Doubles) -> Doubles:
-        """Return the weighted means of values (N,) of the neighbours, shape (n,)."""
+        """Return the weighted means, shape (n,), of the values (N,) of the neighbours."""
         return in_order(self.weight * values[self.known])
 
 
 def passes_of(cells: Integers) -> list[Pass]:
-    """Divide Gaussians, in the order of the curve, into passes; cells have the shape (N, 2)."""
+    """Divide Gaussians, in the order of the curve, into passes; the cells have shape (N, 2)."""
     index = np.arange(len(cells))
     first = index[:: 2 * STRIDES[0]]
     passes = [Pass(first, np.zeros((0, len(first)), np.int64), np.zeros((0, len(first))))]
     for stride in STRIDES:
         rows = index[stride :: 2 * stride]
-        other = rows + stride * PLACES[:, None]
-        inside = (other >= 0) & (other < len(cells))
-        other = np.clip(other, 0, len(cells) - 1)
-        near = np.where(inside, 1 / (squared_distance(cells[rows], cells[other]) + 1), 0)
-        passes.append(Pass(rows, other, near / in_order(near)))
-    return [found for found in passes if len(found.rows)]
+        known = rows + stride * NEIGHBOUR_OFFSETS[:, None]
+        inside = (known >= 0) & (known < len(cells))
+        known = np.clip(known, 0, len(cells) - 1)
+        weight = np.where(inside, 1 / (squared_distance(cells[rows], cells[known]) + 1), 0)
+        passes.append(Pass(rows, known, weight / in_order(weight)))
+    return [part for part in passes if len(part.rows)]
 
 
 def squared_distance(one: Integers, other: Integers) -> Doubles:
-    """Return the squares of the distances of cells, shape (..., 2)."""
-    away = (one - other).astype(np.float64)
-    return away[..., 0] * away[..., 0] + away[..., 1] * away[..., 1]
+    """Return the squared distances of cells, shape (..., 2)."""
+    difference = (one - other).astype(np.float64)
+    return difference[..., 0] * difference[..., 0] + difference[..., 1] * difference[..., 1]
 
 
 def crowding(cells: Integers) -> list[Doubles]:
-    """Return logarithms, shape (N,), that tell how near other Gaussians are.
+    """Return logarithms, shape (N,), that measure the density of Gaussians.
 
-    The numbers of Gaussians in a small and in a large window, and the square of the distance to the
-    nearer neighbour along the curve.
+    These are of the numbers of Gaussians in a small and in a large window, and of the squared
+    distance to the nearer neighbour along the curve.
     """
     counts = [_count(cells - cells.min(axis=0), reach) for reach in (1, 2)]
     ends = np.pad(squared_distance(cells[1:], cells[:-1]), 1, constant_values=np.inf)
@@ -102,7 +102,8 @@ def crowding(cells: Integers) -> list[Doubles]:
 def _count(cells: Integers, reach: int) -> Doubles:
     """Count Gaussians in windows of ``2 reach + 1`` squares, of ``2^reach`` cells or more."""
     shift, side = reach, 2 * reach + 1
-    while int(np.prod((cells.max(axis=0) >> shift) + 1)) > COARSE * len(cells) + 256:
+    limit = MAX_SQUARES_PER_GAUSSIAN * len(cells) + 256
+    while int(np.prod((cells.max(axis=0) >> shift) + 1)) > limit:
         shift += 1
     x, y = (cells >> shift).T
     grid = np.zeros((int(y.max()) + side + 1, int(x.max()) + side + 1), np.int64)
@@ -113,22 +114,23 @@ def _count(cells: Integers, reach: int) -> Doubles:
 
 
 SECTORS = 16
-"""Number of sectors; Gaussians with fewer directions have no sectors."""
+"""Number of sectors of directions; Gaussians with fewer directions have no sectors."""
 
 LENGTHS, AGREEMENTS = (0.5, 1.0), (0.1, 0.25, 0.5, 1.0)
-"""Bounds of the classes: by the stretch l, and by the mean vector of the neighbours."""
+"""Bounds of the classes of directions: by the stretch l, and by the length of the mean vector of
+the neighbours."""
 
-SHARPNESS = 16
-"""A class stores its sharpness times this number, in a byte."""
+SHARPNESS_SCALE = 16
+"""Factor of the sharpness of a class as it is stored, in a byte."""
 
 
 class Directions:
-    """Coding of the directions of all Gaussians of a section, which are near those of neighbours.
+    """Coding of the directions of all Gaussians of a section, relative to those of neighbours.
 
-    A direction is one of K, and K depends on the Gaussian. The full turn has 16 sectors; the
-    direction of the neighbours is in the middle of sector 0. A sector has a probability that falls
-    with its distance from sector 0, faster for long Gaussians and for neighbours that agree. In a
-    sector, all directions have one probability.
+    A Gaussian has one of K directions, where K depends on the Gaussian. The full turn is divided
+    into 16 sectors; the direction of the neighbours is in the middle of sector 0. The probability
+    of a sector decreases with its distance from sector 0, faster for elongated Gaussians and for
+    neighbours that agree. Within a sector, all directions are equally probable.
 
     Parameters
     ----------
@@ -136,7 +138,7 @@ class Directions:
     length : ndarray of float64, shape (N,)
         Stretches l.
     turns : ndarray of int64, shape (N,)
-        Numbers of directions.
+        Number of directions of each Gaussian.
     """
 
     def __init__(self, passes: list[Pass], length: Doubles, turns: Integers) -> None:
@@ -148,36 +150,37 @@ class Directions:
         result = np.zeros_like(self.turns)
         for part in self.passes:
             rows, turns = part.rows, self.turns[part.rows]
-            ahead, label = self._look(part)
-            away = _code_pass(coder, turns, label, sharpness, (given[rows] - ahead) % turns)
-            result[rows] = (away + ahead) % turns
-            self._learn(rows, result[rows])
+            predicted, label = self._predict(part)
+            offset = _code_pass(coder, turns, label, sharpness, (given[rows] - predicted) % turns)
+            result[rows] = (offset + predicted) % turns
+            self._update(rows, result[rows])
         return result
 
     def fit(self, given: Integers) -> Integers:
-        """Return the sharpness of each class for which directions take the fewest bits."""
-        self._learn(np.arange(len(given)), given)
+        """Return the sharpness of each class with which directions take the fewest bits."""
+        self._update(np.arange(len(given)), given)
         chances = np.stack([sector_chances(k) for k in range(256)])
         bits = -np.log2(chances / chances.sum(axis=1, keepdims=True))
         counts = np.zeros((CLASSES, SECTORS))
         for part in self.passes:
-            ahead, label = self._look(part)
+            predicted, label = self._predict(part)
             turns = self.turns[part.rows]
-            many = turns >= SECTORS
-            sector = _sector((given[part.rows] - ahead) % turns, turns)
-            np.add.at(counts, (label[many], sector[many]), 1)
+            has_sectors = turns >= SECTORS
+            sector = _sector((given[part.rows] - predicted) % turns, turns)
+            np.add.at(counts, (label[has_sectors], sector[has_sectors]), 1)
         return np.asarray((counts @ bits.T).argmin(axis=1))
 
-    def _learn(self, rows: Integers, turn: Integers) -> None:
+    def _update(self, rows: Integers, turn: Integers) -> None:
+        """Store the direction vectors of coded Gaussians."""
         angle, length = turn / self.turns[rows], self.length[rows]
         self.u[rows], self.v[rows] = length * cos_turns(angle), length * sin_turns(angle)
 
-    def _look(self, part: Pass) -> tuple[Integers, Integers]:
-        """Return the directions of the neighbours of a pass, and the classes."""
+    def _predict(self, part: Pass) -> tuple[Integers, Integers]:
+        """Return the mean directions of the neighbours of a pass, and the classes."""
         u, v = part.mean(self.u), part.mean(self.v)
-        ahead = np.rint(angle_in_turns(v, u) * self.turns[part.rows]).astype(np.int64)
+        predicted = np.rint(angle_in_turns(v, u) * self.turns[part.rows]).astype(np.int64)
         label = np.digitize(self.length[part.rows], LENGTHS) * (len(AGREEMENTS) + 1)
-        return ahead, label + np.digitize(np.sqrt(u * u + v * v), AGREEMENTS)
+        return predicted, label + np.digitize(np.sqrt(u * u + v * v), AGREEMENTS)
 
 
 def _code_pass(
@@ -185,11 +188,11 @@ def _code_pass(
 ) -> Integers:
     """Code directions relative to those of the neighbours."""
     sector, few = np.zeros_like(turns), turns < SECTORS
-    wanted = _sector(given, turns)
+    given_sector = _sector(given, turns)
     for label in np.unique(labels[~few]):
         rows = np.flatnonzero((labels == label) & ~few)
         model = categorical(sector_chances(int(sharpness[label])))
-        sector[rows] = coder.code(model, wanted[rows])
+        sector[rows] = coder.code(model, given_sector[rows])
     first = np.where(few, 0, _first(sector, turns))
     last = np.where(few, turns, _first(sector + 1, turns))
     place = np.where(few, given, (given - first) % turns)
@@ -202,22 +205,22 @@ def _sector(turn: Integers, turns: Integers) -> Integers:
 
 
 def _first(sector: Integers, turns: Integers) -> Integers:
-    """Return the first direction of a sector; of sector 0, it is before that of the neighbours."""
+    """Return the first direction of a sector; that of sector 0 is below 0."""
     return -(-(2 * sector - 1) * turns // (2 * SECTORS))
 
 
 def sector_chances(sharpness: int) -> Doubles:
-    """Return the probabilities of the sectors, up to a factor: highest at 0."""
-    away = np.minimum(np.arange(SECTORS), SECTORS - np.arange(SECTORS)) * 0.25
-    return np.asarray(1 / (1 + sharpness / SHARPNESS * away * away))
+    """Return the probabilities of the sectors, up to a factor; sector 0 has the highest."""
+    distance = np.minimum(np.arange(SECTORS), SECTORS - np.arange(SECTORS)) * 0.25
+    return np.asarray(1 / (1 + sharpness / SHARPNESS_SCALE * distance * distance))
 
 
 Features = Callable[[Pass], tuple[Doubles, Doubles]]
-"""The features of centres and of widths, shape (F, n), for the n Gaussians of a pass."""
+"""Returns the features of centres and of widths, shape (F, n), for the n Gaussians of a pass."""
 
 
 class GaussianCoder:
-    """Coding of all numbers of the Gaussians of a section but their cells.
+    """Coding of all numbers of the Gaussians of a section, except their cells.
 
     Parameters
     ----------
@@ -225,9 +228,9 @@ class GaussianCoder:
     cells : ndarray of int64, shape (N, 2)
         In the order of the curve.
     model : Model, optional
-        None for an encoder, which finds one; the attribute `model` then holds it.
+        None for an encoder, which fits a model and stores it in the attribute `model`.
     rich : bool, optional
-        Whether the encoder may use all features.
+        Whether the encoder uses all features.
     """
 
     def __init__(
@@ -236,18 +239,18 @@ class GaussianCoder:
         self.coder, self.cells, self.rich = coder, cells, rich
         self.known, self.model = iter(model.weights) if model else None, model or Model()
         self.passes, self.crowding = passes_of(cells), crowding(cells)
-        self.values = np.zeros(len(cells))  # of the kind that is being coded, as far as known
+        self.values = np.zeros(len(cells))  # known values of the kind that is being coded
 
     def code(self, given: Symbols, steps: Steps) -> Symbols:
-        """Code the numbers; a decoder takes their shapes only."""
-        color, one = np.zeros_like(given.color), np.ones(len(self.cells))
+        """Code the numbers; a decoder uses only their shapes."""
+        color, ones = np.zeros_like(given.color), np.ones(len(self.cells))
         for k, values in enumerate(given.color.T):
-            color[:, k] = self._numbers(partial(self._color_features, color, k), one, values)
+            color[:, k] = self._numbers(partial(self._color_features, color, k), ones, values)
         fineness = precision(color)
-        bright, step = log2(fineness), SCALE_STEP / fineness
-        scale = self._numbers(partial(self._scale_features, bright, step), step, given.scale)
+        log_fineness, step = log2(fineness), SCALE_STEP / fineness
+        scale = self._numbers(partial(self._scale_features, log_fineness, step), step, given.scale)
         s, step = scale * step, STRETCH_STEP / fineness
-        features = partial(self._stretch_features, bright, s, step)
+        features = partial(self._stretch_features, log_fineness, s, step)
         stretch = self._numbers(features, step, given.stretch)
         length = stretch * step
         directions = Directions(self.passes, length, turns_of(length, fineness))
@@ -273,38 +276,38 @@ class GaussianCoder:
         return result
 
     def _fit(self, features: Features, step: Doubles, given: Integers) -> Weights:
-        """Find the weights for numbers that are all known, and note them in the model."""
+        """Fit the weights to numbers that are all known, and store them in the model."""
         self.values = given * step
-        both = zip(*(features(part) for part in self.passes), strict=True)
-        center, width = (np.ascontiguousarray(np.concatenate(kind, axis=1).T) for kind in both)
+        pairs = zip(*(features(part) for part in self.passes), strict=True)
+        center, width = (np.ascontiguousarray(np.concatenate(kind, axis=1).T) for kind in pairs)
         order = np.concatenate([part.rows for part in self.passes])
-        found = fit_weights(center, width, self.values[order], step[order], self.rich)
-        self.model.weights.append(found)
-        return found
+        weights = fit_weights(center, width, self.values[order], step[order], self.rich)
+        self.model.weights.append(weights)
+        return weights
 
     def _color_features(self, color: Integers, k: int, part: Pass) -> tuple[Doubles, Doubles]:
-        """Return the features of channel k: the channel near by, and the two channels before it."""
-        rows, here = part.rows, self.values
-        center, width = [part.mean(here)], [np.ones(len(rows)), part.mean(np.abs(here))]
+        """Return the features of channel k: its neighbours, and the two channels before it."""
+        rows, values = part.rows, self.values
+        center, width = [part.mean(values)], [np.ones(len(rows)), part.mean(np.abs(values))]
         for other in color.T[max(0, k - 2) : k].astype(np.float64):
-            slope = part.mean(other * here) / (part.mean(other * other) + 1)
+            slope = part.mean(other * values) / (part.mean(other * other) + 1)
             center += [other[rows], slope * other[rows]]
             width += [np.abs(other[rows]), np.abs(part.mean(other))]
         return np.stack(center), np.stack([*width, *(near[rows] for near in self.crowding[:2])])
 
     def _scale_features(
-        self, bright: Doubles, step: Doubles, part: Pass
+        self, log_fineness: Doubles, step: Doubles, part: Pass
     ) -> tuple[Doubles, Doubles]:
-        """Return the features of s: small Gaussians are where many are."""
-        rows, one = part.rows, np.ones(len(part.rows))
-        center = [one, bright[rows], *(near[rows] for near in self.crowding)]
-        center += [part.mean(self.values), part.mean(bright)]
-        return np.stack(center), np.stack([one, step[rows]])
+        """Return the features of s: Gaussians are small where they are dense."""
+        rows, ones = part.rows, np.ones(len(part.rows))
+        center = [ones, log_fineness[rows], *(near[rows] for near in self.crowding)]
+        center += [part.mean(self.values), part.mean(log_fineness)]
+        return np.stack(center), np.stack([ones, step[rows]])
 
     def _stretch_features(
-        self, bright: Doubles, s: Doubles, step: Doubles, part: Pass
+        self, log_fineness: Doubles, s: Doubles, step: Doubles, part: Pass
     ) -> tuple[Doubles, Doubles]:
         """Return the features of l."""
-        rows, one = part.rows, np.ones(len(part.rows))
-        center = [one, bright[rows], s[rows], self.crowding[1][rows], part.mean(self.values)]
-        return np.stack(center), np.stack([one, step[rows]])
+        rows, ones = part.rows, np.ones(len(part.rows))
+        center = [ones, log_fineness[rows], s[rows], self.crowding[1][rows], part.mean(self.values)]
+        return np.stack(center), np.stack([ones, step[rows]])

@@ -1,4 +1,4 @@
-"""The function `pack`, which writes the smallest file within a loss of PSNR."""
+"""The function `pack`, which writes the smallest file within an allowed loss of PSNR."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..backend.doors import door
 from ..fitting.fit import Fit
 from ..fitting.maps import Map, read_maps
 from ..fitting.objective import values_in
-from ..gaussian.channels import TextureMap, channel_weights, show_sums, slices
+from ..gaussian.channels import TextureMap, channel_weights, display_values, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
 from ..image.io import check_data, check_image
@@ -30,10 +30,10 @@ from .rounding import MIN_MSE, Comparison, planes_of, round_within
 Array = NDArray[np.floating]
 
 BUDGET = 0.5
-"""Loss of PSNR by default, in dB. For a larger loss, fewer Gaussians save more bits."""
+"""Default loss of PSNR in dB. For a larger loss, using fewer Gaussians saves more bits."""
 
 MSE_WITHOUT_IMAGE = 1e-4
-"""Mean squared error that `pack` assumes for a set if it has no image: 40 dB."""
+"""Mean squared error of a set that `pack` assumes if it gets no image: 40 dB."""
 
 
 class PackResult(NamedTuple):
@@ -50,7 +50,7 @@ class PackResult(NamedTuple):
     psnr : float, or dict of str to float
         PSNR of the rendering of the rounded set in dB, in the space of the budget, against the
         image; without an image, against the rendering of the set before rounding. For maps, the
-        psnr_rgb of each by its name.
+        psnr_rgb of each by name.
     psnr_drop : float
         Loss of PSNR in dB; without an image, from 40 dB.
     steps : Steps
@@ -80,24 +80,23 @@ def pack(
     ----------
     gaussians : Gaussians or Fit
     output : path-like
-        File to write; `pack` replaces an existing file atomically. `Gaussians.load` reads it.
+        File to write; an existing file is replaced atomically. `Gaussians.load` reads it.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
         The image of the fit, as `fit` takes it; for a set with maps, the images by name. By default
         the rendering of the set.
     max_psnr_drop : float, optional
         Largest loss of PSNR in dB, above 0 and at most 100: against the image, at the native size
-        and in the space of the set (psnr_ycbcr for YCbCr; `pack` compares linear light as sRGB, and
-        radiance in PU21).
-        Without an image, the loss of a set of 40 dB if the errors add. For maps, the loss is that
-        of the mean over the maps of the squared error (of colours as sRGB) over that before: all
-        maps lose about as many decibels. Without images, their errors are in the ratio of their
-        weights in the fit.
+        and in the space of the set (psnr_ycbcr for YCbCr; linear light is compared as sRGB, and
+        radiance in PU21). Without an image, the loss of a set of 40 dB whose errors add up. For
+        maps, the loss refers to the mean over the maps of the ratio of the squared errors (of
+        colours as sRGB) after and before, so that all maps lose about the same number of decibels.
+        Without images, the errors of the maps are in the ratio of their weights in the fit.
     sections : sequence of int, optional
         Number of Gaussians in each section of the file, in the order of the set. A reader may stop
-        after any section; the budget holds for each of these prefixes. By default one section.
+        after any section; the budget applies to each of these prefixes. By default one section.
         Inside a section, Gaussians are stored in Hilbert-curve order.
     encoding : {"srgb", "linear"}, optional
-        What the pixels of the image are, see `eigengs_dr.fit`.
+        The encoding of the pixels of the image, see `eigengs_dr.fit`.
 
     Returns
     -------
@@ -106,14 +105,14 @@ def pack(
     Raises
     ------
     ValueError
-        If the image or an argument does not fit the set, the suffix is not ``.egs``, or no file
+        If the image or an argument does not match the set, the suffix is not ``.egs``, or no file
         meets the budget.
     OSError
-        If the file cannot be written; an existing file then stays unchanged.
+        If the file cannot be written; an existing file does not change.
 
     Notes
     -----
-    On one machine and backend, the same arguments give the same file bit for bit.
+    On one machine and backend, the same arguments give bit-identical files.
     """
     if Path(output).suffix.lower() != SUFFIX:
         raise ValueError(f"{output}: pack writes {SUFFIX} files; use this suffix, or save()")
@@ -122,29 +121,29 @@ def pack(
             f"pack: max_psnr_drop is {max_psnr_drop}; it must be above 0 and at most "
             f"{MAX_PSNR:g} dB, such as 0.5"
         )
-    whole: Gaussians = dr.detach(set_of(gaussians))
-    rows = _section_rows(len(whole), sections)
-    if whole.maps and len(rows) > 1:
-        raise ValueError("pack: a set with maps has one section; leave the sections out")
-    compare = _compare_maps if whole.maps else _compare
-    maps, shown, compared = compare(whole, image, encoding)
-    weighted = scale_channels(whole, channel_weights(maps)) if maps else whole
-    found, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
-    size = write(output, found.packed._replace(maps=maps))
-    rounded = Gaussians.load(output, types_of(whole.mean).backend)
-    after = psnr_from_mse(max(found.error + compared.unseen, MIN_MSE))
-    figure: float | dict[str, float] = psnr_from_mse(found.error)
+    source: Gaussians = dr.detach(set_of(gaussians))
+    rows = _section_rows(len(source), sections)
+    if source.maps and len(rows) > 1:
+        raise ValueError("pack: a set with maps has one section; leave out the sections")
+    compare = _compare_maps if source.maps else _compare
+    maps, display, compared = compare(source, image, encoding)
+    weighted = scale_channels(source, channel_weights(maps)) if maps else source
+    attempt, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
+    size = write(output, attempt.packed._replace(maps=maps))
+    rounded = Gaussians.load(output, types_of(source.mean).backend)
+    after = psnr_from_mse(max(attempt.error + compared.extra_error, MIN_MSE))
+    figure: float | dict[str, float] = psnr_from_mse(attempt.error)
     if maps:
         pictures = picture_of(rounded)
-        pairs = zip(maps, shown, strict=True)
+        pairs = zip(maps, display, strict=True)
         figure = {m.name: psnr(pictures[m.name], image) for m, image in pairs}
     return PackResult(
         gaussians=rounded,
         bytes=size,
-        bits_per_pixel=8 * size / (whole.width * whole.height),
+        bits_per_pixel=8 * size / (source.width * source.height),
         psnr=figure,
         psnr_drop=psnr_from_mse(before) - after,
-        steps=found.packed.steps,
+        steps=attempt.packed.steps,
     )
 
 
@@ -165,29 +164,30 @@ def _section_rows(count: int, sections: Sequence[int] | None) -> list[slice]:
 
 Images = ArrayLike | Mapping[str, ArrayLike] | None
 Compared = tuple[tuple[TextureMap, ...], list[Array], Comparison]
-"""The maps with their weights for packing, what people see of them, and the comparison."""
+"""The maps with their weights for packing, their display values, and the comparison."""
 
 
 def _compare(g: Gaussians, image: Images, encoding: str | None) -> Compared:
     """Compare a set without maps with its image, or with its own rendering."""
     if isinstance(image, Mapping):
-        raise ValueError("pack: the set has no maps; give its image alone")
-    shown = _shown(g) if image is None else _image_of(g, image, encoding)
-    # The best linear light is not the best sRGB picture. So compensation keeps a set in linear
-    # light near its own rendering, not near the image.
-    keeps = image is None or g.space in LIGHT
+        raise ValueError("pack: the set has no maps; give a single image")
+    target = _display(g) if image is None else _image_of(g, image, encoding)
+    # The best fit in linear light is not the best sRGB picture. So the compensation of a set in
+    # linear light aims at its own rendering, not at the image.
+    keeps_rendering = image is None or g.space in LIGHT
 
-    def error(found: Gaussians) -> float:
-        return float(np.mean(np.square(_shown(found) - shown, dtype=np.float64)))
+    def error(rounded: Gaussians) -> float:
+        return float(np.mean(np.square(_display(rounded) - target, dtype=np.float64)))
 
-    unseen = MSE_WITHOUT_IMAGE if image is None else 0.0
-    return (), [], Comparison(error, planes_of(g) if keeps else shown, unseen)
+    extra_error = MSE_WITHOUT_IMAGE if image is None else 0.0
+    return (), [], Comparison(error, planes_of(g) if keeps_rendering else target, extra_error)
 
 
 def _image_of(g: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
     """Return the image in the space of the comparison.
 
-    It is the set's space; for linear light, sRGB, and for light above 1, PU21, which has bounds.
+    This is the space of the set, except for linear light (sRGB) and light above 1 (PU21, which is
+    bounded).
     """
     data = rendered_as(g.space) is None
     pixels = check_data(image) if data else check_image(image, g.channels == 1, encoding=encoding)
@@ -199,7 +199,7 @@ def _image_of(g: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
     return pixels if g.space == "linear" else values_in(pixels, g.space)
 
 
-def _shown(g: Gaussians) -> Array:
+def _display(g: Gaussians) -> Array:
     """Render a set in the space of the comparison, see `_image_of`."""
     planes = planes_of(g)
     if g.space == "radiance":
@@ -210,39 +210,39 @@ def _shown(g: Gaussians) -> Array:
 # --- A set with maps -----------------------------------------------------------------------------
 
 
-SMALL = 1 / 255
-"""A small change of sums, to measure slopes by."""
+DIFFERENCE = 1 / 255
+"""Change of the sums by which slopes are measured, with 1 as white."""
 
 
 def _compare_maps(g: Gaussians, images: Images, encoding: str | None) -> Compared:
-    """Compare a set with maps with their images, or with its own rendering."""
-    maps, cuts = g.maps, slices(g.maps)
+    """Compare a set with maps with the images of the maps, or with its own rendering."""
+    maps, parts = g.maps, slices(g.maps)
 
-    def show(sums: Array) -> list[Array]:
-        return [show_sums(m.space, sums[..., c]) for m, c in zip(g.maps, cuts, strict=True)]
+    def display(sums: Array) -> list[Array]:
+        return [display_values(m.space, sums[..., c]) for m, c in zip(g.maps, parts, strict=True)]
 
-    values = own = planes_of(g)
-    shown = rendered = show(own)
-    factors, unseen = [m.weight**2 for m in maps], MSE_WITHOUT_IMAGE
+    values = sums = planes_of(g)
+    targets = rendered = display(sums)
+    factors, extra_error = [m.weight**2 for m in maps], MSE_WITHOUT_IMAGE
     if images is not None:
-        shown, values = _images_of(g, images, encoding)
-        factors, unseen = [1 / e for e in _errors(rendered, shown)], 0.0
-        # The slope: how much the squared error of what is seen exceeds that of the sums. Equal
-        # steps of weighted colours then add to each map an error in the ratio of its own.
-        moved = _errors(show(own + np.float32(SMALL)), rendered)
-        logs = 0.5 * np.log(np.multiply(factors, [error / SMALL**2 for error in moved]))
+        targets, values = _images_of(g, images, encoding)
+        factors, extra_error = [1 / e for e in _errors(rendered, targets)], 0.0
+        # The slope: the ratio of the squared errors of display values and of sums. Equal steps of
+        # weighted colours then add an error to each map that is proportional to its own.
+        changed = _errors(display(sums + np.float32(DIFFERENCE)), rendered)
+        logs = 0.5 * np.log(np.multiply(factors, [error / DIFFERENCE**2 for error in changed]))
         weights = np.exp(logs - logs.mean()).tolist()
         maps = tuple(m._replace(weight=w) for m, w in zip(maps, weights, strict=True))
-        for m, c in zip(maps, cuts, strict=True):
-            if m.space in LIGHT:  # as a set of one image in linear light
-                values[..., c] = own[..., c]
+        for m, c in zip(maps, parts, strict=True):
+            if m.space in LIGHT:  # as in `_compare`
+                values[..., c] = sums[..., c]
     scale = np.array(channel_weights(maps), np.float32)
 
-    def error(found: Gaussians) -> float:
-        seen = _errors(show(planes_of(found) / scale), shown)
-        return float(np.mean(np.multiply(seen, factors)))
+    def error(rounded: Gaussians) -> float:
+        errors = _errors(display(planes_of(rounded) / scale), targets)
+        return float(np.mean(np.multiply(errors, factors)))
 
-    return maps, shown, Comparison(error, values * scale, unseen)
+    return maps, targets, Comparison(error, values * scale, extra_error)
 
 
 def _images_of(g: Gaussians, images: Images, encoding: str | None) -> tuple[list[Array], Array]:
@@ -252,21 +252,22 @@ def _images_of(g: Gaussians, images: Images, encoding: str | None) -> tuple[list
         raise ValueError(f"pack: the set has maps; give the images of {', '.join(spaces)} by name")
     if sorted(images) != sorted(spaces):
         raise ValueError(
-            f"pack: images are of {', '.join(images)}; give one of each of {', '.join(spaces)}"
+            f"pack: there are images of {', '.join(images)}; give one of each of "
+            f"{', '.join(spaces)}"
         )
-    given = {name: Map(images[name], space) for name, space in spaces.items()}
-    found = read_maps(given, encoding=encoding)
-    for image, m in zip(found, g.maps, strict=True):
+    named = {name: Map(images[name], space) for name, space in spaces.items()}
+    targets = read_maps(named, encoding=encoding)
+    for image, m in zip(targets, g.maps, strict=True):
         expected = (g.height, g.width, m.channels)
         if image.pixels.shape != expected:
             raise ValueError(
                 f"pack: map {m.name!r} has shape {image.pixels.shape}, the set needs {expected}"
             )
-    values = [values_in(image.pixels, image.space) for image in found]
-    return [image.pixels for image in found], np.concatenate(values, axis=2)
+    values = [values_in(image.pixels, image.space) for image in targets]
+    return [image.pixels for image in targets], np.concatenate(values, axis=2)
 
 
 def _errors(a: list[Array], b: list[Array]) -> list[float]:
-    """Return the mean squared error of each map, of at least `MIN_MSE`."""
+    """Return the mean squared error of each map, at least `MIN_MSE`."""
     pairs = zip(a, b, strict=True)
     return [max(float(np.mean(np.square(x - y, dtype=np.float64))), MIN_MSE) for x, y in pairs]

@@ -1,18 +1,18 @@
-"""Quantization: Gaussians as integers, with steps of equal visible effect.
+"""Quantization: Gaussians as integers, with steps of equal effect on the image.
 
-A change of a Gaussian changes the image. With the amplitude ``A = color size``, where the size is
-the geometric mean of the standard deviations, the squared change of the image is
+With the amplitude ``A = color size`` of a Gaussian, where the size is the geometric mean of the
+standard deviations, a change of the Gaussian changes the image by the squared error
 
     pi (|dA|^2 + |A|^2 (ds^2 + dl^2 + (sinh(2 l) / 2)^2 dt^2 + 1/2 |F dm|^2))
 
 for a change of A, the logarithm s of the inverse size, the stretch l (half the logarithm of the
-ratio of the axes), twice the angle t of the axes, and the mean m. All products of different
-changes vanish. So one step for everything is best: a step of A is ``Steps.color``, and the steps of
-s, l, sinh(2 l) t / 2 and F m are ``1 / Q`` for a Gaussian whose colour has Q steps. A faint
-Gaussian has a rough shape and place, and a round Gaussian has no angle. The factors `SCALE_STEP`
-and others were tried on training photos.
+ratio of the axes), twice the angle t of the axes, and the mean m. All mixed products vanish. So a
+single step for everything is best: the step of A is ``Steps.color``, and the steps of s, l, sinh(2
+l) t / 2 and F m are ``1 / Q`` for a Gaussian whose colour has Q steps. A faint Gaussian has a
+coarse shape and position, and a round Gaussian has no angle. The factors `SCALE_STEP` and others
+were tuned on training photos.
 
-A mean lies in a square cell, see `Steps.cell`; a Gaussian divides its cell into a grid.
+A mean lies in a square cell, see `Steps.cell`, which each Gaussian divides into a grid.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from ..gaussian.covariance import log_shapes
 from .exact_math import cos_turns, exp2, in_order, sin_turns
 
 MAX_SYMBOL = 1 << 23
-"""Bound of the integers; finer steps are not worth storing. Two cells differ by less than twice the
-bound, which fits `eigengs_dr.codec.cells.MAX_LEVELS`."""
+"""Bound of the absolute value of integers; finer steps are not worth storing. Cells differ by less
+than twice the bound, which fits `eigengs_dr.codec.cells.MAX_LEVELS`."""
 
 SCALE_STEP, STRETCH_STEP, TURN_STEP, MEAN_STEP = 1.2, 1.0, 1.0, 1.4142135623730951
 """Steps of s, l, the angle and the mean, times Q."""
 
 MIN_PRECISION = 1.0
-"""Smallest Q: the shape of a Gaussian with a colour of 0 steps."""
+"""Smallest Q, used for the shape of a Gaussian whose colour has 0 steps."""
 
 DEAD_ZONE = 0.08
-"""Part of a step by which colours are rounded towards 0, which saves bits for little error."""
+"""Fraction of a step by which colours are rounded towards 0; it saves bits for little error."""
 
 MAX_TURNS, MAX_PARTS = 1 << 20, 1 << 16
-"""Largest numbers of directions, and of parts of a side of a cell."""
+"""Largest number of directions, and of parts of a side of a cell."""
 
 LOG2E = 1.4426950408889634
 
 
 class Steps(NamedTuple):
-    """Sizes of the steps; exact in single precision, as in files.
+    """Sizes of the steps, exactly representable in single precision, as in files.
 
     Attributes
     ----------
     color : float
-        Step of the colour, with 1 for white, times the size of the Gaussian in pixels.
+        Step of the colour, with 1 as white, times the size of the Gaussian in pixels.
     cell : float
         Side of a cell in pixels.
     """
@@ -68,13 +68,13 @@ class Symbols(NamedTuple):
     cell : ndarray of int64, shape (N, 2)
         Column and row of the cell of the mean.
     part : ndarray of int64, shape (N, 2)
-        Column and row of the mean in the grid of its cell, see `Shapes.parts`.
+        Column and row of the mean in the grid of its cell, see `parts_of`.
     color : ndarray of int64, shape (N, C)
         Steps of the colours.
     scale, stretch : ndarray of int64, shape (N,)
         Steps of s and l.
     turn : ndarray of int64, shape (N,)
-        Direction, from 0 to ``Shapes.turns - 1``.
+        Direction, from 0 to the number from `turns_of`, minus 1.
     """
 
     cell: Integers
@@ -97,8 +97,8 @@ def precision(color: Integers) -> Doubles:
 def turns_of(stretch: Doubles, fineness: Doubles) -> Integers:
     """Return the number of directions for stretches l and the Q of Gaussians, both (N,)."""
     with np.errstate(all="ignore"):
-        wide = exp2(2 * LOG2E * stretch)
-        turns = np.rint((wide - 1 / wide) * fineness * (1.5707963267948966 / TURN_STEP))
+        ratio = exp2(2 * LOG2E * stretch)
+        turns = np.rint((ratio - 1 / ratio) * fineness * (1.5707963267948966 / TURN_STEP))
     return np.clip(turns, 1, MAX_TURNS).astype(np.int64)
 
 
@@ -107,15 +107,15 @@ def factors_of(scale: Integers, stretch: Integers, turn: Integers, fineness: Dou
     length = stretch * (STRETCH_STEP / fineness)
     angle = turn / turns_of(length, fineness)
     with np.errstate(all="ignore"):
-        wide, size = exp2(2 * LOG2E * length), exp2(LOG2E * (scale * (SCALE_STEP / fineness)))
-        odd = 0.5 * (wide - 1 / wide)
-        half = cos_turns(0.5 * angle)
-        a = np.sqrt(1 / wide + 2 * odd * half * half)
-        return np.stack([a * size, odd * sin_turns(angle) / a * size, size / a], axis=1)
+        ratio, size = exp2(2 * LOG2E * length), exp2(LOG2E * (scale * (SCALE_STEP / fineness)))
+        sinh = 0.5 * (ratio - 1 / ratio)
+        cosine = cos_turns(0.5 * angle)
+        a = np.sqrt(1 / ratio + 2 * sinh * cosine * cosine)
+        return np.stack([a * size, sinh * sin_turns(angle) / a * size, size / a], axis=1)
 
 
 def parts_of(factor: Floats, fineness: Floats, cell: float) -> Integers:
-    """Return the parts of the sides of each cell, shape (N, 2)."""
+    """Return the number of parts of the sides of each cell, shape (N, 2)."""
     with np.errstate(all="ignore"):
         unit = fineness * (cell / MEAN_STEP)
         parts = np.rint(np.stack([factor[:, 0] * unit, factor[:, 2] * unit], axis=1))
@@ -131,7 +131,7 @@ def quantize(arrays: dict[str, Floats], steps: Steps, dead_zone: float = 0.0) ->
         mean (N, 2), factor (N, 3) and color (N, C), see `eigengs_dr.Gaussians`.
     steps : Steps
     dead_zone : float, optional
-        Part of a step by which colours are rounded towards 0.
+        Fraction of a step by which colours are rounded towards 0.
 
     Returns
     -------
@@ -145,19 +145,19 @@ def quantize(arrays: dict[str, Floats], steps: Steps, dead_zone: float = 0.0) ->
     s, u, v = log_shapes(arrays["factor"]).T
     amplitude = np.asarray(arrays["color"], np.float64) / (steps.color * np.exp(s))[:, None]
     rounded = np.copysign(np.floor(np.maximum(np.abs(amplitude) + 0.5 - dead_zone, 0)), amplitude)
-    color = _whole("color", rounded)
+    color = _to_integers("color", rounded)
     fineness = precision(color)
-    scale = _whole("shape", s * fineness / SCALE_STEP)
-    stretch = _whole("shape", np.hypot(u, v) * fineness / STRETCH_STEP)
+    scale = _to_integers("shape", s * fineness / SCALE_STEP)
+    stretch = _to_integers("shape", np.hypot(u, v) * fineness / STRETCH_STEP)
     turns = turns_of(stretch * (STRETCH_STEP / fineness), fineness)
     turn = np.rint(np.arctan2(v, u) / (2 * np.pi) * turns).astype(np.int64) % turns
     factor = factors_of(scale, stretch, turn, fineness)
     parts = parts_of(factor, fineness, steps.cell)
     mean = np.asarray(arrays["mean"], np.float64) / steps.cell
     cell_y, part_y = _place(mean[:, 1], parts[:, 1])
-    # The error across moves the mean along, so that F (m' - m) is small in both coordinates.
-    moved = cell_y + (part_y + 0.5) / parts[:, 1] - mean[:, 1]
-    cell_x, part_x = _place(mean[:, 0] - factor[:, 1] / factor[:, 0] * moved, parts[:, 0])
+    # The error in y shifts x, so that both coordinates of F (m' - m) are small.
+    error_y = cell_y + (part_y + 0.5) / parts[:, 1] - mean[:, 1]
+    cell_x, part_x = _place(mean[:, 0] - factor[:, 1] / factor[:, 0] * error_y, parts[:, 0])
     return Symbols(
         np.stack([cell_x, cell_y], axis=1),
         np.stack([part_x, part_y], axis=1),
@@ -171,7 +171,7 @@ def quantize(arrays: dict[str, Floats], steps: Steps, dead_zone: float = 0.0) ->
 def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Floats]:
     """Return mean (N, 2), factor (N, 3) and color (N, C) for integers.
 
-    Numbers of hostile files may overflow to infinity or zero.
+    Numbers of damaged files may overflow to infinity or zero.
     """
     fineness = precision(symbols.color)
     factor = factors_of(symbols.scale, symbols.stretch, symbols.turn, fineness)
@@ -186,12 +186,12 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Floats]:
 
 
 def _place(values: Floats, parts: Integers) -> tuple[Integers, Integers]:
-    """Return the cells of coordinates, and the parts of the cells."""
-    cell = _whole("mean", np.floor(values))
+    """Return the cells of coordinates, and their parts inside the cells."""
+    cell = _to_integers("mean", np.floor(values))
     return cell, np.clip((values - cell) * parts, 0, parts - 1).astype(np.int64)
 
 
-def _whole(name: str, counts: Floats) -> Integers:
+def _to_integers(name: str, counts: Floats) -> Integers:
     """Round numbers of steps to integers; for errors see `quantize`."""
     if not (np.abs(counts) < MAX_SYMBOL).all():
         raise ValueError(

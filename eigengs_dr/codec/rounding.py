@@ -1,13 +1,14 @@
-"""Rounding as coarse as a loss of PSNR allows: the search of the steps, and error feedback.
+"""Rounding as coarsely as a loss of PSNR allows: the search for the steps, and error feedback.
 
-All steps follow from one, see `eigengs_dr.codec.quantization`. `round_within` searches the
+All steps follow from one, see `eigengs_dr.codec.quantization`. `round_within` searches for the
 largest one that the loss allows, first without error feedback, which is fast, then with it.
 
 With error feedback, Gaussians that are not yet rounded compensate for those that are. The Gaussians
-are divided into groups; neighbours along a Hilbert curve are in different groups. One group after
-another is rounded with all its parameters. After each group, the others descend on the error that
-is left. On training photos at equal error this saves 3 bits for each Gaussian, a tenth of the file.
-A set in several sections gets no compensation, because a reader may stop after any section.
+are divided into groups; neighbours along a Hilbert curve are in different groups. The groups are
+rounded one after another, with all their parameters. After each group, the remaining Gaussians
+descend on the remaining error. On training photos at equal error this saves 3 bits per Gaussian, a
+tenth of the file. A set in several sections gets no compensation, because a reader may stop after
+any section.
 """
 
 from __future__ import annotations
@@ -34,36 +35,37 @@ from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
 Array = NDArray[np.floating]
 
 MIN_MSE = 1e-9
-"""Smallest mean squared error that counts: 90 dB."""
+"""Lower bound of mean squared errors: 90 dB."""
 
 FIRST_STEP = 0.06
-"""Step of the colours at which the search starts."""
+"""Step of the colours at which the search starts, with 1 as white, times pixels."""
 
-CELLS = 4
-"""Cells for the mean distance of Gaussians: some lie in one cell, and few bits tell the rest."""
+CELLS_PER_SPACING = 4
+"""Number of cells per mean distance of Gaussians. Few Gaussians share a cell, and few bits give the
+position inside the cell."""
 
-FEEDBACK = 0.6
-"""Error that rounding adds with error feedback, relative to that without, on training photos."""
+FEEDBACK_ERROR_RATIO = 0.6
+"""Ratio of the errors that rounding adds with and without error feedback, on training photos."""
 
 TOO_FINE = "pack: no rounding is fine enough for the budget; allow more dB"
 
 
 class Comparison(NamedTuple):
-    """What the loss of a set is measured by.
+    """The measure of the loss of a set.
 
     Attributes
     ----------
     error : callable
         ``error(gaussians)`` returns the mean squared error of a set.
     target : ndarray, shape (H, W, C)
-        What compensation for the rounding aims at, in the space of the set.
-    unseen : float
-        Mean squared error that `error` does not see, and that adds to it.
+        Target of the compensation for the rounding, in the space of the set.
+    extra_error : float
+        Mean squared error that is not included in `error`, and is added to it.
     """
 
     error: Callable[[Gaussians], float]
     target: Array
-    unseen: float
+    extra_error: float
 
 
 def round_within(
@@ -77,60 +79,60 @@ def round_within(
         Set without gradients.
     compared : Comparison
     max_psnr_drop : float
-        Allowed loss in dB of each prefix: of the Gaussians up to the end of each section.
+        Allowed loss in dB of each prefix: the Gaussians up to the end of each section.
     rows : list of slice
         The sections.
 
     Returns
     -------
     Attempt
-        The best one.
+        The best attempt.
     float
-        The mean squared error before, with what is unseen.
+        The mean squared error before rounding, including `Comparison.extra_error`.
 
     Raises
     ------
     ValueError
         If no rounding meets the budget.
     """
-    unseen = compared.unseen
+    extra = compared.extra_error
 
-    def errors(found: Gaussians) -> list[float]:
-        return [compared.error(part) for part in (*(found[: r.stop] for r in rows[:-1]), found)]
+    def errors(candidate: Gaussians) -> list[float]:
+        prefixes = (*(candidate[: r.stop] for r in rows[:-1]), candidate)
+        return [compared.error(prefix) for prefix in prefixes]
 
-    before = [max(error + unseen, MIN_MSE) for error in errors(gaussians)]
-    limits = [error * 10 ** (max_psnr_drop / 10) - unseen for error in before]
+    before = [max(error + extra, MIN_MSE) for error in errors(gaussians)]
+    limits = [error * 10 ** (max_psnr_drop / 10) - extra for error in before]
     if min(limits) <= 0:
         raise ValueError(TOO_FINE)
 
-    def judge(packed: EgsContent) -> Attempt:
+    def evaluate(packed: EgsContent) -> Attempt:
         after = errors(Gaussians.from_data(packed.set_data(), types_of(gaussians.mean).backend))
         shares = [
-            (e + unseen - b) / (m + unseen - b)
-            for e, m, b in zip(after, limits, before, strict=True)
+            (e + extra - b) / (m + extra - b) for e, m, b in zip(after, limits, before, strict=True)
         ]
         return Attempt(max(shares), packed, after[-1])  # the worst prefix counts
 
     def plain(octaves: float) -> Attempt:
-        return judge(quantize_sections(gaussians, _steps(gaussians, octaves), rows))
+        return evaluate(quantize_sections(gaussians, _steps(gaussians, octaves), rows))
 
     def compensated(octaves: float) -> Attempt:
         steps = _steps(gaussians, octaves)
-        return judge(quantize_with_feedback(gaussians, compared.target, steps))
+        return evaluate(quantize_with_feedback(gaussians, compared.target, steps))
 
-    found = largest_within(plain)
-    if len(rows) == 1:  # compensation for the whole set would harm its prefixes
-        least = MIN_OCTAVES if found is None else found[0]
-        start = least if found is None else least - 0.5 * np.log2(FEEDBACK)
-        found = largest_within(compensated, start, least) or found
-    if found is None:
+    best = largest_within(plain)
+    if len(rows) == 1:  # compensation for the full set would harm its prefixes
+        least = MIN_OCTAVES if best is None else best[0]
+        start = least if best is None else least - 0.5 * np.log2(FEEDBACK_ERROR_RATIO)
+        best = largest_within(compensated, start, least) or best
+    if best is None:
         raise ValueError(TOO_FINE)
-    return found[1], before[-1]
+    return best[1], before[-1]
 
 
 def _steps(gaussians: Gaussians, octaves: float) -> Steps:
-    """Return steps in single precision, as in the file."""
-    cell = (gaussians.width * gaussians.height / len(gaussians)) ** 0.5 / CELLS
+    """Return the steps in single precision, as in the file."""
+    cell = (gaussians.width * gaussians.height / len(gaussians)) ** 0.5 / CELLS_PER_SPACING
     values = np.array([FIRST_STEP * 2.0**octaves, cell], np.float32)
     return Steps(*values.tolist())
 
@@ -138,26 +140,27 @@ def _steps(gaussians: Gaussians, octaves: float) -> Steps:
 MIN_OCTAVES, MAX_OCTAVES = -14.0, 6.0
 """Range of the search around the first step, in octaves."""
 
-MAX_MOVE = 2.0
-"""Largest distance of two attempts, in octaves."""
+MAX_CHANGE = 2.0
+"""Largest change between two attempts, in octaves."""
 
-ENOUGH, ATTEMPTS = 0.97, 4
-"""Part of the budget that leaves no room worth another attempt, and number of attempts."""
+SUFFICIENT_SHARE, MIN_ATTEMPTS = 0.97, 4
+"""Share of the budget at which the search stops at once, and number of attempts after which
+`ACCEPTED_SHARE` suffices."""
 
-FAIR, MAX_ATTEMPTS = 0.9, 10
-"""Part of the budget that must be used after `ATTEMPTS`, and attempts after which it need not."""
+ACCEPTED_SHARE, MAX_ATTEMPTS = 0.9, 10
+"""Share of the budget that suffices after `MIN_ATTEMPTS`, and largest number of attempts."""
 
 MARGIN = 0.01
-"""Octaves below the crossing at which the next attempt is."""
+"""Distance of the next attempt below the predicted crossing, in octaves."""
 
 
 class Attempt(NamedTuple):
-    """One step and what it gives.
+    """The result of one step size.
 
     Attributes
     ----------
     excess : float
-        Error that rounding adds, relative to the largest that the budget allows.
+        Error that rounding adds, relative to the largest error that the budget allows.
     packed : EgsContent
         The rounded set.
     error : float
@@ -172,22 +175,22 @@ class Attempt(NamedTuple):
 def largest_within(
     attempt: Callable[[float], Attempt], start: float = 0.0, least: float = MIN_OCTAVES
 ) -> tuple[float, Attempt] | None:
-    """Search the largest step whose error stays within a limit, by few attempts.
+    """Search for the largest step whose error stays within a limit, in few attempts.
 
     The error is about ``e_0 + k step^2``: rounding adds error, and the compensation for it may
-    improve the set. Every step rounds all numbers anew, so the error is random too: by 10 % of the
-    budget for 100 Gaussians, and 1 % for 3,000. The last two attempts give e_0 and k, and with them
-    the step at which the error should cross the limit. The next attempt is there, or a little below
-    it.
+    improve the set. Every step rounds all numbers anew, so the error has a random part too: 10 % of
+    the budget for 100 Gaussians, and 1 % for 3,000. The last two attempts determine e_0 and k, and
+    so the step at which the error should cross the limit. The next attempt is there or slightly
+    below.
 
     Parameters
     ----------
     attempt : callable
-        ``attempt(octaves)`` rounds with ``2**octaves`` times some first step.
+        ``attempt(octaves)`` rounds with ``2**octaves`` times the first step.
     start : float, optional
         Octaves of the first attempt.
     least : float, optional
-        Octaves of the smallest step to try.
+        Octaves of the smallest step that is tried.
 
     Returns
     -------
@@ -198,10 +201,10 @@ def largest_within(
     tried: dict[float, float] = {}
     best: tuple[float, Attempt] | None = None
     while True:
-        found = attempt(octaves)
-        tried[octaves] = found.excess
-        if found.excess <= 1 and (best is None or octaves > best[0]):
-            best = octaves, found
+        result = attempt(octaves)
+        tried[octaves] = result.excess
+        if result.excess <= 1 and (best is None or octaves > best[0]):
+            best = octaves, result
         goal = _crossing(list(tried.items())) - MARGIN
         if best is None:
             if octaves <= least:
@@ -210,8 +213,8 @@ def largest_within(
             continue
         low, used = best[0] + MARGIN, best[1].excess
         high = min((place for place in tried if place > best[0]), default=MAX_OCTAVES + MARGIN)
-        enough = used >= ENOUGH or (len(tried) >= ATTEMPTS and used >= FAIR)
-        if low > high - MARGIN or enough or len(tried) >= MAX_ATTEMPTS:
+        needed = ACCEPTED_SHARE if len(tried) >= MIN_ATTEMPTS else SUFFICIENT_SHARE
+        if low > high - MARGIN or used >= needed or len(tried) >= MAX_ATTEMPTS:
             return best
         octaves = min(max(goal, low), high - MARGIN)
 
@@ -224,24 +227,24 @@ def _crossing(tried: list[tuple[float, float]]) -> float:
     if before != octaves:
         slope = (excess - error) / (4.0**octaves - 4.0**before)
         offset = excess - slope * 4.0**octaves
-    if slope <= 0 or offset >= 1:  # noise, or an improvement: go on by the larger steps
-        return octaves + (MAX_MOVE if excess <= 0 else float(np.clip(1 - excess, -1, 1)))
+    if slope <= 0 or offset >= 1:  # noise or an improvement: continue with a fixed change
+        return octaves + (MAX_CHANGE if excess <= 0 else float(np.clip(1 - excess, -1, 1)))
     crossing = 0.5 * np.log2(max((1 - offset) / slope, 1e-30))
-    return octaves + float(np.clip(crossing - octaves, -MAX_MOVE, MAX_MOVE))
+    return octaves + float(np.clip(crossing - octaves, -MAX_CHANGE, MAX_CHANGE))
 
 
-GROUPS = 16
-"""Groups of Gaussians, at most."""
+MAX_GROUPS = 16
+"""Largest number of groups of Gaussians."""
 
-STEPS = 12
-"""Steps of descent after each group but the last one."""
+FEEDBACK_STEPS = 12
+"""Number of descent steps after each group except the last one."""
 
-RATE = 0.2
-"""Learning rates of this descent, as a fraction of those of `fit`: the optimum is near."""
+FEEDBACK_RATE = 0.2
+"""Learning rates of this descent, relative to those of `fit`, because the optimum is near."""
 
 
 def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) -> EgsContent:
-    """Round a set; let the Gaussians not yet rounded compensate.
+    """Round a set, while the Gaussians that are not yet rounded compensate.
 
     Parameters
     ----------
@@ -262,37 +265,38 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
         If a number would be too large to store.
     """
     count = len(gaussians)
-    groups = min(GROUPS, count)
+    groups = min(MAX_GROUPS, count)
     group_of = np.argsort(_along_curve(gaussians)) % groups
-    slow = replace(DEFAULT.at_rates(RATE), controls=())
+    method = replace(DEFAULT.at_rates(FEEDBACK_RATE), controls=())
     free, rest = np.arange(count), np.asarray(target, np.float32)
     done: list[Symbols] = []
     current, inside = gaussians, _all_inside(gaussians)
     for group in range(groups):
-        arrays, now = current.to_arrays(), group_of[free] == group
-        chosen = {name: arrays[name][now] for name in ("mean", "factor", "color")}
-        done.append(quantize(chosen, steps, DEAD_ZONE))
-        free = free[~now]
+        arrays, in_group = current.to_arrays(), group_of[free] == group
+        selected = {name: arrays[name][in_group] for name in ("mean", "factor", "color")}
+        done.append(quantize(selected, steps, DEAD_ZONE))
+        free = free[~in_group]
         if not len(free):
             break
         rest = rest - planes_of(like(gaussians, **dequantize(done[-1], steps)))
         objective = Pixels.plain(rest, current)
-        current = solve(current[np.flatnonzero(~now)], objective, 2, warm_start=True)
-        if inside:  # descent would move means outside the image into it
-            current = last(descend(objective, slow, begin(current), STEPS), current)
+        current = solve(current[np.flatnonzero(~in_group)], objective, 2, warm_start=True)
+        if inside:  # the descent would clip means to the image
+            states = descend(objective, method, begin(current), FEEDBACK_STEPS)
+            current = last(states, current)
     symbols = Symbols(*map(np.concatenate, zip(*done, strict=True)))
     return _content(gaussians, [symbols], steps, current.to_arrays()["background"])
 
 
 def quantize_sections(gaussians: Gaussians, steps: Steps, rows: list[slice]) -> EgsContent:
-    """Round a set without compensation, in sections of these ranges of Gaussians."""
+    """Round a set without compensation, divided into sections by ranges of Gaussians."""
     arrays = gaussians.to_arrays()
     symbols = quantize(arrays, steps, DEAD_ZONE)
     return _content(gaussians, [symbols.select(r) for r in rows], steps, arrays["background"])
 
 
 def planes_of(gaussians: Gaussians) -> NDArray[np.float32]:
-    """Render a set in its own space."""
+    """Render a set in its own space, without decoding."""
     return np.asarray(render(replace(gaussians, space="data")).numpy(), np.float32)
 
 

@@ -1,4 +1,4 @@
-"""The weights of a model of probabilities: how an encoder finds them, and how files store them."""
+"""The weights of a probability model: fitting them in the encoder, and storing them in files."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from .range_coder import TAILS
 MIN_WIDTH = 0.1
 """Smallest width of a distribution, in steps."""
 
-WIDTHS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2)
-"""Factors of the mean absolute error that are tried as width."""
+WIDTH_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2)
+"""Factors of the mean absolute error that are tried as the width."""
 
 CLASSES = 15
-"""Classes of directions, see `Directions` in `eigengs_dr.codec.gaussian_model`."""
+"""Number of classes of directions, see `Directions` in `eigengs_dr.codec.gaussian_model`."""
 
-SMALL = 1500
-"""Number of Gaussians below which the weights may take more bytes than they save."""
+MIN_RICH_COUNT = 1500
+"""Number of Gaussians below which all weights may take more bytes than they save."""
 
 
 class Weights(NamedTuple):
-    """How one kind of numbers is predicted.
+    """The prediction of one kind of numbers.
 
     Attributes
     ----------
@@ -43,14 +43,14 @@ class Weights(NamedTuple):
 
 @dataclass
 class Model:
-    """All that a section stores beside the integers.
+    """All parameters that a section stores besides the integers.
 
     Attributes
     ----------
     weights : list of Weights
         For each channel, for the scale, and for the stretch.
     sharpness : ndarray of int64, shape (CLASSES,)
-        How near directions are to those of the neighbours, from 0 to 255.
+        Concentration of directions around those of the neighbours, from 0 to 255.
     """
 
     weights: list[Weights] = field(default_factory=list)
@@ -58,7 +58,7 @@ class Model:
 
 
 def feature_counts(channels: int) -> list[tuple[int, int]]:
-    """Return the numbers of features of centre and width, for each `Weights` of a model."""
+    """Return the number of features of the centre and of the width, for each `Weights`."""
     colors = [(1 + 2 * min(k, 2), 4 + 2 * min(k, 2)) for k in range(channels)]
     return [*colors, (7, 2), (5, 2)]
 
@@ -66,7 +66,7 @@ def feature_counts(channels: int) -> list[tuple[int, int]]:
 def fit_weights(
     center: Doubles, width: Doubles, values: Doubles, step: Doubles, rich: bool = True
 ) -> Weights:
-    """Return the weights for which numbers take few bits.
+    """Return weights with which the numbers take few bits.
 
     Parameters
     ----------
@@ -75,34 +75,34 @@ def fit_weights(
     values, step : ndarray, shape (N,)
         The numbers, which are multiples of the steps.
     rich : bool, optional
-        Whether all weights may differ from 0, or only the first ones.
+        Whether all weights may differ from 0, or only the first one of each.
     """
-    parts, spread = np.zeros(width.shape[1]), np.maximum(step, 1e-9)
-    some = slice(None) if rich else slice(0, 1)
-    found = np.zeros(center.shape[1])
+    width_weights, deviation = np.zeros(width.shape[1]), np.maximum(step, 1e-9)
+    used = slice(None) if rich else slice(0, 1)
+    center_weights = np.zeros(center.shape[1])
     for _ in range(3):
-        scaled = center[:, some] / spread[:, None]
+        scaled = center[:, used] / deviation[:, None]
         ridge = 1e-3 * len(values) ** 0.5 * np.eye(scaled.shape[1])
-        known = np.append(values / spread, np.zeros(len(ridge)))
-        solved = np.linalg.lstsq(np.vstack([scaled, ridge]), known, rcond=None)[0]
-        found[some] = stored_center(solved)
-        error = values - in_order(found[:, None] * center.T)
-        parts[some] = _fit_width(width[:, some], np.abs(error) + 0.1 * step, spread)
-        spread = np.maximum(in_order(parts[:, None] * width.T), MIN_WIDTH * step)
-    trials = [(w, tails) for tails in TAILS for w in WIDTHS]
-    best = min(trials, key=lambda trial: _bits(error / step, trial[0] * spread / step, trial[1]))
-    return Weights(found, stored_width(parts * best[0]), best[1])
+        known = np.append(values / deviation, np.zeros(len(ridge)))
+        solution = np.linalg.lstsq(np.vstack([scaled, ridge]), known, rcond=None)[0]
+        center_weights[used] = stored_center(solution)
+        error = values - in_order(center_weights[:, None] * center.T)
+        width_weights[used] = _fit_width(width[:, used], np.abs(error) + 0.1 * step, deviation)
+        deviation = np.maximum(in_order(width_weights[:, None] * width.T), MIN_WIDTH * step)
+    trials = [(w, tails) for tails in TAILS for w in WIDTH_FACTORS]
+    best = min(trials, key=lambda trial: _bits(error / step, trial[0] * deviation / step, trial[1]))
+    return Weights(center_weights, stored_width(width_weights * best[0]), best[1])
 
 
-def _fit_width(features: Doubles, error: Doubles, spread: Doubles) -> Doubles:
-    """Return weights above 0 of features above 0 whose sum is near the absolute errors."""
-    from scipy.optimize import nnls  # decoders need not wait for this import
+def _fit_width(features: Doubles, error: Doubles, deviation: Doubles) -> Doubles:
+    """Return non-negative weights of features whose weighted sum approximates absolute errors."""
+    from scipy.optimize import nnls  # imported here, because decoders do not need it
 
-    return np.asarray(nnls(features / spread[:, None], error / spread)[0])
+    return np.asarray(nnls(features / deviation[:, None], error / deviation)[0])
 
 
 def _bits(error: Doubles, width: Doubles, tails: int) -> float:
-    """Return about the bits that errors in steps take with a distribution."""
+    """Estimate the bits that errors, in steps, take with a distribution."""
     t = error / width
     density = np.log2(width) + 0.5 * (tails + 1) * np.log2(1 + t * t / tails)
     return float(density.sum()) + len(t) * {2: 1.5, 4: 1.415, 8: 1.369}[tails]
@@ -114,31 +114,31 @@ def stored_center(weights: Doubles) -> Doubles:
 
 
 def stored_width(weights: Doubles) -> Doubles:
-    """Round weights above 0 to half precision with two bits after the first, as in files."""
+    """Round positive weights to half precision with a mantissa of two bits, as in files."""
     half = np.clip(np.nan_to_num(weights), 0, 4e4).astype("<f2").view("<u2")
     return ((half + 0x80) & 0xFF00).astype("<u2").view("<f2").astype(np.float64)
 
 
 def to_bytes(model: Model, rich: bool) -> bytes:
-    """Return the bytes of a model; if it is not rich, of the first weights only."""
-    some, parts = slice(None) if rich else slice(0, 1), list[bytes]()
+    """Return the bytes of a model; if it is not rich, only of the first weights."""
+    used, parts = slice(None) if rich else slice(0, 1), list[bytes]()
     for weights in model.weights:
-        high = weights.width[some].astype("<f2").view("<u2") >> 8
+        high = weights.width[used].astype("<f2").view("<u2") >> 8
         parts.append(bytes([TAILS.index(weights.tails)]))
-        parts += [weights.center[some].astype("<f2").tobytes(), high.astype(np.uint8).tobytes()]
+        parts += [weights.center[used].astype("<f2").tobytes(), high.astype(np.uint8).tobytes()]
     if rich:
         parts.append(model.sharpness.astype(np.uint8).tobytes())
     return b"".join(parts)
 
 
 def from_bytes(data: bytes, channels: int, rich: bool) -> tuple[Model, bytes]:
-    """Return a model and the bytes after it; the bytes may be hostile."""
+    """Return a model and the bytes after it; the bytes need not be trusted."""
     model = Model()
 
     def take(count: int) -> bytes:
         nonlocal data
         if count > len(data):
-            raise BadValue("the weights are cut off")
+            raise BadValue("the weights are truncated")
         taken, data = data[:count], data[count:]
         return taken
 

@@ -1,8 +1,7 @@
-"""Many images, one row of results for each: read ahead, worked on in groups, written whole.
+"""Runs over many images: reading ahead, work on groups, atomic results, one row for each image.
 
 - ``sources``: names, outputs and pixels of the images
-- ``manifest``: what becomes of an image; the rows of a folder
-- ``run``: a whole run, over groups of images in this process or chunks of images on a cluster
-- ``fit_batch``: the fit of several small images in one program
+- ``manifest``: the row of an image, and the rows of a folder
+- ``run``: a run over groups of images in this process, or chunks of images on a cluster
 - ``fit_many``: `fit_many`, the fit of many images
 """

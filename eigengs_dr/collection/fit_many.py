@@ -21,20 +21,20 @@ from .run import Job, run_images
 from .sources import Images
 
 MAX_SIDE = 256
-"""Longer side, in pixels, of the largest images that are fitted in groups."""
+"""Largest side in pixels of images that are fitted in groups."""
 
 MAX_GAUSSIANS = 1 << 15
-"""Most Gaussians of an image of a group: Dr.Jit adds up to so many numbers in one order, more in
-parts that depend on how many sums there are."""
+"""Largest number of Gaussians of an image in a group. Dr.Jit adds up to this many numbers in a
+fixed order, and more of them in parts that depend on the number of sums."""
 
 MAX_CUTOFF = 3.1
 """Largest cutoff at which no Gaussian of a fit is steep, see `eigengs_dr.raster.evaluate.is_steep`.
-One steep Gaussian changes the arithmetic of all, so those of another image may not share it."""
+One steep Gaussian changes the arithmetic of all, also of those of other images in its group."""
 
 MAX_GROUP_PIXELS, MAX_GROUP_PIXELS_ON_GPU = 1 << 18, 1 << 20
-"""Largest number of pixels of a group: on llvm 4 images of 256x256, or 64 of 64x64, since larger
-groups are not faster, and an interrupt loses the group under way. A GPU fits 16 images of 256x256
-in 1.5 times the time of 4, and no more images a second in larger groups (H200, 100 steps)."""
+"""Largest number of pixels of a group. On llvm 4 images of 256x256, or 64 of 64x64: larger groups
+are not faster, and an interrupt loses the current group. A GPU fits 16 images of 256x256 in 1.5
+times the time of 4, and larger groups are not faster per image (H200, 100 steps)."""
 
 
 @shows_progress
@@ -47,36 +47,36 @@ def fit_many(
     client: Any = None,
     **options: Any,
 ) -> list[ImageRow]:
-    """Fit many images; a bad image is a row with its error and does not end the run.
+    """Fit many images; an image that fails gets a row with its error, and the run continues.
 
-    Files are decoded and results are written by threads while other images are fitted. Memory does
-    not grow with the number of images if there is an output folder.
+    Threads decode files and write results while other images are fitted. With an output folder,
+    memory does not grow with the number of images.
 
     Parameters
     ----------
     images : path-like or iterable
         A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of one of them; or an iterable of
-        files, of URLs and of arrays (H, W, 3), (H, W, 1) or (H, W). The name of an image is the
-        stem of its file; arrays are named by their number, as in "000012". URLs need fsspec, from
-        the extra ``cluster``.
+        files, URLs and arrays (H, W, 3), (H, W, 1) or (H, W). The name of an image is the stem of
+        its file; arrays are named by their index, such as "000012". URLs need fsspec, from the
+        extra ``cluster``.
     output : path-like, optional
         Folder of the results, ``NAME.npz`` for each image; it is created if it is missing. Each
-        file is written completely or not at all. ``manifest.jsonl`` has a row for each image. By
-        default the results stay in memory.
+        file is written atomically. ``manifest.jsonl`` has a row for each image. By default the
+        results stay in memory.
     overwrite : bool, optional
-        Fit images whose output exists. By default such images are skipped: a run that was
-        interrupted continues if it is repeated. Options that the results do not have are an error
-        if they are given or there is work to do, else a warning. A file that is no set of Gaussians
-        is never replaced.
+        Fit images again whose output exists. By default these are skipped, so that repeating an
+        interrupted run continues it. Options that differ from those of existing results are an
+        error if they are given explicitly or there is work to do, otherwise a warning. A file that
+        is not a set of Gaussians is never replaced.
     progress : bool or callable, optional
-        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
-        ``progress(done, total, row)`` after every image, with its `ImageRow`, which in this process
-        has the `Fit`; `total` is None for an iterator. It may raise `KeyboardInterrupt` to end the
-        run.
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none. A
+        function is called as ``progress(done, total, row)`` after every image, with its
+        `ImageRow`, which has the `Fit` in this process; `total` is None for an iterator. It may
+        raise `KeyboardInterrupt` to end the run.
     client : distributed.Client, optional
         Fit on the workers of this Dask cluster; None is this process. Workers read the files and
-        write the results, so they need the same file system, or URLs. On llvm the results have
-        the same bits whatever the number of workers.
+        write the results, so they need the same file system, or URLs. On llvm the results are
+        bit-identical for any number of workers.
     options : Any
         Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, target_psnr,
         start, space, method, seed, backend and encoding. A start is read once.
@@ -89,9 +89,9 @@ def fit_many(
     Raises
     ------
     ValueError
-        If an option is out of range, two images have one name, there is no image, or the output
-        folder has results of other options. In an
-        iterator, the second image of one name has a row with an error instead.
+        If an option is out of range, two images have the same name, there is no image, or the
+        output folder has results of other options. In an iterator, the second image of the same
+        name gets a row with an error instead.
     TypeError
         If an option is unknown.
     OSError
@@ -101,15 +101,15 @@ def fit_many(
     ClusterError
         If the cluster cannot be used, or is lost. The same call continues the run.
     RunInterrupted
-        After Ctrl-C or SIGTERM: a `KeyboardInterrupt` with the rows until then. Their files are
-        complete. The image that was interrupted has no file.
+        After Ctrl-C or SIGTERM: a `KeyboardInterrupt` with the rows so far, whose files are
+        complete. The interrupted image has no file.
 
     Notes
     -----
-    Small images of one size that follow each other are fitted in groups, see
-    `eigengs_dr.fitting.fit.fit_images`. On llvm a result equals that of `eigengs_dr.fit` bit for
-    bit, whatever the other images are. On cuda sums run in another order: long fits end some
-    tenths of a decibel apart, up or down.
+    Consecutive small images of the same size are fitted in groups, see
+    `eigengs_dr.fitting.fit.fit_images`. On llvm a result is bit-identical to that of
+    `eigengs_dr.fit`, whatever the other images are. On cuda the order of summation differs: the
+    results of long fits differ by some tenths of a decibel, up or down.
 
     Examples
     --------
@@ -119,29 +119,29 @@ def fit_many(
     >>> [(row.name, row.status, row.gaussians) for row in rows]
     [('000000', 'done', 200), ('000001', 'done', 200)]
     """
-    own = ("images", "output", "overwrite", "progress", "client")
+    parameters = ("images", "output", "overwrite", "progress", "client")
     known = [field.name for field in fields(FitOptions) if field.name != "loss"]
-    refuse_unknown(options, [*known, *own])
+    refuse_unknown(options, [*known, *parameters])
     settings = FitOptions(**options)
     if settings.start is not None:
         start = load_start(settings.start, settings.backend)
         settings = replace(settings, start=start, space=settings.space or set_in(start).space)
     if client is None:
-        select(settings.backend)  # a backend that is missing is said before the work
+        select(settings.backend)  # a missing backend is an error before any work
     job = Job(
         partial(_fit_group, options=settings),
         partial(_may_join, options=settings),
         rendered_as(settings.space or "ycbcr") is None,
         settings.encoding,
         settings.iterations,
-        _decisive(settings),
+        _settings_of(settings),
         list(options),
     )
     return run_images(images, output, overwrite, job, progress, client)
 
 
-def _decisive(settings: FitOptions) -> dict[str, Any]:
-    """Return the options on which results depend; a start by what it holds."""
+def _settings_of(settings: FitOptions) -> dict[str, Any]:
+    """Return the options on which results depend; a start is replaced by its fingerprint."""
     options = {name: value for name, value in vars(settings).items() if name != "backend"}
     options["method"] = repr(settings.method)
     if settings.goal:
@@ -155,17 +155,17 @@ def _decisive(settings: FitOptions) -> dict[str, Any]:
 
 
 def _may_join(group: list[EncodedImage], added: EncodedImage, options: FitOptions) -> bool:
-    """Group small images of one size, up to `MAX_GROUP_PIXELS`."""
+    """Return whether an image may join a group: small images of the same size may."""
     on_cpu = name_of(select(options.backend)) == "llvm"
-    most = MAX_GROUP_PIXELS if on_cpu else MAX_GROUP_PIXELS_ON_GPU
+    max_pixels = MAX_GROUP_PIXELS if on_cpu else MAX_GROUP_PIXELS_ON_GPU
     first, last = group[-1].pixels, added.pixels
-    alike = first.shape == last.shape and _is_groupable(group[-1], options)
-    area = (len(group) + 1) * last.shape[0] * last.shape[1]
-    return alike and _is_groupable(added, options) and area <= most
+    same_size = first.shape == last.shape and _is_groupable(group[-1], options)
+    pixels = (len(group) + 1) * last.shape[0] * last.shape[1]
+    return same_size and _is_groupable(added, options) and pixels <= max_pixels
 
 
 def _is_groupable(image: EncodedImage, options: FitOptions) -> bool:
-    """Return whether a group may hold an image: results have the bits of fits alone."""
+    """Return whether a fit in a group is bit-identical to a separate fit of the image."""
     pixels, method = image.pixels, options.method
     return (
         image.encoding == "srgb"
@@ -181,7 +181,7 @@ def _is_groupable(image: EncodedImage, options: FitOptions) -> bool:
 
 
 def _fit_group(images: list[EncodedImage], options: FitOptions) -> list[Fit]:
-    """Fit one image, or several that may be in one batch."""
+    """Fit one image, or several as one batch."""
     try:
         return fit_images(images, options)
     except Diverged:

@@ -1,9 +1,9 @@
-"""What becomes of an image, and the manifest of an output folder: a row for each image.
+"""The row of an image, and the manifest of an output folder with a row for each image.
 
-The files of results are whole or not there, so they say what a run need not do again. During a run
-``manifest.jsonl`` grows by a line for each image, a JSON object; the last line of an image counts.
-The end of a run leaves one line an image, sorted by name. A row holds the options of its result,
-so that a run goes on with the same options alone.
+Result files are complete or missing, so a run need not fit images again whose file exists. During a
+run, ``manifest.jsonl`` grows by one line per image, a JSON object; the last line of an image
+counts. At the end of a run there is one line per image, sorted by name. A row holds the options of
+its result, so that a run is only continued with the same options.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ..storage.settings import Settings, difference, to_json
 
 @dataclass(frozen=True)
 class ImageRow:
-    """What became of one of many images.
+    """The result of one of many images.
 
     Attributes
     ----------
     name : str
-        Stem of the file, or the number of the array with six digits.
+        Stem of the file, or the index of the array with six digits.
     status : str
         "done", "skipped" because the output exists, or "failed".
     input : Path, str or None
@@ -41,13 +41,13 @@ class ImageRow:
     output : Path or None
         The file of the result, if there is one.
     width, height, gaussians : int or None
-        Size of the image in pixels, and the number of Gaussians. A skipped image has the figures
-        of the manifest, see `eigengs_dr.collection.manifest`.
+        Size of the image in pixels, and the number of Gaussians. For a skipped image, the figures
+        come from the manifest, see `eigengs_dr.collection.manifest`.
     psnr_ycbcr, psnr_rgb : float or None
         PSNR of the fit in dB, see `eigengs_dr.Fit`; None for encoded images.
     seconds : float or None
-        Time of the work on the image, without reading and writing; None if it was not done. Images
-        in one group share their time.
+        Time of the work on the image, without reading and writing; None if there was none. The
+        time of a group is divided equally.
     iterations : int or None
         Number of refinement steps; None for encoded images.
     stopped : str
@@ -79,12 +79,12 @@ RowProgress = Callable[[int, int | None, ImageRow], None]
 
 
 class RunInterrupted(KeyboardInterrupt):
-    """The error of a run over many images that Ctrl-C or SIGTERM interrupted.
+    """A run over many images was interrupted by Ctrl-C or SIGTERM.
 
     Attributes
     ----------
     rows : list of ImageRow
-        The images until then. The image that was interrupted has no row and no file.
+        The finished images. The interrupted image has neither row nor file.
     """
 
     def __init__(self, rows: list[ImageRow]) -> None:
@@ -105,7 +105,7 @@ Row = Record
 
 @contextmanager
 def open_manifest(folder: Path, options: Settings | None = None) -> Iterator[Manifest]:
-    """Open the manifest of an existing folder, and hold the lock of the folder, during a block.
+    """Lock an existing folder during a block, and open its manifest.
 
     Parameters
     ----------
@@ -118,21 +118,21 @@ def open_manifest(folder: Path, options: Settings | None = None) -> Iterator[Man
     OSError
         If another run writes into the folder, or the file cannot be read or written.
     ValueError
-        If the file is no manifest.
+        If the file is not a manifest.
     """
     path, settings = folder / NAME, to_json(options or {})
     with lock_folder(folder):
         remove_stale(folder)
         rows, clean = read_manifest(path)
         if not clean:
-            write_manifest(path, rows)  # else the next row would continue a half line
+            write_manifest(path, rows)  # otherwise the next row would extend a truncated line
         file = path.open("ab")
         try:
             yield Manifest(path, rows, file, settings)
         finally:
-            # If the disk is too full for a second file, the longer one holds the same rows.
+            # If the disk is too full for a second file, the longer file with the same rows stays.
             with suppress(OSError):
-                file.close()  # Windows replaces no file that is open
+                file.close()  # Windows cannot replace an open file
                 write_manifest(path, rows)
                 remove_stale(folder)
 
@@ -144,11 +144,11 @@ class Manifest(NamedTuple):
     ----------
     path : Path
     rows : dict of str to dict
-        The last row of each image, by its name.
+        The last row of each image, by name.
     file : file
-        Takes the rows to come.
+        File to which new rows are appended.
     options : dict
-        The options of the rows to come.
+        The options of new rows.
     """
 
     path: Path
@@ -157,24 +157,25 @@ class Manifest(NamedTuple):
     options: Settings
 
     def other_options(self, names: Collection[str]) -> str:
-        """Say which of some options the results do not have, and what to do; else nothing.
+        """Return a message if some of the named options differ from those of results, else "".
 
-        Rows of older versions do not say their options.
+        Rows of older versions have no options.
         """
-        wanted = {name: value for name, value in self.options.items() if name in names}
+        options = {name: value for name, value in self.options.items() if name in names}
         for row in self.rows.values():
-            known = row.get("options") if row["status"] == "done" else None
-            if isinstance(known, dict) and (different := difference(known, wanted)):
+            stored = row.get("options") if row["status"] == "done" else None
+            if isinstance(stored, dict) and (changes := difference(stored, options)):
                 return (
-                    f"{self.path.parent}: holds results with {different}; use their options or "
-                    "another folder, or do all again with --overwrite (overwrite=True)"
+                    f"{self.path.parent}: holds results with {changes}; use their options or "
+                    "another folder, or fit all images again with --overwrite (overwrite=True)"
                 )
         return ""
 
     def add(self, row: ImageRow) -> None:
-        """Record what became of an image. A skipped image keeps the row of its result.
+        """Append the row of an image. A skipped image keeps the row of its result.
 
-        If a run was killed between the file of a result and its row, the file has the figures.
+        If a run was killed after it wrote a result but before its row, the figures are those of
+        the file.
         """
         if row.status == "skipped":
             if self.rows.get(row.name, {}).get("status") == "done":
@@ -190,7 +191,7 @@ class Manifest(NamedTuple):
 
 
 def write_manifest(path: Path, rows: dict[str, Row]) -> None:
-    """Write a manifest with one line an image, sorted by name."""
+    """Write a manifest with one line per image, sorted by name."""
     with atomic_write(path) as temporary:
         lines = (json.dumps(rows[name]) + "\n" for name in sorted(rows))
         temporary.write_text("".join(lines), encoding="utf-8")
@@ -202,14 +203,14 @@ def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:
     Returns
     -------
     rows : dict of str to dict
-        The last row of each image, by its name.
+        The last row of each image, by name.
     clean : bool
-        False if the last line is cut off, as after a crash; it is then left out.
+        False if the last line is truncated, as after a crash; it is then left out.
 
     Raises
     ------
     ValueError
-        If the file holds something else than rows.
+        If the file holds anything other than rows.
     OSError
         If the file cannot be read.
     """
@@ -224,7 +225,7 @@ def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:
                 raise ValueError
         except (ValueError, TypeError, KeyError):
             raise ValueError(
-                f"{path}: line {number} is no row of a manifest; move the file, or use another "
+                f"{path}: line {number} is not a row of a manifest; move the file, or use another "
                 "folder"
             ) from None
         rows[row["name"]] = row
@@ -232,14 +233,14 @@ def read_manifest(path: Path) -> tuple[dict[str, Row], bool]:
 
 
 def fingerprint(gaussians: Gaussians) -> str:
-    """Return a text that tells a set from others, for options."""
+    """Return a hash that identifies a set among options."""
     arrays = gaussians.to_arrays().values()
     data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     return hashlib.sha256(data).hexdigest()[:16]
 
 
 def _to_json(row: ImageRow) -> Row:
-    """Return a row as types of JSON; the output without its folder, which may move."""
+    """Return a row in JSON types; the output without its folder, which may be moved."""
     plain: Row = {key: getattr(row, key) for key in KEYS if key != "options"}
     plain["input"] = None if row.input is None else str(row.input)
     plain["output"] = None if row.output is None else row.output.name

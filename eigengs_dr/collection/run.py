@@ -1,8 +1,8 @@
-"""The runner of many images: groups of images are worked on, and each image has a row of results.
+"""Runs over many images: groups of images are processed, and each image gets a row of results.
 
-In this process a run reads images ahead and writes results behind the work. On a cluster the same
-run does a chunk of images a task. What the images are decides the chunks, never how long they took,
-so that a run repeats itself.
+In this process, a run reads images ahead and writes results in the background. On a cluster, each
+task is such a run over a chunk of images. Chunks depend on the images only, never on timings, so
+that runs are reproducible.
 """
 
 from __future__ import annotations
@@ -39,38 +39,38 @@ from .manifest import ImageRow, Manifest, RowProgress, RunInterrupted, open_mani
 from .sources import Images, RunImage, list_sources, plan_output
 
 WRITERS = 2
-"""Threads that compress and write results: 5,000 Gaussians take 6 ms."""
+"""Number of threads that compress and write results: 5,000 Gaussians take 6 ms."""
 
 MAX_WRITING = 8
-"""Largest number of results that wait for their file."""
+"""Largest number of results that wait to be written."""
 
 FAILURES = (ValueError, OSError, MemoryError)
 """Errors of one image, which do not end the run."""
 
 FIGURES = ("psnr_ycbcr", "psnr_rgb", "iterations", "stopped")
-"""What a row has of a fit."""
+"""Figures of a fit in a row."""
 
 
 class Job(NamedTuple):
-    """What a run does with its images. It can travel to the workers of a cluster.
+    """The work of a run on its images, which can be sent to the workers of a cluster.
 
     Attributes
     ----------
     work : callable
         ``work(images)`` returns the results of a group, in order.
     may_join : callable
-        ``may_join(group, image)``: whether an image may join a group that is not empty; by default
-        none may.
+        ``may_join(group, image)`` returns whether an image may join a group that is not empty; by
+        default none may.
     keep_grey : bool
-        Whether the images are data, which keep one channel.
+        Whether the images are data, so that grey ones keep one channel.
     encoding : {"srgb", "linear"} or None
         See `eigengs_dr.image.io.check_image`.
     steps : int
-        Steps of gradient descent of an image: how much work it is.
+        Number of descent steps per image, as a measure of the work.
     options : dict or None
         Options on which the results depend, with values that JSON can hold.
     given : collection of str
-        Names of the options that the caller gave; others have their defaults.
+        Names of the options that the caller gave explicitly.
     """
 
     work: Callable[[list[EncodedImage]], list[Fit] | list[Gaussians]]
@@ -83,21 +83,21 @@ class Job(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """An image whose result, if any, is written.
+    """An image whose result, if there is one, is written.
 
     Attributes
     ----------
     place : int
-        Place of the image among the images of the run, from 0.
+        Index of the image in the run, from 0.
     row : ImageRow
         With the result, whether or not there is an output folder.
-    may_pass : bool
-        Whether a failure may pass by itself: a full disk, a network.
+    is_transient : bool
+        Whether a failure may be temporary, such as a full disk or a network error.
     """
 
     place: int
     row: ImageRow
-    may_pass: bool = False
+    is_transient: bool = False
 
 
 def run_images(
@@ -110,21 +110,21 @@ def run_images(
 ) -> list[ImageRow]:
     """Run a job; for arguments, rows and errors see `eigengs_dr.fit_many`.
 
-    In this process the images on which there is work end in their order.
+    In this process, images that are processed end in order.
     """
     sources = list_sources(images)
     total = len(sources) if isinstance(sources, list) else None
     executor = None if client is None else executor_for(client)
     rows: dict[int, ImageRow] = {}
 
-    def note(place: int, row: ImageRow) -> None:
+    def record(place: int, row: ImageRow) -> None:
         if manifest:
             manifest.add(row)
         rows[place] = replace(row, result=None) if manifest else row
         if progress:
             progress(len(rows), total, row)
 
-    def with_work() -> Iterator[RunImage]:
+    def unfinished() -> Iterator[RunImage]:
         for source in sources:
             planned: RunImage | ImageRow = source
             if source.error:
@@ -132,32 +132,32 @@ def run_images(
             elif manifest:
                 planned = plan_output(source, manifest, overwrite)
             if isinstance(planned, ImageRow):
-                note(source.place, planned)
+                record(source.place, planned)
                 continue
-            if other:
-                raise ValueError(other)
+            if conflict:
+                raise ValueError(conflict)
             yield planned
 
     with ExitStack() as stack:
         manifest: Manifest | None = None
-        other = ""  # options that results do not have
+        conflict = ""  # message about options that differ from those of results
         if output is not None:
             manifest = stack.enter_context(open_manifest(make_folder(output), job.options))
             if not overwrite:
-                if given := manifest.other_options(job.given):
-                    raise ValueError(given)
-                other = manifest.other_options(job.options or {})
+                if message := manifest.other_options(job.given):
+                    raise ValueError(message)
+                conflict = manifest.other_options(job.options or {})
         if executor is None:
-            found = run_here(with_work(), job)
+            finished = run_here(unfinished(), job)
         else:
-            found = run_on_workers(with_work(), job, executor, total, output is None)
+            finished = run_on_workers(unfinished(), job, executor, total, output is None)
         try:
-            for place, row, _ in stack.enter_context(closing(found)):
-                note(place, row)
+            for place, row, _ in stack.enter_context(closing(finished)):
+                record(place, row)
         except KeyboardInterrupt:
             raise RunInterrupted([rows[place] for place in sorted(rows)]) from None
-    if other:
-        warn(other)
+    if conflict:
+        warn(conflict)
     return [rows[place] for place in sorted(rows)]
 
 
@@ -183,24 +183,24 @@ def make_folder(output: str | os.PathLike[str]) -> Path:
 # ---------------------------------------------------------------------------------------------
 
 Decoded = tuple[RunImage, EncodedImage | Exception]
-"""An image that was read, or why it cannot be read."""
+"""An image that was read, or the error."""
 
 Writing = tuple[RunImage, ImageRow, "Future[None] | None"]
-"""An image, and its file if that is being written."""
+"""An image, its row, and the pending write of its file, if any."""
 
 
 def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None, None]:
-    """Work on groups of images, and write each result while the next ones are computed.
+    """Process groups of images, and write each result while the next ones are computed.
 
     Yields
     ------
     Finished
-        One for each image, in order. Its result is written before.
+        One for each image, in order, after its result is written.
 
     Raises
     ------
     KeyboardInterrupt
-        After Ctrl-C or SIGTERM, when all results are written and yielded.
+        After Ctrl-C or SIGTERM, once all results are written and yielded.
     """
     decoded = read_ahead(sources, partial(_decode, job=job), _is_file, _bytes_of)
     writing: deque[Writing] = deque()
@@ -214,7 +214,7 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
                 for source, row, gaussians in _work_on(group, job):
                     file = None
                     if gaussians is not None and row.output:
-                        # The thread that calls this owns all work of Dr.Jit.
+                        # Only this thread uses Dr.Jit: the writers get NumPy arrays.
                         file = pool.submit(write, row.output, gaussians.data(), _figures_of(row))
                     writing.append((source, row, file))
                     while writing and (len(writing) > MAX_WRITING or _is_written(writing[0])):
@@ -228,7 +228,7 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
 
 
 def _decode(source: RunImage, job: Job) -> Decoded:
-    """Read one image. An array is copied: its owner may overwrite it."""
+    """Read one image. An array is copied, because its owner may overwrite it."""
     try:
         if job.keep_grey:
             return source, EncodedImage(check_data(source.image), "srgb")
@@ -247,10 +247,10 @@ def _bytes_of(decoded: Decoded) -> int:
 
 
 def _groups(decoded: Iterable[Decoded], job: Job) -> Iterator[list[Decoded]]:
-    """Collect consecutive images that may be worked on together."""
+    """Collect consecutive images that may be processed together."""
     group: list[Decoded] = []
     for source, image in decoded:
-        images = [found for _, found in group if isinstance(found, EncodedImage)]
+        images = [member for _, member in group if isinstance(member, EncodedImage)]
         joins = (
             images
             and isinstance(image, EncodedImage)
@@ -284,7 +284,7 @@ def _work_on(
 
 
 def _figures_of(row: ImageRow) -> FitFigures | None:
-    """Return what the file of a fit says of it."""
+    """Return the figures that are stored in the file of a fit."""
     if row.psnr_ycbcr is None or row.psnr_rgb is None:
         return None
     name = "" if row.input is None else Path(row.input).name
@@ -292,18 +292,18 @@ def _figures_of(row: ImageRow) -> FitFigures | None:
 
 
 def _results(images: list, job: Job) -> list:
-    """Return the results of a group; if it fails, its images say one by one what is wrong."""
+    """Return the results of a group; if it fails, process its images one by one."""
     if isinstance(images[0], Exception):
         return images
     try:
-        with exclusive():  # for a group, so that other threads wait for no folder
+        with exclusive():  # per group, so that other threads need not wait for the run
             return list(job.work(images))
     except FAILURES as error:
         return [error] if len(images) == 1 else [_results([image], job)[0] for image in images]
 
 
 def _failed(source: RunImage, error: Exception) -> ImageRow:
-    """Return the row of an image that failed; its result is the error."""
+    """Return the row of an image that failed; the error is stored as its result."""
     name, text = str(source.path or source.name), str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename is not None:
         text = f"{error.filename}: {error.strerror}"
@@ -317,14 +317,14 @@ def _is_written(entry: Writing) -> bool:
 
 
 def _finish(source: RunImage, row: ImageRow, file: Future[None] | None) -> Finished:
-    """Wait for the file of a result; a file that cannot be written is an error of the image."""
+    """Wait until a result is written; a file that cannot be written is an error of the image."""
     try:
         if file:
             file.result()
     except OSError as error:
         row = _failed(source, error)
-    may_pass = isinstance(row.result, OSError)
-    return Finished(source.place, replace(row, result=None) if row.error else row, may_pass)
+    is_transient = isinstance(row.result, OSError)
+    return Finished(source.place, replace(row, result=None) if row.error else row, is_transient)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -332,27 +332,28 @@ def _finish(source: RunImage, row: ImageRow, file: Future[None] | None) -> Finis
 # ---------------------------------------------------------------------------------------------
 
 MAX_CHUNK_WORK = 1 << 27
-"""Pixels times steps of a chunk, for some seconds; the bytes of a file stand for its pixels. A task
-costs Dask some milliseconds, and a lost worker loses half a chunk on average."""
+"""Largest work of a chunk, in pixels times steps, for a few seconds; the size of a file in bytes
+stands for its pixels. A task costs Dask some milliseconds, and a lost worker loses half a chunk on
+average."""
 
-MAX_CHUNK = 256
-"""Images of the largest chunk."""
+MAX_CHUNK_IMAGES = 256
+"""Largest number of images of a chunk."""
 
-FIRST_STEPS = 10
-"""Steps of gradient descent that take as long as what comes before the first one."""
+SETUP_STEPS = 10
+"""Number of descent steps that take as long as the work before the first step."""
 
-URL_SIZE = 1 << 16
-"""Pixels that stand for an image behind a URL, which nothing is known of."""
+URL_PIXELS = 1 << 16
+"""Assumed number of pixels of an image at a URL, whose size is unknown."""
 
-BYTE_WORK = 8
-"""Work of a byte of an array: the scheduler keeps a copy, of at most 16 MB, until its chunk is
+WORK_PER_BYTE = 8
+"""Minimum work per byte of an array: the scheduler keeps a copy of at most 16 MB until the chunk is
 done."""
 
 
 def run_on_workers(
     sources: Iterable[RunImage], job: Job, executor: Executor, total: int | None, keep: bool
 ) -> Generator[Finished, None, None]:
-    """Work on images by an executor.
+    """Process images with an executor.
 
     Parameters
     ----------
@@ -362,22 +363,22 @@ def run_on_workers(
     total : int or None
         Number of images, if it is known.
     keep : bool
-        Whether results travel back.
+        Whether results are sent back.
 
     Yields
     ------
     Finished
-        One for each image, in any order. An image whose failure may pass is tried once more. So
-        are the images of a chunk that ends its worker, one by one: an image fails for its own fault
-        only.
+        One for each image, in any order. An image whose failure may be temporary is tried once
+        more. So are the images of a chunk that crashed its worker, one by one, so that no image
+        fails because of another.
 
     Raises
     ------
     ClusterError
         If the cluster is lost.
     """
-    again: list[RunImage] = []
-    chunks = _cut(sources, job, total, executor.workers), ([source] for source in again)
+    retries: list[RunImage] = []
+    chunks = _cut(sources, job, total, executor.workers), ([source] for source in retries)
     for last, tasks in enumerate(chunks):
         with closing(executor.map(run_chunk, tasks, (job, keep, Path.cwd()))) as ended:
             for chunk, result, lost in ended:
@@ -385,38 +386,38 @@ def run_on_workers(
                 for text in notes:
                     warn(text)
                 for source, entry in zip(chunk, finished, strict=True):
-                    if entry.may_pass and not last:
-                        again.append(source)
+                    if entry.is_transient and not last:
+                        retries.append(source)
                     else:
                         yield entry
 
 
 def _lost(source: RunImage, lost: str) -> Finished:
-    """Return an image whose chunk has ended its worker."""
+    """Return the failure of an image whose chunk crashed its worker."""
     error = f"{source.path or source.name}: {lost}"
-    return Finished(source.place, source.row("failed", error=error), may_pass=True)
+    return Finished(source.place, source.row("failed", error=error), is_transient=True)
 
 
 def run_chunk(
     chunk: list[RunImage], shared: tuple[Job, bool, Path]
 ) -> tuple[list[Finished], list[str]]:
-    """Work on the images of a chunk, on a worker; return what became of them, and its warnings.
+    """Process the images of a chunk on a worker; return the finished images and the warnings.
 
-    Names are relative to the folder of the client, as the user gave them, and so in the rows.
+    Names in the rows are as the user gave them, relative to the folder of the client.
     """
     job, keep, folder = shared
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        found = list(run_here((_absolute(source, folder) for source in chunk), job))
+        results = list(run_here((_absolute(source, folder) for source in chunk), job))
     finished = []
-    for source, entry in zip(chunk, found, strict=True):
+    for source, entry in zip(chunk, results, strict=True):
         row = replace(entry.row, input=source.path, output=source.output)
         finished.append(entry._replace(row=row if keep else replace(row, result=None)))
     return finished, [str(n.message) for n in caught if issubclass(n.category, UserWarning)]
 
 
 def _absolute(source: RunImage, folder: Path) -> RunImage:
-    """Name files from the root: a worker runs in another folder."""
+    """Make file names absolute, because a worker runs in another folder."""
     image = folder / source.image if isinstance(source.image, Path) else source.image
     return source._replace(image=image, output=source.output and folder / source.output)
 
@@ -424,21 +425,21 @@ def _absolute(source: RunImage, folder: Path) -> RunImage:
 def _cut(
     sources: Iterable[RunImage], job: Job, total: int | None, workers: int
 ) -> Iterator[list[RunImage]]:
-    """Cut the images into chunks.
+    """Divide the images into chunks.
 
-    The last ones are shorter, so that all workers end at about the same time.
+    The last chunks are shorter, so that all workers end at about the same time.
     """
     chunk: list[RunImage] = []
     work = 0
     for source in sources:
-        if source.path is None:  # a copy, as its owner may reuse it
+        if source.path is None:  # a copy, because the owner may overwrite the array
             source = source._replace(image=np.array(source.image))
         chunk.append(source)
         work += _work_of(source, job.steps)
-        longest = MAX_CHUNK
-        if total is not None:  # images without work count too, as those that an earlier run did
-            longest = min(MAX_CHUNK, (total - 1 - source.place) // (2 * workers))
-        if len(chunk) >= longest or work >= MAX_CHUNK_WORK:
+        limit = MAX_CHUNK_IMAGES
+        if total is not None:  # this counts images that are skipped too
+            limit = min(MAX_CHUNK_IMAGES, (total - 1 - source.place) // (2 * workers))
+        if len(chunk) >= limit or work >= MAX_CHUNK_WORK:
             yield chunk
             chunk, work = [], 0
     if chunk:
@@ -446,12 +447,12 @@ def _cut(
 
 
 def _work_of(source: RunImage, steps: int) -> int:
-    """Return the pixels of an image times its steps, as far as they are known."""
-    steps += FIRST_STEPS
+    """Estimate the work on an image, in pixels times steps."""
+    steps += SETUP_STEPS
     if source.path is None:
         pixels = math.prod(source.image.shape[:2])
-        return max(pixels * steps, BYTE_WORK * source.image.nbytes)
+        return max(pixels * steps, WORK_PER_BYTE * source.image.nbytes)
     if isinstance(source.path, str):
-        return URL_SIZE * steps
-    # What is wrong with a file, the worker says.
+        return URL_PIXELS * steps
+    # Errors of a file are left to the worker.
     return source.path.stat().st_size * steps if source.path.is_file() else 0

@@ -17,7 +17,7 @@ from ..image.remote import is_url, stem_of
 from .manifest import ImageRow, Manifest
 
 Images = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | ArrayLike]
-"""A folder, a glob, a URL of one of them, or any iterable of image files, their URLs and arrays."""
+"""A folder, a glob, a URL of one of them, or an iterable of image files, URLs and arrays."""
 
 
 class RunImage(NamedTuple):
@@ -26,15 +26,15 @@ class RunImage(NamedTuple):
     Attributes
     ----------
     place : int
-        Place among the images of the run, from 0.
+        Index in the run, from 0.
     name : str
-        Stem of the file, or the number of the array with six digits.
+        Stem of the file, or the index of the array with six digits.
     image : Path, str or array_like
         A file, a URL, or the pixels.
     output : Path or None
         The file of the result; None keeps the result in memory.
     error : str
-        Why there is no work on the image.
+        Reason why the image cannot be processed.
     """
 
     place: int
@@ -49,7 +49,7 @@ class RunImage(NamedTuple):
         return self.image if isinstance(self.image, (Path, str)) else None
 
     def row(self, status: str, **figures: Any) -> ImageRow:
-        """Return a row of the image."""
+        """Return a row for the image."""
         return ImageRow(self.name, status, self.path, self.output, **figures)
 
 
@@ -60,27 +60,27 @@ def list_sources(images: Images) -> Iterable[RunImage]:
     ----------
     images : path-like or iterable
         A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of a folder, a glob or a file; or
-        an iterable of files, of URLs and of arrays, see `eigengs_dr.image.io.check_image`.
+        an iterable of files, URLs and arrays, see `eigengs_dr.image.io.check_image`.
 
     Returns
     -------
     iterable of RunImage
-        A list, if `images` has a length; else an iterator that reads `images` when it is read. In
-        an iterator, an image whose name is taken has an error.
+        A list if `images` has a length, otherwise a lazy iterator. In an iterator, an image whose
+        name is already used has an error.
 
     Raises
     ------
     ValueError
-        If two images have one name, there is no image, or `images` is one array of one image.
+        If two images have the same name, there is no image, or `images` is the array of one image.
     """
     if isinstance(images, (str, os.PathLike)):
         images = list_images(images)
     if isinstance(images, np.ndarray) and (images.ndim < 3 or images.shape[2:] in ((1,), (3,))):
-        raise ValueError(f"images: found one array of shape {images.shape}; pass a list of images")
+        raise ValueError(f"images: got one array of shape {images.shape}; pass a list of images")
     if not isinstance(images, (Sequence, np.ndarray)):
         return _name_each(images)
     if len(images) == 0:
-        raise ValueError("images: found none; pass at least one image")
+        raise ValueError("images: got none; pass at least one image")
     sources = list(_name_each(images))
     for source in sources:
         if source.error:
@@ -89,7 +89,7 @@ def list_sources(images: Images) -> Iterable[RunImage]:
 
 
 def _name_each(images: Iterable) -> Iterator[RunImage]:
-    """Name images one by one; a name that is taken is an error of the image."""
+    """Name images one by one; a name that is already used is an error of the image."""
     taken: Record = {}
     for place, image in enumerate(images):
         is_file = isinstance(image, (str, os.PathLike))
@@ -103,7 +103,7 @@ def _name_each(images: Iterable) -> Iterator[RunImage]:
 
 
 def plan_output(source: RunImage, manifest: Manifest, overwrite: bool) -> RunImage | ImageRow:
-    """Give a source its output file, or return its row if there is no work on it.
+    """Assign its output file to a source, or return its row if there is no work on it.
 
     Parameters
     ----------
@@ -111,8 +111,8 @@ def plan_output(source: RunImage, manifest: Manifest, overwrite: bool) -> RunIma
     manifest : Manifest
         The manifest of the output folder.
     overwrite : bool
-        Do images again whose result exists. A file that holds something else, such as a basis, is
-        never replaced.
+        Process images again whose result exists. A file of another kind, such as a basis, is never
+        replaced.
     """
     output = manifest.path.with_name(f"{source.name}.npz")
     source = source._replace(output=output)
@@ -125,7 +125,7 @@ def plan_output(source: RunImage, manifest: Manifest, overwrite: bool) -> RunIma
     try:
         head = read_head(output)
     except (ValueError, OSError):
-        error = f"{output}: exists and is no set of Gaussians; move it, or use another folder"
+        error = f"{output}: exists and is not a set of Gaussians; move it, or use another folder"
         return source.row("failed", error=error)
     if overwrite or row.get("status") == "failed":
         return source

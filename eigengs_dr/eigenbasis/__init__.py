@@ -1,10 +1,11 @@
-"""A family of images: one set of Gaussians for all of its principal components.
+"""Families of images: one set of Gaussians for all principal components.
 
 - ``pca``: the principal components
-- ``components``: an eigenbasis to a model: shared Gaussians, and their weights in all components
+- ``components``: from an eigenbasis to shared Gaussians and their weights in all components
 - ``eigengs``: the model `EigenGS`
-- ``encoder``: an image to Gaussians of the model, or to coefficients
+- ``encoder``: from an image to Gaussians of the model, or to coefficients
+- ``normal_equations``: the best colours of many images on the same shapes
 - ``options``: the options of a training
-- ``training``: a folder of images to a model, and its figures on images held out
+- ``training``: from a folder of images to a model, with figures of held-out images
 - ``model_file``: the file of a model
 """

@@ -27,7 +27,7 @@ from ..image.resize import resample
 from .model_file import read_members, write_model
 from .pca.truncation import TruncationCurve, curve_from_eigenvalues, name_components
 
-if TYPE_CHECKING:  # what trains, encodes and runs over many images is imported where it is called
+if TYPE_CHECKING:  # training, encoding and runs over many images are imported on demand
     from ..collection.manifest import ImageRow
     from ..collection.sources import Images
     from ..image.folder import TrainingImages
@@ -49,20 +49,21 @@ class EigenGS:
     gaussians : Gaussians
         N Gaussians at the size of the training images, with the colours of the mean image.
     weights : tuple of C ndarrays of float32, shape (k_c, N + 1)
-        Weight ``psi_nj`` of Gaussian n in component j, in the order of falling eigenvalues; the
+        Weight ``psi_nj`` of Gaussian n in component j, in the order of descending eigenvalues; the
         last column is the background ``beta_j``.
     eigenvalues : tuple of C ndarrays of float64, shape (k_c,)
         Variance along each component.
     mean_image : ndarray of float32, shape (C, H, W)
         Pixels of the mean image, in the space of the Gaussians.
     low, low_components : int
-        The first `low` Gaussians serve the first `low_components` of each channel alone; both are
-        0 if all Gaussians serve all components.
+        The first `low` Gaussians only represent the first `low_components` of each channel; both
+        are 0 if all Gaussians represent all components.
     variance : ndarray of float64, shape (C,) or (0,)
         See `eigengs_dr.Eigenbasis`; empty in a file of version 1.
     held_out : ndarray of float64, shape (n + 1,) or (0,)
-        Mean PSNR in dB of PCA with 0, 1, ..., n components, for images held out of the training;
-        see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. Empty if no image was held out.
+        Mean PSNR in dB of PCA with 0, 1, ..., n components, for images that were held out of the
+        training; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. Empty if there were
+        none.
     figures : dict of str to float
         See `eigengs_dr.eigenbasis.components.solve.fit_model`; not saved.
     """
@@ -96,23 +97,24 @@ class EigenGS:
         Parameters
         ----------
         basis : Eigenbasis, or path, array or iterable
-            Images stand for their basis, ``Eigenbasis.from_images(images)``.
+            Images are converted to their basis, ``Eigenbasis.from_images(images)``.
         gaussians : int, optional
             Number of Gaussians, at most one per pixel.
         frequency_aware : {"auto", True, False}, optional
-            Whether a tenth of the Gaussians serve the first 50 components alone, and the others
-            the rest; "auto" does so from 512 pixels on, the longer side.
+            Whether a tenth of the Gaussians only represent the first 50 components, and the others
+            the rest; "auto" does so if the longer side has at least 512 pixels.
         seed : int, optional
         preset : {"default", "eigengs"}, optional
             "default" places Gaussians on a grid and solves for all weights by one factorisation.
             "eigengs" trains shapes and weights from a random start, with the paper's settings.
         iterations : int, optional
-            Training steps. "default" trains the shapes (0 by default; 300 gain 0.3 dB), "eigengs"
-            shapes and weights (15,000 by default, which take hours without a GPU).
+            Number of training steps. "default" trains the shapes (0 steps by default; 300 gain
+            0.3 dB), "eigengs" shapes and weights (15,000 by default, which take hours without a
+            GPU).
         backend : {"llvm", "cuda"}, optional
         progress : bool or callable, optional
-            By default a bar, in a terminal or a notebook, after two seconds; False shows none.
-            ``progress(step, steps, {})`` after every round of training.
+            By default a bar, in a terminal or a notebook, after two seconds; False shows none. A
+            function is called as ``progress(step, steps, {})`` after every round of training.
 
         Raises
         ------
@@ -151,7 +153,7 @@ class EigenGS:
     def truncation_curve(self) -> TruncationCurve | None:
         """Return the truncation curve of the PCA of the training images.
 
-        It is None for a file of version 1, which lacks the variance.
+        It is None for a file of version 1, which does not hold the variance.
         """
         if not len(self.variance):
             return None
@@ -159,11 +161,11 @@ class EigenGS:
 
     @takes_numbers
     def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
-        """Find the coefficients of an image by least squares on the rendered components.
+        """Compute the coefficients of an image by least squares on the rendered components.
 
         The function solves ``min_a |Psi~ a - (I - Psi~_0)|^2``. If the Gaussians render the
         components well, the result is the projection of PCA. With nearly as many components as
-        Gaussians, single coefficients are large and mean little, but their sum renders well.
+        Gaussians, individual coefficients are large and not meaningful, but their sum renders well.
 
         Parameters
         ----------
@@ -171,7 +173,7 @@ class EigenGS:
             An image of any size; it is resampled to the size of the model.
         target_psnr : float, optional
             Use the fewest components that reach this PSNR, in dB, for the image at the size of the
-            model; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. All by default.
+            model; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. By default all.
 
         Returns
         -------
@@ -193,7 +195,7 @@ class EigenGS:
     def reconstruct(
         self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
     ) -> Gaussians:
-        """Turn coefficients into Gaussians, by one matrix product for each channel.
+        """Convert coefficients to Gaussians, by one matrix product per channel.
 
         Parameters
         ----------
@@ -205,7 +207,7 @@ class EigenGS:
         Raises
         ------
         ValueError
-            If there is not one array for each channel, or one has over k_c coefficients.
+            If there is not one array per channel, or one has more than k_c coefficients.
         """
         return self.encoder.reconstruct(coefficients, size)
 
@@ -217,7 +219,7 @@ class EigenGS:
         mean: str = "gaussians",
         target_psnr: float | None = None,
     ) -> Gaussians:
-        """Encode an image as Gaussians of its size, without optimisation.
+        """Encode an image as Gaussians with its native size, without optimisation.
 
         Parameters
         ----------
@@ -225,18 +227,20 @@ class EigenGS:
             An image of any size and aspect ratio; it is resampled to the size of the model, and
             the Gaussians are scaled to the size of the image.
         colors : {"exact", "projected"}, optional
-            "exact" finds the best colours for the shapes, by back-substitution. With a split, it
-            finds the best colours of the first `low` Gaussians, then those of the others for the
-            residual. "projected" uses as many degrees of freedom as there are components.
+            "exact" computes the best colours for the shapes, by back-substitution. With a split, it
+            computes the best colours of the first `low` Gaussians, then those of the others for the
+            residual. "projected" has as many degrees of freedom as there are components.
         mean : {"gaussians", "dense"}, optional
-            "dense" is the form of the paper: the result lacks the mean image, `dense_mean`.
+            "dense" is the form of the paper: the result does not include the mean image,
+            `dense_mean`.
         target_psnr : float, optional
-            Use the fewest components that reach this PSNR; for "projected" alone, see `project`.
+            Use the fewest components that reach this PSNR; only with "projected", see `project`.
 
         Raises
         ------
         ValueError
-            As `project`; also if an option is unknown, or a target comes with exact colours.
+            As for `project`; also if an option is unknown, or a target is combined with exact
+            colours.
         """
         pixels = check_image(image, copy=False)
         return self.encoder.encode(pixels, colors, mean, target_psnr)
@@ -255,15 +259,15 @@ class EigenGS:
         progress: Any = None,
         client: object = None,
     ) -> list[ImageRow]:
-        """Encode many images; a bad image is a row with its error and does not end the run.
+        """Encode many images; an image that fails gets a row with its error, and the run continues.
 
         Parameters
         ----------
         images, output, overwrite, progress, client
-            See `eigengs_dr.fit_many`. ``ImageRow.result`` is a `Gaussians`, if there is no output
-            folder; rows have no PSNR.
+            See `eigengs_dr.fit_many`. Without an output folder, ``ImageRow.result`` is a
+            `Gaussians`; rows have no PSNR.
         colors, mean, target_psnr
-            See `encode`. The Gaussians have the bits of `encode`.
+            See `encode`. The Gaussians are bit-identical to those of `encode`.
 
         Returns
         -------
@@ -288,11 +292,11 @@ class EigenGS:
 
     @takes_numbers
     def dense_mean(self, width: int, height: int) -> Planes:
-        """Return the pixels of the mean image, shape (height, width, C), in the model's space."""
+        """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
         return resample(np.moveaxis(self.mean_image, 0, 2), width, height)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an ``.npz`` file, all or nothing; after OSError, an old file is unchanged."""
+        """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
         write_model(path, self)
 
     @classmethod
@@ -302,13 +306,13 @@ class EigenGS:
         Parameters
         ----------
         path : path-like
-            A file, or a name of `SHIPPED`, whose file is read once.
+            A file, or a name in `SHIPPED`; the latter are read once and cached.
         backend : {"llvm", "cuda"}, optional
 
         Raises
         ------
         ValueError, OSError
-            As `eigengs_dr.Gaussians.load`, for a model; also if there is no such file and name.
+            As for `eigengs_dr.Gaussians.load`; also if there is no such file or name.
         """
         if path in SHIPPED:
             return _shipped(str(path), backend)
@@ -318,12 +322,12 @@ class EigenGS:
         return cls(**read_members(path, backend))
 
     def __getstate__(self) -> Record:
-        """Leave the encoder here: what it has computed holds arrays of Dr.Jit."""
+        """Leave out the encoder, whose cached values are Dr.Jit arrays."""
         return {key: value for key, value in self.__dict__.items() if key != "encoder"}
 
     @cached_property
     def encoder(self) -> Encoder:
-        """The functions of `eigengs_dr.eigenbasis.encoder`, with what they compute once."""
+        """The `eigengs_dr.eigenbasis.encoder.Encoder` of the model, with cached values."""
         from .encoder import Encoder
 
         return Encoder(self.gaussians, self.weights, self.mean_image, self.low)
@@ -332,10 +336,10 @@ class EigenGS:
 def _encode_all(
     images: list[EncodedImage], model: EigenGS, options: tuple[str, str, float | None]
 ) -> list[Gaussians]:
-    """Encode images, here or on a worker."""
+    """Encode images, in this process or on a worker."""
     return [model.encode(image, *options) for image in images]
 
 
-@cache  # a file of the package does not change
+@cache  # files of the package do not change
 def _shipped(name: str, backend: str | None) -> EigenGS:
     return EigenGS(**read_members(SHIPPED[name], backend))

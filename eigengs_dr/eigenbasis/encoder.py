@@ -1,9 +1,9 @@
-"""Images to Gaussians of a model: colours by least squares on its shapes or on its components.
+"""Encoding of images as Gaussians of a model: least squares on its shapes or on its components.
 
-Coefficients are least squares on the rendered components Psi~: on all, or on the fewest for a PSNR.
-With the Cholesky factor L of ``Psi~^T Psi~``, the coefficients of an image x are ``a = L^-T y``
-with ``y = L^-1 Psi~^T x``. The entries of y are the coefficients on the components after
-Gram-Schmidt orthonormalisation. Therefore the first k components leave the error
+Coefficients solve least squares on the rendered components Psi~: on all, or on the fewest for a
+PSNR. With the Cholesky factor L of ``Psi~^T Psi~``, the coefficients of an image x are
+``a = L^-T y`` with ``y = L^-1 Psi~^T x``. The entries of y are the coefficients on the components
+after Gram-Schmidt orthonormalisation. Therefore the residual of the first k components is
 ``|x|^2 - sum_(j <= k) y_j^2``, and their coefficients follow from the leading blocks of L and y.
 """
 
@@ -31,7 +31,7 @@ Columns = NDArray[np.float64]
 @class_of_doors
 @dataclass(frozen=True, eq=False)
 class Encoder:
-    """What images of one model share, and the functions that need it.
+    """The functions that encode images by a model, with the values that all images share.
 
     Attributes
     ----------
@@ -46,14 +46,14 @@ class Encoder:
 
     @cached_property
     def equations(self) -> NormalEquations:
-        """Normal equations of all Gaussians, with their factors."""
+        """Factorised normal equations of all Gaussians."""
         return NormalEquations(self.gaussians, self.low)
 
     def project(self, image: Planes, target_psnr: float | None) -> tuple[Planes, ...]:
         """Return the coefficients of a checked image (H, W, 3); see `eigengs_dr.EigenGS.project`.
 
-        A target is in dB. The ridge on the diagonal of ``Psi~^T Psi~`` makes the real error smaller
-        than the estimate.
+        A target is in dB. Because of the ridge on the diagonal of ``Psi~^T Psi~``, the actual error
+        is smaller than the estimate.
         """
         pixels = resample(image, self.gaussians.width, self.gaussians.height)
         return self._coefficients(pixels, self._correlate(pixels), False, target_psnr)
@@ -61,13 +61,13 @@ class Encoder:
     def reconstruct(
         self, coefficients: Sequence[ArrayLike], size: tuple[int, int] | None = None
     ) -> Gaussians:
-        """Turn coefficients into Gaussians; see `eigengs_dr.EigenGS.reconstruct`."""
+        """Convert coefficients to Gaussians; see `eigengs_dr.EigenGS.reconstruct`."""
         shapes = [np.shape(values) for values in coefficients]
-        most = tuple(len(weights) for weights in self.weights)
-        if len(shapes) != len(most) or not all(
-            len(shape) == 1 and shape[0] <= k for shape, k in zip(shapes, most, strict=True)
+        limits = tuple(len(weights) for weights in self.weights)
+        if len(shapes) != len(limits) or not all(
+            len(shape) == 1 and shape[0] <= k for shape, k in zip(shapes, limits, strict=True)
         ):
-            raise ValueError(f"coefficients have shapes {shapes}; expected up to {most}")
+            raise ValueError(f"coefficients have shapes {shapes}; expected up to {limits}")
         return self._colored(self._mean_colors + self._sum(coefficients), size)
 
     def encode(self, image: Planes, colors: str, mean: str, target_psnr: float | None) -> Gaussians:
@@ -88,18 +88,19 @@ class Encoder:
     def _correlate(self, pixels: Planes) -> Columns:
         """Return ``[A 1]^T x`` of all channels of an image of the model's size, shape (N + 1, C).
 
-        The conversion of RGB pixels D is affine: ``A^T (M D + o) = M A^T D + o A^T 1``. There are
-        fewer Gaussians than pixels, and the colours of "coffee" have half of the rounding error.
+        The conversion of RGB pixels D is affine: ``A^T (M D + o) = M A^T D + o A^T 1``. Converting
+        the correlations is cheaper, as there are fewer Gaussians than pixels, and halves the
+        rounding error of the colours of "coffee".
         """
-        found = self.equations.correlate(np.moveaxis(pixels, 2, 0))
+        correlations = self.equations.correlate(np.moveaxis(pixels, 2, 0))
         if self.gaussians.space == "rgb":
-            return found
+            return correlations
         area = self.gaussians.width * self.gaussians.height
         black = np.outer(np.append(self.equations.coverage, area), YCBCR_OFFSET)
-        return found @ RGB_TO_YCBCR.T + black
+        return correlations @ RGB_TO_YCBCR.T + black
 
     def _colored(self, columns: Columns, size: tuple[int, int] | None) -> Gaussians:
-        """Return the shapes of the model with colours and background, scaled to a size."""
+        """Return the shapes of the model with new colours and background, scaled to a size."""
         result = with_colors(self.gaussians, columns, self.gaussians.space)
         return result.scaled(*size) if size else result
 
@@ -124,8 +125,8 @@ class Encoder:
         """Cholesky factors L of ``Psi~^T Psi~``, one for each channel."""
         factors = []
         for rows in self.weights:
-            # Double precision and a ridge: in some models components outnumber the Gaussians, or
-            # two components render alike.
+            # Double precision and a ridge, because in some models there are more components than
+            # Gaussians, or two components have nearly equal renderings.
             double = rows.astype(np.float64)
             gram = double @ self.equations.product(double.T)
             gram += np.eye(len(gram)) * (1e-9 * np.trace(gram) / max(1, len(gram)) + 1e-30)
@@ -137,12 +138,12 @@ class Encoder:
     ) -> tuple[Planes, ...]:
         """Solve least squares on the rendered components for an image of the model's size.
 
-        `centred` correlations lack the mean image.
+        `centred` correlations do not include the mean image.
         """
         products = correlations if centred else correlations - self._mean_product
         halves = []
         for c, (weights, factor) in enumerate(zip(self.weights, self._factors, strict=True)):
-            # Not BLAS: its threads and those of Dr.Jit wait for each other, which is twice as slow.
+            # Not BLAS, whose threads wait for those of Dr.Jit and vice versa: twice as slow.
             right = np.einsum("jn,n->j", weights, products[:, c].astype(np.float32))
             halves.append(_solve(factor, right))
         counts: Sequence[int] = [len(y) for y in halves]
@@ -181,7 +182,7 @@ def _solve(lower: Columns, right: NDArray, transposed: bool = False) -> Columns:
 
 
 def check_encoding(colors: str, mean: str, target_psnr: float | None) -> None:
-    """Raise ValueError for options of `eigengs_dr.EigenGS.encode` that are unknown or contradict.
+    """Raise ValueError if options of `eigengs_dr.EigenGS.encode` are unknown or contradictory.
 
     Parameters
     ----------

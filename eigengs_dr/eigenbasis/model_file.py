@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 FORMAT, VERSION = "eigengs_dr.model", 3
 
 MAX_ENTRIES = 1 << 28
-"""Most elements of an array: 300 components of a million Gaussians have about as many."""
+"""Largest number of elements of an array: 300 components of a million Gaussians need about this."""
 
 MAX_WEIGHT = 1e6
 """Largest valid colour or weight; 1 is white."""
 
 MAX_PSNR = 200.0
-"""Largest valid PSNR in dB, positive or negative; no real PSNR comes near."""
+"""Largest valid absolute PSNR in dB, far above any actual PSNR."""
 
 LAYOUT_V1: dict[str, Field] = {
     "mean": Field("f4", 2),
@@ -43,19 +43,19 @@ LAYOUT_V1: dict[str, Field] = {
     **{f"scale{c}": Field("f4", 1) for c in range(3)},
     **{f"eigenvalues{c}": Field("f8", 1) for c in range(3)},
 }
-"""Arrays of a file of version 1: kind and number of dimensions."""
+"""Arrays of a file of version 1, with their types and numbers of dimensions."""
 
 LAYOUT: dict[str, Field] = {
     **LAYOUT_V1,
     "variance": Field("f8", 1),
     "held_out": Field("f8", 1),
 }
-"""Arrays of a file; version 2 added the last two, for the truncation curve, and a text, which
-version 3 left out."""
+"""Arrays of a file. Version 2 added the last two, for the truncation curve, and a text that version
+3 removed."""
 
 
 def write_model(path: str | os.PathLike[str], model: EigenGS) -> None:
-    """Write the file of a model, all or nothing; see `eigengs_dr.EigenGS.save`."""
+    """Write the file of a model atomically; see `eigengs_dr.EigenGS.save`."""
     members = to_members(model)
     try:
         check_members(members)
@@ -77,16 +77,18 @@ def read_members(path: str | os.PathLike[str], backend: str | None) -> Record:
 def to_members(model: EigenGS) -> dict[str, NDArray]:
     """Convert a model to the arrays of its file.
 
-    Weights are stored in half precision; each component is scaled by its largest weight. The
+    Weights are stored in half precision, with each component scaled by its largest weight. The
     rounding error is at least 60 dB below the image.
 
     Raises
     ------
     ValueError
-        If the Gaussians have another cutoff than the default: the file does not hold it.
+        If the Gaussians do not have the default cutoff, because the file does not store it.
     """
     if model.gaussians.cutoff != CUTOFF:
-        raise ValueError(f"the cutoff is {model.gaussians.cutoff}; a model is saved with {CUTOFF}")
+        raise ValueError(
+            f"the cutoff is {model.gaussians.cutoff}; a model can only be saved with {CUTOFF}"
+        )
     arrays = {key: v.astype(np.float32) for key, v in model.gaussians.to_arrays().items()}
     members: dict[str, NDArray] = {
         **arrays,
@@ -106,7 +108,7 @@ def to_members(model: EigenGS) -> dict[str, NDArray]:
 
 
 def from_members(arrays: dict[str, NDArray], backend: str | None) -> Record:
-    """Check the arrays of a file and convert them to the arguments of `eigengs_dr.EigenGS`.
+    """Check the arrays of a file, and convert them to the arguments of `eigengs_dr.EigenGS`.
 
     Errors as for `check_members`.
     """
@@ -125,7 +127,7 @@ def from_members(arrays: dict[str, NDArray], backend: str | None) -> Record:
 
 
 def _set_of(arrays: dict[str, NDArray]) -> SetData:
-    """Return the set in the arrays of a file."""
+    """Return the set that the arrays of a file hold."""
     parts = {key: arrays[key] for key in ("mean", "factor", "color", "background")}
     return SetData(parts, tuple(arrays["size"].tolist()), str(arrays["space"]))
 
@@ -161,11 +163,11 @@ def check_members(arrays: dict[str, NDArray]) -> tuple[NDArray[np.float32], ...]
             f"split is {low}, {low_components}; expected up to {number - 1} Gaussians and "
             f"{max(counts)} components"
         )
-    falls = np.diff(held_out) < -1e-9  # the logarithm rounds by less
-    if falls.any() or (np.abs(held_out) > MAX_PSNR).any():
+    descends = np.diff(held_out) < -1e-9  # rounding of the logarithm is smaller
+    if descends.any() or (np.abs(held_out) > MAX_PSNR).any():
         raise ValueError(f"held_out must ascend, within {MAX_PSNR:g} dB")
     check(_set_of(arrays))
-    with np.errstate(over="ignore"):  # the check below refuses infinity
+    with np.errstate(over="ignore"):  # the check below rejects infinity
         weights = tuple(
             arrays[f"weights{c}"].astype(np.float32) * arrays[f"scale{c}"][:, None]
             for c in range(3)
@@ -174,5 +176,5 @@ def check_members(arrays: dict[str, NDArray]) -> tuple[NDArray[np.float32], ...]
     values |= {key: arrays[key] for key in ("color", "background")}
     for name, rows in values.items():
         if not np.abs(rows).max(initial=0) <= MAX_WEIGHT:
-            raise ValueError(f"{name} exceeds {MAX_WEIGHT:g}, which no image needs")
+            raise ValueError(f"{name} exceeds the limit of {MAX_WEIGHT:g}")
     return weights

@@ -1,8 +1,8 @@
 """The best colours of many images on the same shapes, by one sparse factorisation.
 
 Column n of A holds the weights of Gaussian n at all pixels. The best colours c and background b of
-an image D minimise ``|A c + b 1 - D|^2``. ``A^T A`` depends on the shapes only: it is factorised
-once, and each image costs one product and one back-substitution. For one image,
+an image D minimise ``|A c + b 1 - D|^2``. ``A^T A`` depends only on the shapes: it is factorised
+once, and each image costs one product and one back-substitution. For a single image,
 `eigengs_dr.fitting.solve` is cheaper.
 """
 
@@ -36,35 +36,36 @@ from ..raster.parameters import (
 )
 from ..raster.render import bin_gaussians, to_tiles
 
-GROUP = 3
-"""Planes that one adjoint correlates: as many as an image has channels, so that all calls share one
+ADJOINT_PLANES = 3
+"""Number of planes that one adjoint correlates, the channels of an image, so that all calls share a
 program."""
 
 THREADS = min(4, available_cores())
-"""Threads that share a sparse product; SciPy does not hold the interpreter lock. The result does
-not depend on their number."""
+"""Number of threads that share a sparse product; SciPy releases the interpreter lock. The result
+does not depend on it."""
 
 BATCH = 48
-"""Columns of one sparse product."""
+"""Number of columns of one sparse product."""
 
 MIN_BATCH = 12
-"""Least number of columns for sparse products. With 48 columns, 5,000 Gaussians and 256x256 pixels,
-a sparse product takes a third of the time of adjoints; with the 3 of one image it is not faster."""
+"""Smallest number of columns for sparse products. With 48 columns, 5,000 Gaussians and 256x256
+pixels, a sparse product takes a third of the time of adjoints; with the 3 columns of one image it
+is not faster."""
 
 MAX_KEPT_WEIGHTS = 1 << 24
-"""Largest number of weights that stay in memory for sparse products, in 128 MiB."""
+"""Largest number of weights that are kept for sparse products, in 128 MiB of memory."""
 
-STRIP = 2048
-"""Pixels that are transposed at once; the planes of a strip stay in the cache."""
+STRIP_PIXELS = 2048
+"""Number of pixels that are transposed at once; the planes of a strip fit into the cache."""
 
 RIDGE = 1e-4
-"""Number added to the diagonal of ``A^T A``, relative to the mean of the diagonal. It bounds the
-colours of Gaussians that overlap much, at no visible cost."""
+"""Value added to the diagonal of ``A^T A``, relative to the mean of the diagonal. It bounds the
+colours of Gaussians that overlap strongly, without a visible effect."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive Gaussians with a common solve for their colours.
+    """Consecutive Gaussians whose colours are solved for together.
 
     Attributes
     ----------
@@ -73,16 +74,16 @@ class Block:
     system : csr_array of float64, shape (n, n)
         ``A^T A + ridge``.
     factor : SuperLU
-        Factorisation of ``A^T A + ridge`` in single precision, which halves the memory to read for
-        every image; its rounding is below the ridge.
-    spread : ndarray of float64, shape (n,)
+        Factorisation of ``A^T A + ridge`` in single precision, which halves the memory that is read
+        for every image; its rounding error is below the ridge.
+    background_response : ndarray of float64, shape (n,)
         ``h = (A^T A + ridge)^-1 A^T 1``: a background b changes the colours by ``-b h``.
     """
 
     rows: slice
     system: csr_array
     factor: SuperLU
-    spread: NDArray[np.float64]
+    background_response: NDArray[np.float64]
 
     def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``(A^T A + ridge)^-1`` times a column (n,) or columns (n, M)."""
@@ -91,16 +92,16 @@ class Block:
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    """Return the threads that share work on many columns."""
+    """Return the thread pool for sparse products."""
     return ThreadPoolExecutor(THREADS, thread_name_prefix="columns")
 
 
 class NormalEquations:
     """Factorised equations ``(A^T A + ridge) c = A^T (D - b)`` for any number of images D.
 
-    The solution is exact or, with `low`, for two blocks of Gaussians one after the other.
+    The solution is exact or, with `low`, computed for two blocks of Gaussians one after the other.
 
-    The background is a dense column of ones beside A and stays out of the sparse factor: block
+    The background is a dense column of ones next to A, and not part of the sparse factor: block
     elimination computes it from two sums. A column of coefficients holds N colours and, last, the
     background.
 
@@ -110,9 +111,9 @@ class NormalEquations:
         Shapes and native size; the colours are ignored.
     low : int, optional
         If positive, the first `low` Gaussians and the background fit the image, and the other
-        Gaussians fit the residual. If large Gaussians precede small ones, this solution starts some
-        0.1 dB below the exact one. The exact one, in which large numbers cancel each other, ends
-        1 dB lower after refinement.
+        Gaussians fit the residual. If large Gaussians precede small ones, this solution is about
+        0.1 dB worse than the exact one, in which large numbers cancel; after refinement, the exact
+        one is 1 dB worse.
 
     Raises
     ------
@@ -128,15 +129,17 @@ class NormalEquations:
         self.gram = (double @ double.T).tocsr()
         self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
         ends = [self.count * k // THREADS for k in range(THREADS + 1)]
-        few = matrix.nnz <= MAX_KEPT_WEIGHTS
-        self.shares = [matrix[slice(*pair)] for pair in pairwise(ends)] if few else []
+        keep = matrix.nnz <= MAX_KEPT_WEIGHTS
+        self.shares = [matrix[slice(*pair)] for pair in pairwise(ends)] if keep else []
         ends = [0, low, self.count] if low else [0, self.count]
         self.blocks = [self._block(slice(*pair)) for pair in pairwise(ends)]
         with dr.suspend_grad():
             types = types_of(gaussians.mean)
-            self.packed = pack_parameters([*kernel_shape(gaussians), *[types.Float(0)] * GROUP])
+            self.packed = pack_parameters(
+                [*kernel_shape(gaussians), *[types.Float(0)] * ADJOINT_PLANES]
+            )
             self.lists = bin_gaussians(gaussians)
-        # Python takes 0.4 ms to trace the adjoint, and 0.05 ms to call a frozen one.
+        # Tracing the adjoint takes 0.4 ms in Python, calling a frozen one 0.05 ms.
         programs = ExitStack()
         self.adjoint = programs.enter_context(freeze_program(adjoint))
         weakref.finalize(self, programs.close)
@@ -151,7 +154,7 @@ class NormalEquations:
                 system.tocsc().astype(np.float32),
                 permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0,
-                relax=1,  # by default, back-substitution takes 1.1 times as long
+                relax=1,  # with the default, back-substitution takes 1.1 times as long
                 options={"SymmetricMode": True},
             )
         except RuntimeError as error:
@@ -161,8 +164,9 @@ class NormalEquations:
             ) from None
         coverage = self.coverage[rows]
         block = Block(rows, system, factor, 0 * coverage)
-        spread = block.divide(coverage)
-        return replace(block, spread=spread + block.divide(coverage - system @ spread))
+        response = block.divide(coverage)  # with one step of iterative refinement
+        response = response + block.divide(coverage - system @ response)
+        return replace(block, background_response=response)
 
     def correlate(self, images: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return ``A^T D`` and, in the last row, ``1^T D``.
@@ -170,14 +174,14 @@ class NormalEquations:
         Parameters
         ----------
         images : ndarray of float32, shape (M, H, W)
-            M planes of the native size. The 3 planes of one image may share its memory, as
+            M planes of the native size. The 3 planes of one image may be views of it, such as
             ``numpy.moveaxis(pixels, 2, 0)``.
 
         Returns
         -------
         ndarray of float64, shape (N + 1, M)
-            Cost: one sparse product for `MIN_BATCH` to `BATCH` planes, one adjoint with respect
-            to colours for every `GROUP` of fewer planes.
+            Cost: one sparse product for `MIN_BATCH` to `BATCH` planes; for fewer planes, one
+            adjoint with respect to colours per `ADJOINT_PLANES`.
         """
         result = np.empty((self.count + 1, len(images)))
         for first in range(0, len(images), BATCH):
@@ -187,7 +191,7 @@ class NormalEquations:
                 sums[:] = self._multiply(planes)
             else:
                 self._adjoint(planes, sums)
-        # Sums along the axis of the rows are fast for planes and for pixels.
+        # Summing along the axis of rows first is fast for planes and for interleaved pixels.
         result[-1] = images.sum(axis=1).sum(axis=1, dtype=np.float64)
         return result
 
@@ -195,20 +199,22 @@ class NormalEquations:
         """Return ``A^T D`` of many planes, shape (N, M), by sparse products."""
         flat = planes.reshape(len(planes), -1)
         columns = np.empty(flat.shape[::-1], np.float32)
-        for first in range(0, len(columns), STRIP):
-            columns[first : first + STRIP] = flat[:, first : first + STRIP].T
+        for first in range(0, len(columns), STRIP_PIXELS):
+            columns[first : first + STRIP_PIXELS] = flat[:, first : first + STRIP_PIXELS].T
         return np.vstack(list(_threads().map(lambda share: share @ columns, self.shares)))
 
     def _adjoint(self, planes: NDArray[np.float32], result: NDArray[np.float64]) -> None:
-        """Write ``A^T D`` of few planes to an array (N, M), by Dr.Jit."""
+        """Write ``A^T D`` of few planes to an array (N, M), computed by Dr.Jit."""
         types = types_of(self.packed)
         with dr.suspend_grad():
-            for first in range(0, len(planes), GROUP):
-                group = planes[first : first + GROUP]
-                missing = [(0, GROUP - len(group)), (0, 0), (0, 0)]
-                padded = np.pad(group, missing) if len(group) < GROUP else group
+            for first in range(0, len(planes), ADJOINT_PLANES):
+                group = planes[first : first + ADJOINT_PLANES]
+                missing = [(0, ADJOINT_PLANES - len(group)), (0, 0), (0, 0)]
+                padded = np.pad(group, missing) if len(group) < ADJOINT_PLANES else group
                 delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
-                rows = self.adjoint(self.packed, delta, GROUP, self.lists, self.radius, True)
+                rows = self.adjoint(
+                    self.packed, delta, ADJOINT_PLANES, self.lists, self.radius, True
+                )
                 for column, row in zip(range(first, first + len(group)), rows, strict=False):
                     result[:, column] = row.numpy()
 
@@ -222,21 +228,22 @@ class NormalEquations:
         Returns
         -------
         ndarray of float64, shape (N + 1, M)
-            The second of two blocks fits the residual of the first.
+            With two blocks, the second fits the residual of the first.
         """
         first, *others = self.blocks
         sums, total = correlations[first.rows], correlations[-1]
         pixels = self.width * self.height
-        free = pixels - first.spread @ self.coverage[first.rows]
+        response = first.background_response
+        free = pixels - response @ self.coverage[first.rows]
         # If the Gaussians alone can form a constant, the background is not determined: use 0.
-        background = (total - first.spread @ sums) / free if free > 1e-6 * pixels else 0 * total
-        solved = np.zeros(correlations.shape)
-        solved[-1] = background
-        solved[first.rows] = first.divide(sums) - np.outer(first.spread, background)
+        background = (total - response @ sums) / free if free > 1e-6 * pixels else 0 * total
+        coefficients = np.zeros(correlations.shape)
+        coefficients[-1] = background
+        coefficients[first.rows] = first.divide(sums) - np.outer(response, background)
         for block in others:
-            left = correlations - self.product(solved)
-            solved[block.rows] = block.divide(left[block.rows])
-        return solved
+            residual = correlations - self.product(coefficients)
+            coefficients[block.rows] = block.divide(residual[block.rows])
+        return coefficients
 
     def product(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``[A 1]^T [A 1] x`` for coefficients x of shape (N + 1, M)."""
@@ -255,13 +262,13 @@ class NormalEquations:
         correlations: NDArray[np.float64],
         squared_norms: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return ``|A c + b 1 - D|^2`` of M images by inner products, without a rendering.
+        """Return ``|A c + b 1 - D|^2`` of M images from inner products, without rendering.
 
         Parameters
         ----------
         coefficients, correlations : ndarray of float64, shape (N + 1, M)
         squared_norms : ndarray of float64, shape (M,)
-            ``|D|^2``; the result is exact to about 1e-6 of this number.
+            ``|D|^2``; the result is accurate to about 1e-6 of this number.
 
         Returns
         -------
@@ -273,12 +280,12 @@ class NormalEquations:
 
 
 def squared_norms(planes: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return ``|D|^2`` of every plane D: planes (M, H, W) give shape (M,)."""
+    """Return ``|D|^2`` of every plane D, shape (M,), for planes (M, H, W)."""
     return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)
 
 
 MAX_WEIGHTS = 1 << 28
-"""Largest number of weights of a matrix; the weights and their indices then take 6 GiB."""
+"""Largest number of weights of a matrix, which take 6 GiB with their indices."""
 
 
 def weight_matrix(gaussians: Gaussians) -> csr_array:
@@ -298,7 +305,7 @@ def weight_matrix(gaussians: Gaussians) -> csr_array:
     Raises
     ------
     ValueError
-        If the ellipses have more than `MAX_WEIGHTS` pixels in all.
+        If the ellipses have more than `MAX_WEIGHTS` pixels in total.
     """
     arrays = gaussians.to_arrays()
     splat, x, y = _pixels_inside(
@@ -309,7 +316,7 @@ def weight_matrix(gaussians: Gaussians) -> csr_array:
         gaussians.cutoff,
     )
     size = (len(gaussians), gaussians.width * gaussians.height)
-    if len(splat) == 0:  # Dr.Jit does not compute with no elements
+    if len(splat) == 0:  # Dr.Jit does not support empty arrays here
         return csr_array(size, dtype=np.float32)
     types = types_of(gaussians.mean)
     with dr.suspend_grad():
@@ -356,9 +363,9 @@ def _expand(
     total = int(count.sum(dtype=np.int64))
     if total > MAX_WEIGHTS:
         raise ValueError(
-            f"the Gaussians cover {total:,} pixels in all, over {MAX_WEIGHTS:,}; use fewer, or a "
-            "smaller size"
+            f"the Gaussians cover {total:,} pixels in total, the limit is {MAX_WEIGHTS:,}; use "
+            "fewer, or a smaller size"
         )
-    which = np.repeat(np.arange(len(low)), count)
+    index = np.repeat(np.arange(len(low)), count)
     before = np.repeat(np.cumsum(count) - count, count)
-    return which, (np.arange(len(which)) - before + low[which]).astype(np.int32)
+    return index, (np.arange(len(index)) - before + low[index]).astype(np.int32)

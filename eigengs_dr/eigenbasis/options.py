@@ -1,4 +1,4 @@
-"""Everything that decides a training beside the images, checked once."""
+"""The options of a training, which are checked once."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from .pca.basis import check_components
 from .pca.truncation import check_target
 
 STEPS = {"default": 0, "eigengs": 15_000}
-"""Presets, and the steps of training that each takes if none are given."""
+"""The presets, with their default numbers of training steps."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Options of a training; `eigengs_dr.EigenGS.fit` takes a part of them.
+    """Options of a training, some of which are those of `eigengs_dr.EigenGS.fit`.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class TrainOptions:
     energy : float or None
         Keep the fewest components that hold this share of a channel's variance.
     target_psnr : float or None
-        Keep the fewest components whose PCA has this mean PSNR, in dB, on the images held out; see
+        Keep the fewest components whose PCA has this mean PSNR, in dB, for the held-out images; see
         `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`.
     gaussians, frequency_aware, preset, iterations, seed
         See `eigengs_dr.EigenGS.fit`.
@@ -37,7 +37,7 @@ class TrainOptions:
     Raises
     ------
     ValueError
-        If an option is out of range, or two of them exclude each other; one line that names it.
+        If an option is out of range, or two options exclude each other; one line that names it.
     """
 
     size: tuple[int, int] = (256, 256)
@@ -90,5 +90,5 @@ class TrainOptions:
 
     @property
     def training_steps(self) -> int:
-        """The number of steps: as given, or that of the preset."""
+        """Number of training steps: the given number, or that of the preset."""
         return STEPS[self.preset] if self.iterations is None else self.iterations

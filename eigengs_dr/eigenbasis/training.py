@@ -1,4 +1,4 @@
-"""Training of a model on a folder of images, with checkpoints and figures of images held out."""
+"""Training of a model on a folder of images, with checkpoints and figures of held-out images."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from .pca.basis import Eigenbasis
 from .pca.truncation import TruncationCurve
 
 HELD_OUT = 10
-"""Every tenth image is held out of the training and measured."""
+"""One in this number of images is held out of the training and measured."""
 
 MAX_HELD_OUT = 100
-"""Most images to measure; more would change the figures little."""
+"""Largest number of measured images; more would change the figures little."""
 
 SAVE_SECONDS = 10.0
 """Seconds between two checkpoints of the shapes."""
@@ -43,18 +43,18 @@ StageProgress = Callable[[str, int, int], None]
 
 
 class Interrupted(Exception):
-    """An interrupt by Ctrl-C; the message says what is saved."""
+    """Ctrl-C was pressed; the message says whether anything is saved."""
 
 
 class Training(NamedTuple):
     """Result of `train`: the model, the basis that it renders, and figures.
 
     The figures are ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of the last
-    run alone if ``resumed``), ``images``, ``iterations``, ``components`` (of each channel),
-    ``gaussians``, ``frequency_aware``, ``psnr_held_out`` (`held_out` of the
-    model), those of `eigengs_dr.eigenbasis.components.solve.fit_model`, and of images held out
-    the mean psnr_ycbcr of PCA, ``psnr_pca``, of projected colours, ``psnr_init``, and of exact
-    colours, ``psnr_solved``.
+    run only if ``resumed``), ``images``, ``iterations``, ``components`` (of each channel),
+    ``gaussians``, ``frequency_aware``, ``psnr_held_out`` (`held_out` of the model), those of
+    `eigengs_dr.eigenbasis.components.solve.fit_model`, and the mean psnr_ycbcr of held-out images:
+    of PCA (``psnr_pca``), of projected colours (``psnr_init``) and of exact colours
+    (``psnr_solved``).
     """
 
     model: EigenGS
@@ -70,9 +70,9 @@ def train(
     progress: StageProgress = lambda stage, done, total: None,
     client: object = None,
 ) -> Training:
-    """Train a model on a folder of images and write it.
+    """Train a model on a folder of images, and write it.
 
-    The folder ``OUTPUT.checkpoint`` keeps the work of an unfinished run. After Ctrl-C or a crash,
+    The folder ``OUTPUT.checkpoint`` stores the state of an unfinished run. After Ctrl-C or a crash,
     the same call resumes from there, with the same images, and gives the same result.
 
     Parameters
@@ -86,8 +86,8 @@ def train(
     progress : callable, optional
         ``progress(stage, done, total)``.
     client : distributed.Client, optional
-        Find components on the workers of this Dask cluster, see
-        `eigengs_dr.Eigenbasis.from_images`. The images must lie on a file system that they share.
+        Compute components on the workers of this Dask cluster, see
+        `eigengs_dr.Eigenbasis.from_images`. The images must be on a shared file system.
 
     Raises
     ------
@@ -96,20 +96,20 @@ def train(
     ClusterError
         If the cluster cannot be used, or is lost; the same call resumes.
     ValueError
-        If no image can be read, or the settings are wrong or differ from the checkpoint.
+        If no image can be read, or the settings are invalid or differ from the checkpoint.
     OSError
         If a file cannot be written.
     """
     started = time.perf_counter()
-    found = list_images(folder)
-    names = [path if isinstance(path, str) else path.name for path in found]
+    images = list_images(folder)
+    names = [path if isinstance(path, str) else path.name for path in images]
     steps = settings.training_steps
     record = {**asdict(settings), "iterations": steps, "folder": str(folder)}
     with open_checkpoint(output, record, names) as checkpoint, defer_interrupts() as interrupted:
         if names != checkpoint.files:
             warn(
-                f"{folder}: the images have changed since this training began; it goes on with "
-                f"the {len(checkpoint.files)} that were there"
+                f"{folder}: the images have changed since this training began; it continues with "
+                f"the original {len(checkpoint.files)}"
             )
         files = [name if is_url(name) else Path(folder) / name for name in checkpoint.files]
         held_out = files[HELD_OUT - 1 :: HELD_OUT][:MAX_HELD_OUT]
@@ -123,7 +123,7 @@ def train(
         except ValueError as error:
             if not checkpoint.holds_work:
                 raise
-            raise ValueError(f"{error}; to start anew, delete {checkpoint.folder}") from None
+            raise ValueError(f"{error}; to start again, delete {checkpoint.folder}") from None
         figures = {
             "resumed": checkpoint.resumed,
             "images": basis.count,
@@ -155,12 +155,12 @@ class Run(NamedTuple):
     def stop_if_interrupted(self) -> None:
         """Raise `Interrupted` after Ctrl-C."""
         if self.interrupted():
-            kept = self.checkpoint.holds_work
-            raise Interrupted("the same command goes on from here" if kept else "nothing is saved")
+            saved = self.checkpoint.holds_work
+            raise Interrupted("repeat the command to continue" if saved else "nothing is saved")
 
 
 def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
-    """Find the components, or read them from the checkpoint, which keeps the first shards too."""
+    """Compute the components, or read them from the checkpoint, which also stores shards."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
         return Eigenbasis.load(path)
@@ -182,8 +182,8 @@ def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
     if settings.target_psnr is not None:
         if (curve := _curve(basis, run)) is None:
             raise ValueError(
-                f"target_psnr needs images that are held out, one in {HELD_OUT}, and none can be "
-                "read; give more images, or use energy"
+                f"target_psnr needs held-out images, one in {HELD_OUT}, and none can be read; give "
+                "more images, or use energy"
             )
         basis = basis.truncated(curve.rank_for_psnr(settings.target_psnr))
     basis.save(path)
@@ -219,32 +219,33 @@ def _model(basis: Eigenbasis, run: Run) -> EigenGS:
 
 
 def _curve(basis: Eigenbasis, run: Run) -> TruncationCurve | None:
-    """Return the truncation curve of the images held out, None if none can be read."""
+    """Return the truncation curve of the held-out images, None if none can be read."""
     images = _readable(basis, run)
     first = next(images, None)
     return None if first is None else basis.truncation_curve(chain([first], images))
 
 
 def _evaluate(model: EigenGS, basis: Eigenbasis, run: Run) -> dict[str, float]:
-    """Measure the images held out, for the figures of `Training`, and warn of bad files."""
+    """Measure the held-out images, for the figures of `Training`, and warn about failures."""
     rows: list[dict[str, float]] = []
-    bad: list[str] = []
-    for image in _readable(basis, run, bad, "measure"):
+    errors: list[str] = []
+    for image in _readable(basis, run, errors, "measure"):
         pictures = {
             "psnr_pca": basis.reconstruct(basis.project(image)),
             "psnr_init": render(model.encode(image, "projected")).numpy(),
             "psnr_solved": render(model.encode(image, "exact")).numpy(),
         }
         rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
-    if bad:
-        warn(f"{len(bad)} of {len(run.held_out)} images held out were skipped, as {bad[0]}")
+    if errors:
+        skipped = f"{len(errors)} of {len(run.held_out)} held-out images were skipped"
+        warn(f"{skipped}, for example {errors[0]}")
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if rows else {}
 
 
 def _readable(
-    basis: Eigenbasis, run: Run, bad: list[str] | None = None, stage: str = ""
+    basis: Eigenbasis, run: Run, errors: list[str] | None = None, stage: str = ""
 ) -> Iterator[NDArray[np.float32]]:
-    """Read the images held out at the size of a basis, skip those that cannot be read."""
+    """Read the held-out images at the size of a basis; skip those that cannot be read."""
     for done, path in enumerate(run.held_out):
         if stage:
             run.progress(stage, done, len(run.held_out))
@@ -252,7 +253,7 @@ def _readable(
         try:
             image = center_crop(check_image(path, copy=False), basis.width, basis.height)
         except (ImageError, OSError) as error:
-            if bad is not None:
-                bad.append(str(error))
+            if errors is not None:
+                errors.append(str(error))
         else:
             yield image

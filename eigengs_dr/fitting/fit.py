@@ -26,7 +26,7 @@ from .coarse import COARSE_TO_FINE
 from .control import Redistribute, Surplus
 from .descent import begin
 from .fewest import fewest
-from .from_loss import Spaces, refine_loss, views_of_spaces
+from .from_loss import Problem, Spaces, refine_loss, views_of_spaces
 from .levels import place_levels, sort_levels
 from .loop import FitProgress, Refinement, Score, refine, sets_of
 from .loss import Loss, LossFunction, LossObjective, View
@@ -191,7 +191,7 @@ def fit(
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
-        weigh more in the dark. "data" uses one or three channels unchanged (roughness, heights).
+        weigh more in the dark. "data" uses one to three channels unchanged (roughness, heights).
         "normal" uses the codes ``(n + 1) / 2`` of a normal map; renderings have normals of length
         1. "radiance" is "linear" without an upper bound. "log" suits light above 1 best: the
         Gaussians sum to logarithms of light, see `eigengs_dr.image.color.to_log`. For an image of
@@ -201,7 +201,7 @@ def fit(
     weight : array_like, shape (H, W) or (H, W, C), optional
         Factors of the squared errors of pixels, or of their channels in the space of the colours,
         for maps of pixels alone; finite and at least 0. A pixel of weight 0 does not count; it may
-        be NaN.
+        be NaN. Without an image, how much a pixel matters to the loss: it places the Gaussians.
     method : Method, optional
         How to fit, by default `DEFAULT`, or `COARSE_TO_FINE` without an image; `eigengs_dr.paper`
         has those of the papers.
@@ -261,7 +261,7 @@ def fit(
     started = time.perf_counter()
     spaces, space = space, space if isinstance(space, str) else None
     if image is None:
-        _check_loss(loss, size, target_psnr, gaussians, weight)
+        _check_loss(loss, size, target_psnr, gaussians)
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
@@ -276,7 +276,7 @@ def fit(
     )
     factors = check_weight(weight)
     if image is None:
-        return fit_loss(size, spaces, options, started, progress)
+        return fit_loss(size, spaces, options, factors, started, progress)
     if size is not None:
         raise ValueError("size is for a loss without an image; leave it or the image out")
     if isinstance(image, Mapping):
@@ -361,7 +361,7 @@ def fit_images(
     return _finished(found, affines, mean_image, started, seconds_init)
 
 
-def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any, weight: Any) -> None:
+def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any) -> None:
     """Raise ValueError unless there is a loss with a size, and nothing that needs an image."""
     if loss is None or size is None:
         raise ValueError(
@@ -374,14 +374,13 @@ def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any, weight: 
         raise ValueError(
             "without an image there is no PSNR and there are no levels; give the loss a target"
         )
-    if weight is not None:
-        raise ValueError("without an image there are no errors to weigh; weigh them in the loss")
 
 
 def fit_loss(
     size: tuple[int, int] | None,
     spaces: Spaces,
     options: FitOptions,
+    weight: Image | None,
     started: float,
     progress: FitProgress | None = None,
 ) -> Fit:
@@ -392,19 +391,22 @@ def fit_loss(
         raise ValueError("a model needs an image to start from; give a set")
     if start is not None and spaces is None:
         spaces = {m.name: m.space for m in start.maps} or start.space
+    spaces = spaces or options.loss.space
     views, maps = views_of_spaces(spaces)
     channels, (width, height) = sum(len(view.channels) for view in views), size
     options.check_image(width, height, channels)
+    if weight is not None and weight.shape[:2] != (height, width):
+        shape = f"{weight.shape[1]}x{weight.shape[0]}"
+        raise ValueError(f"weight is for {shape} pixels, but size is {width}x{height}")
+    check_channels(weight, 1 if maps else channels)
     if start is not None:
         space = "data" if maps else views[0].space
         check_start(start, size, channels, space, options)
         cutoff = float(options.method.cutoff)
         start = replace(start.scaled(width, height), cutoff=cutoff, maps=()).bounded()
     with defer_interrupts() as interrupted:
-        types = types_for(start, options.backend)
-        found, seconds_init = refine_loss(
-            options.loss, size, views, options, types, start, started, progress, interrupted
-        )
+        problem = Problem(options.loss, size, views, types_for(start, options.backend), weight)
+        found, seconds_init = refine_loss(problem, options, start, started, progress, interrupted)
     found = replace(found, gaussians=replace(found.gaussians, maps=maps))
     [result] = _finished([found], [Affine()], None, started, seconds_init)
     return result

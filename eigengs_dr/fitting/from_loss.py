@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import drjit as dr
@@ -64,12 +64,58 @@ def views_of_spaces(spaces: Spaces) -> tuple[list[View], tuple[TextureMap, ...]]
     return views, maps if isinstance(spaces, Mapping) else ()
 
 
+@dataclass(frozen=True)
+class Problem:
+    """A loss for a picture of which nothing is known yet.
+
+    Attributes
+    ----------
+    loss : Loss
+    size : (int, int)
+        Width and height in pixels.
+    views : list of View
+    types : ArrayTypes
+        Backend and precision of the sets.
+    weight : ndarray of float32, shape (H, W) or (H, W, C), or None
+        How much each pixel matters.
+    """
+
+    loss: Loss
+    size: tuple[int, int]
+    views: list[View]
+    types: ArrayTypes
+    weight: NDArray[np.float32] | None = None
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of a set."""
+        return sum(len(view.channels) for view in self.views)
+
+    def near(self, values: NDArray[np.floating]) -> LossObjective:
+        """Return the objective of a loss whose best picture is near these sums, (H * W * C,)."""
+        space = "data" if self.views[0].name else self.views[0].space
+        width, height = self.size
+        values = np.asarray(values, np.float32).reshape(height, width, self.channels)
+        values = np.maximum(values, 0) if space in LIGHT else values
+        shown = to_coded(values) if space in LIGHT else values
+        pixels = Pixels.of(Data(values, shown, self.weight), space, self.types)
+        return LossObjective.of_loss(self.loss, self.views, pixels)
+
+    def grey(self) -> NDArray[np.floating]:
+        """Return the sums of a pixel of which nothing is known, shape (C,)."""
+        low, high = self.loss.bounds or (0.0, 1.0)
+        parts = []
+        for view in self.views:
+            value = GREY if view.space in LIGHT else (low + high) / 2
+            value = float(to_log(np.float32(GREY))) if view.space == "log" else value
+            part = np.full(len(view.channels), value)
+            parts.append(np.array([0.5, 0.5, 1.0]) if view.space == "normal" else part)
+        return np.concatenate(parts)
+
+
 def refine_loss(
-    loss: Loss,
-    size: tuple[int, int],
-    views: Sequence[View],
+    problem: Problem,
     options: FitOptions,
-    types: ArrayTypes,
     start: Gaussians | None,
     started: float,
     progress: FitProgress | None,
@@ -105,15 +151,15 @@ def refine_loss(
         place = options.method.place
         coarse = place if isinstance(place, Coarse) else Coarse()
         steps = round(coarse.share * options.iterations)
-        objective = _descend_texels(loss, size, views, types, coarse, steps, ended)
+        objective = _descend_texels(problem, coarse, steps, ended)
         taken = objective.calls.step
         trace = [{"loss": objective.judge(objective.seen(_rows(objective)))}]
         start, numbers = _start(objective, options, coarse, ended)
         trace = [timed({"iteration": taken, **row}) for row in trace + numbers]
     else:
-        objective = _near(loss, size, views, types, np.zeros(size[0] * size[1] * start.channels))
+        objective = problem.near(np.zeros(problem.size[0] * problem.size[1] * problem.channels))
         sums = objective.picture(objective.draw_set(start)[0])
-        objective = _near(loss, size, views, types, sums.numpy())
+        objective = problem.near(sums.numpy())
     seconds_init = time.perf_counter() - started
     refined = refine(
         objective,
@@ -130,22 +176,6 @@ def refine_loss(
     return found, seconds_init
 
 
-def _near(
-    loss: Loss,
-    size: tuple[int, int],
-    views: Sequence[View],
-    types: ArrayTypes,
-    values: NDArray[np.floating],
-) -> LossObjective:
-    """Return the objective of a loss whose best picture is near these sums, (H * W * C,)."""
-    channels = sum(len(view.channels) for view in views)
-    space = "data" if views[0].name else views[0].space
-    values = np.asarray(values, np.float32).reshape(size[1], size[0], channels)
-    values = np.maximum(values, 0) if space in LIGHT else values
-    shown = to_coded(values) if space in LIGHT else values
-    return LossObjective.of_loss(loss, views, Pixels.of(Data(values, shown), space, types))
-
-
 def _rows(objective: LossObjective) -> Float:
     """Return the picture near which a loss is least, as rows of pixels."""
     assert objective.model.target is not None
@@ -153,30 +183,13 @@ def _rows(objective: LossObjective) -> Float:
 
 
 def _descend_texels(
-    loss: Loss,
-    size: tuple[int, int],
-    views: Sequence[View],
-    types: ArrayTypes,
-    coarse: Coarse,
-    steps: int,
-    ended: Callable[[int], bool],
+    problem: Problem, coarse: Coarse, steps: int, ended: Callable[[int], bool]
 ) -> LossObjective:
     """Return the objective of a loss near the picture of a pyramid of texels."""
-    low, high = loss.bounds or (0.0, 1.0)
-    grey = np.concatenate([_grey(view.space, len(view.channels), low, high) for view in views])
-    first = np.tile(grey, size[0] * size[1])
-    objective = _near(loss, size, views, types, first)
+    grey, (low, high) = problem.grey(), problem.loss.bounds or (0.0, 1.0)
+    objective = problem.near(np.tile(grey, problem.size[0] * problem.size[1]))
     sums = coarse_picture(objective, coarse, steps, grey.tolist(), high - low, ended)
-    return replace(_near(loss, size, views, types, sums.numpy()), calls=objective.calls)
-
-
-def _grey(space: str, channels: int, low: float, high: float) -> NDArray[np.floating]:
-    """Return the sums of a picture of which nothing is known."""
-    if space == "normal":
-        return np.array([0.5, 0.5, 1.0])
-    if space in LIGHT:
-        return np.full(channels, GREY)
-    return np.full(channels, to_log(np.float32(GREY)) if space == "log" else (low + high) / 2)
+    return replace(problem.near(sums.numpy()), calls=objective.calls)
 
 
 def _start(

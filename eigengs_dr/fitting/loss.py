@@ -8,7 +8,7 @@ they see the squared error of an image.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -58,6 +58,8 @@ class Loss:
         ``function(picture, 0)``.
     target : float, optional
         Value to reach with as few Gaussians as possible, instead of their number.
+    space : str or mapping of str to str, optional
+        Space of the sums without an image, if `eigengs_dr.fit` gets none.
 
     Raises
     ------
@@ -81,6 +83,7 @@ class Loss:
     parameters: Any = None
     judge: Callable[[Any], Any] | None = None
     target: float | None = None
+    space: str | Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
         if not callable(self.function):
@@ -184,9 +187,10 @@ NO_ERROR = 1e-20
 FLAT = 0.02
 """Secant of a tile, relative to that of all tiles, below which the loss does not depend on it."""
 
-LITTLE = 0.01
+LITTLE = 0.1
 """Squared error of a tile, relative to the mean, that says as much as the secants of all tiles. For
-L1 + 0.2 (1 - SSIM), 400 steps and 4 training photos, 0.1 ends with a loss 2 % higher."""
+L1 + 0.2 (1 - SSIM), 1,000 steps and 8 training photos, 0.01 ends with a loss 0 to 1 % lower, and a
+PSNR 0.13 dB lower."""
 
 PULL = 10.0
 """How strongly sums outside the bounds are pulled back: a tenth of the range outside weighs as much

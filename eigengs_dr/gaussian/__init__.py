@@ -1,9 +1,9 @@
 """The representation: sets of 2D Gaussians.
 
-- ``gaussians``: the set, its bounds, its tensors; several sets as one
+- ``gaussians``: the set, its bounds, its tensors; the union of several sets
 - ``covariance``: factors, Cholesky factors, logarithms, eigenvalues
 - ``channels``: groups of channels with a name and a space
-- ``file``: the .npz file, and what makes a set valid
+- ``file``: the .npz file, and the checks of a set
 - ``packed``: the .egs file, which the codec reads
-- ``region``: the part of a set that a region shows
+- ``region``: the part of a set inside a region
 """

@@ -1,4 +1,4 @@
-"""The maps of a set: groups of channels with a name and a space, such as those of a material."""
+"""The maps of a set: groups of channels with a name and a space, as in a material."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from ..image.color import SPACES, decode, from_sum, to_picture
 from ..storage.npz import BadValue
 
 MAX_MAP_CHANNELS = 16
-"""Largest number of channels of all maps together: a program holds the sums of all channels of a
-block of pixels in registers."""
+"""Largest total number of channels of all maps, because a program keeps the sums of all channels of
+a block of pixels in registers."""
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}")
 """Valid names of maps."""
 
 COLORS = ("albedo", "base_color", "basecolor", "color", "diffuse", "reflectance", "emission")
-"""Names of maps that hold colours, unless the caller says something else."""
+"""Names of maps that hold colours by default."""
 
 NORMALS = ("normal", "normals", "normalmap")
-"""Names of maps that hold normals, unless the caller says something else."""
+"""Names of maps that hold normals by default."""
 
 
 class TextureMap(NamedTuple):
@@ -35,11 +35,11 @@ class TextureMap(NamedTuple):
     name : str
         Letters, digits, "_" and "-"; at most 32.
     space : str
-        Space of its channels, one of `eigengs_dr.image.color.SPACES`.
+        Colour space of the channels, one of `eigengs_dr.image.color.SPACES`.
     channels : int
-        Number of its channels.
+        Number of channels.
     weight : float
-        Factor of its errors in the fit; packing uses it again.
+        Factor of the errors of the map in a fit and in packing.
     """
 
     name: str
@@ -49,7 +49,7 @@ class TextureMap(NamedTuple):
 
 
 def usual_space(name: str) -> str:
-    """Return the space of a map by its name: linear light, normals, or data.
+    """Return the default space of a map by its name: linear light, normals or data.
 
     Examples
     --------
@@ -63,26 +63,26 @@ def usual_space(name: str) -> str:
 
 
 def check_name(name: str) -> None:
-    """Raise `BadValue` if no map can have a name."""
+    """Raise `BadValue` if a name is not valid for a map."""
     if not isinstance(name, str) or not NAME.fullmatch(name):
-        shown = repr(name)[:40]
         raise BadValue(
-            f"map {shown}: a name starts with a letter and has at most 32 letters, digits, _ or -"
+            f"map {repr(name)[:40]}: a name starts with a letter and has at most 32 letters, "
+            "digits, _ or -"
         )
 
 
 def check_maps(maps: Sequence[TextureMap], channels: int) -> None:
-    """Raise `BadValue` if maps are invalid, or do not have this number of channels together."""
+    """Raise `BadValue` if maps are invalid, or their total number of channels differs."""
     names = [m.name for m in maps]
     for m in maps:
         check_name(m.name)
         if m.space not in SPACES:
             raise BadValue(f"map {m.name!r}: space {m.space[:20]!r} is not in {', '.join(SPACES)}")
-        fitting = {"ycbcr": (3,), "normal": (3,)}.get(m.space, (1, 3))
-        if m.channels not in fitting:
-            wanted = " or ".join(map(str, fitting))
+        allowed = {"ycbcr": (3,), "normal": (3,)}.get(m.space, (1, 3))
+        if m.channels not in allowed:
+            numbers = " or ".join(map(str, allowed))
             raise BadValue(
-                f"map {m.name!r} has {m.channels} channels; space {m.space!r} has {wanted}"
+                f"map {m.name!r} has {m.channels} channels; space {m.space!r} has {numbers}"
             )
         if not (math.isfinite(m.weight) and m.weight > 0):
             raise BadValue(f"map {m.name!r}: weight is {m.weight}; it must be above 0")
@@ -91,36 +91,36 @@ def check_maps(maps: Sequence[TextureMap], channels: int) -> None:
     total = sum(m.channels for m in maps)
     if total > MAX_MAP_CHANNELS:
         raise BadValue(
-            f"the maps have {total} channels, at most {MAX_MAP_CHANNELS} share shapes; make two "
-            "materials"
+            f"the maps have {total} channels, the limit is {MAX_MAP_CHANNELS}; split them into "
+            "two materials"
         )
     if total != channels:
         raise BadValue(f"the maps have {total} channels, but the Gaussians have {channels}")
 
 
 def slices(maps: Sequence[TextureMap]) -> list[slice]:
-    """Return the channels of each map among those of all."""
+    """Return the slice of each map in the channels of the set."""
     ends = np.cumsum([m.channels for m in maps]).tolist()
     return [slice(end - m.channels, end) for end, m in zip(ends, maps, strict=True)]
 
 
 def find_map(maps: Sequence[TextureMap], name: str) -> tuple[TextureMap, slice]:
-    """Return a map and its channels among those of all.
+    """Return a map and its slice in the channels of the set.
 
     Raises
     ------
     BadValue
-        If there is none; the message lists the names.
+        If there is no map of this name; the message lists the names.
     """
-    for found, own in zip(maps, slices(maps), strict=True):
-        if found.name == name:
-            return found, own
+    for texture_map, part in zip(maps, slices(maps), strict=True):
+        if texture_map.name == name:
+            return texture_map, part
     names = ", ".join(m.name for m in maps)
-    raise BadValue(f"map {name!r} is not in it; it has {names or 'no maps'}")
+    raise BadValue(f"no map is named {name!r}; it has {names or 'no maps'}")
 
 
-def show_sums(space: str, sums: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Convert sums of Gaussians of a space to what people look at.
+def display_values(space: str, sums: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Convert sums of Gaussians to display values: sRGB for colours.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def show_sums(space: str, sums: NDArray[np.floating]) -> NDArray[np.floating]:
     Returns
     -------
     ndarray, same shape
-        As `eigengs_dr.picture_of` of a set of this space: RGB for colours, else data or normals.
+        As from `eigengs_dr.picture_of`: RGB for colours; data and normals are not converted.
     """
     if space == "ycbcr":
         sums = np.stack(decode(space, list(np.moveaxis(sums, -1, 0))), axis=-1)

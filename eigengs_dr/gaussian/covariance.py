@@ -90,12 +90,12 @@ def log_shapes(factor: Floats) -> NDArray[np.float64]:
     Returns
     -------
     ndarray of float64, shape (N, 3)
-        s, u, v. The size, the geometric mean of the two standard deviations, is ``exp(-s)``. The
-        vector (u, v) gives elongation and direction, and is 0 for a round Gaussian.
+        s, u, v. The geometric mean of the two standard deviations is ``exp(-s)``. The vector (u, v)
+        gives elongation and direction, and is 0 for a round Gaussian.
     """
     a, b, c = np.asarray(factor, np.float64).T
     half, across, size = 0.5 * (a * a - b * b - c * c), a * b, np.log(a * c)
-    # The larger eigenvalue of F^T F is a sum of positive numbers: no digits cancel.
+    # The larger eigenvalue of F^T F is a sum of positive numbers: there is no cancellation.
     largest = 0.5 * (a * a + b * b + c * c) + np.hypot(half, across)
     length = 0.5 * (np.log(largest) - size)
     angle = np.arctan2(across, half)

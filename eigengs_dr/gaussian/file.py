@@ -1,4 +1,4 @@
-"""The file of a set of Gaussians, the checks of a set, and its maps."""
+"""The file format of a set of Gaussians and its maps, and the checks of a set."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ its amplitude: 1.1 % at 3, 0.034 % at 4, 3.7e-6 at 5."""
 
 MAX_CUTOFF = 12.0
 """Largest cutoff, in standard deviations. The fast exponential needs a bound, and ``exp(-72)`` is
-below single precision."""
+negligible in single precision."""
 
 MAX_SET_SIDE = 1 << 16
-"""Largest side of a set in pixels: a mean in single precision then has 1/128 pixel or less."""
+"""Largest side of a set in pixels: single precision then resolves means to 1/128 pixel."""
 
 MAX_SUM = 1e18
-"""Largest sum of the absolute colours of a channel: it and its square are finite in single
-precision, and so is every rendering."""
+"""Largest sum of the absolute colours of a channel: the sum and its square, and so every rendering,
+are finite in single precision."""
 
 MAX_ENTRIES = 1 << 30
 """Largest number of elements of one array: 357 million Gaussians."""
 
-PLAIN_COUNT = 1 << 20
-"""Number of Gaussians from which on a set is stored without compression, which would save 9 % of
-the bytes for 20 times the time."""
+UNCOMPRESSED_COUNT = 1 << 20
+"""Number of Gaussians from which a set is stored without compression, which would save 9 % of the
+size and take 20 times as long."""
 
 ARRAYS: dict[str, Field] = {
     "mean": Field("f4", 2, MAX_ENTRIES),
@@ -57,10 +57,10 @@ ARRAYS: dict[str, Field] = {
 """Arrays of a set, with their types and numbers of dimensions."""
 
 LAYOUT: dict[str, Field] = ARRAYS | {"size": Field("i8", 1), "space": Field("U", 0)}
-"""What a file of version 1 holds. Sets of this version have the cutoff `CUTOFF`."""
+"""Content of a file of version 1, in which sets have the cutoff `CUTOFF`."""
 
 CUTOFF_FIELD = {"cutoff": Field("f8", 0)}
-"""What version 2 added."""
+"""Content that version 2 added."""
 
 MAPS: dict[str, Field] = {
     "names": Field("U", 1, MAX_MAP_CHANNELS),
@@ -68,13 +68,13 @@ MAPS: dict[str, Field] = {
     "channels": Field("i8", 1, MAX_MAP_CHANNELS),
     "weights": Field("f8", 1, MAX_MAP_CHANNELS),
 }
-"""Arrays of a file with maps, in the place of the space."""
+"""Arrays of a file with maps, instead of the space."""
 
 FIGURES: dict[str, Field] = {"figures": Field("f8", 1, 3), "source": Field("U", 0)}
-"""Arrays that a file may have besides: what the fit of the set reached; see `FitFigures`."""
+"""Optional arrays of a file with the results of the fit; see `FitFigures`."""
 
 MAX_SOURCE = 64
-"""Characters of the name of an image that a file keeps: its last."""
+"""Number of characters of the name of an image, counted from its end, that a file stores."""
 
 
 class SetData(NamedTuple):
@@ -108,13 +108,13 @@ class SetData(NamedTuple):
         BadValue
             If there is no such map.
         """
-        found, own = find_map(self.maps, name)
-        parts = {k: self.arrays[k][..., own] for k in ("color", "background")}
-        return self._replace(arrays=self.arrays | parts, space=found.space, maps=())
+        texture_map, part = find_map(self.maps, name)
+        arrays = {k: self.arrays[k][..., part] for k in ("color", "background")}
+        return self._replace(arrays=self.arrays | arrays, space=texture_map.space, maps=())
 
 
 class FitFigures(NamedTuple):
-    """What a fit reached, in a file: its PSNR in dB, its steps, and the name of the image."""
+    """Results of a fit in a file: PSNR in dB, number of steps, and name of the image."""
 
     psnr_ycbcr: float
     psnr_rgb: float
@@ -123,27 +123,29 @@ class FitFigures(NamedTuple):
 
 
 def check_suffix(path: str | os.PathLike[str]) -> None:
-    """Raise ValueError if the suffix of a file for a set says that the file is something else."""
+    """Raise ValueError if the suffix of a file for a set belongs to another kind of file."""
     suffix = Path(path).suffix.lower()
     if suffix == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
     if suffix in SUFFIXES:
-        raise ValueError(f"{path}: a set is no image; save as .npz, its picture by save_image")
+        raise ValueError(
+            f"{path}: a set is not an image; save it as .npz, and its picture with save_image"
+        )
 
 
 def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | None = None) -> None:
-    """Write a set as an ``.npz`` file in single precision, completely or not at all.
+    """Write a set atomically as an ``.npz`` file in single precision.
 
     Raises
     ------
     ValueError
-        If the suffix is ``.egs``, or `read` would refuse the set.
+        If the suffix is ``.egs``, or `read` would reject the set.
     OSError
         If the file cannot be written; an existing file does not change.
     """
     check_suffix(path)
     kind = MATERIAL if data.maps else FORMAT
-    with np.errstate(over="ignore"):  # the check refuses infinity
+    with np.errstate(over="ignore"):  # the check rejects infinity
         members: Arrays = {name: np.asarray(a, np.float32) for name, a in data.arrays.items()}
     with _errors_of(path):
         check(data._replace(arrays=members))
@@ -157,12 +159,12 @@ def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | Non
     if figures is not None and not data.maps:
         members["figures"] = np.array(figures[:3], np.float64)
         members["source"] = np.array(figures.source[-MAX_SOURCE:])
-    few = len(members["mean"]) < PLAIN_COUNT
-    npz.write(path, kind, VERSIONS[kind], members, compressed=few)
+    compressed = len(members["mean"]) < UNCOMPRESSED_COUNT
+    npz.write(path, kind, VERSIONS[kind], members, compressed)
 
 
 class SetHead(NamedTuple):
-    """What a file of a set says without its large arrays; see `SetData`."""
+    """Properties of a set in a file, without its large arrays; see `SetData`."""
 
     gaussians: int
     channels: int
@@ -173,7 +175,7 @@ class SetHead(NamedTuple):
 
 
 def read_head(path: Path) -> SetHead:
-    """Read what an ``.npz`` file of a set holds, without its Gaussians.
+    """Read the properties of a set from an ``.npz`` file, without its Gaussians.
 
     Raises
     ------
@@ -193,7 +195,7 @@ def read_head(path: Path) -> SetHead:
 
 @contextmanager
 def _errors_of(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the name of a file before the errors of its values."""
+    """Put the name of a file before error messages about its values."""
     try:
         yield
     except BadValue as error:
@@ -209,12 +211,12 @@ def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
     return FORMAT, VERSIONS[FORMAT], LAYOUT if first else LAYOUT | CUTOFF_FIELD
 
 
-def _properties(found: Arrays) -> tuple[tuple[int, int], str, float, tuple[TextureMap, ...]]:
-    """Return the size, the space, the cutoff and the maps of what was read."""
-    size, cutoff = tuple(found["size"].tolist()), float(found.get("cutoff", np.array(CUTOFF)))
-    if "names" not in found:
-        return size, str(found["space"]), cutoff, ()
-    columns = [found[name].tolist() for name in MAPS]
+def _properties(members: Arrays) -> tuple[tuple[int, int], str, float, tuple[TextureMap, ...]]:
+    """Return the size, the space, the cutoff and the maps from the arrays of a file."""
+    size, cutoff = tuple(members["size"].tolist()), float(members.get("cutoff", np.array(CUTOFF)))
+    if "names" not in members:
+        return size, str(members["space"]), cutoff, ()
+    columns = [members[name].tolist() for name in MAPS]
     if len({len(column) for column in columns}) > 1:
         raise BadValue("names, spaces, channels and weights differ in length")
     maps = tuple(TextureMap(*row) for row in zip(*columns, strict=True))
@@ -224,7 +226,7 @@ def _properties(found: Arrays) -> tuple[tuple[int, int], str, float, tuple[Textu
 
 
 def maps_of(path: Path) -> tuple[TextureMap, ...]:
-    """Return the maps of a file, ``.npz`` or ``.egs``; none for one image. Errors as `read`."""
+    """Return the maps of an ``.npz`` or ``.egs`` file, () for one image; errors as for `read`."""
     return packed.read_maps(path) if packed.is_packed(path) else read_head(path).maps
 
 
@@ -235,19 +237,19 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
     ----------
     path : Path
     name : str or None
-        The map; None for the set of one image.
+        Name of the map; None for the set of one image.
     option : str, optional
-        What messages call `name`.
+        How messages refer to `name`.
 
     Raises
     ------
     ValueError
-        As `read`; if a file of maps is read without a name, or another one with a name; or if there
-        is no such map. The message lists the maps.
+        As for `read`; if a file with maps is read without a name, or one without maps with a name;
+        or if there is no such map. The message lists the maps.
     """
     maps = maps_of(path)
     if not maps and name is not None:
-        raise ValueError(f"{path}: holds one image and no maps; leave {option} out")
+        raise ValueError(f"{path}: holds one image and no maps; leave out {option}")
     if maps and name is None:
         names = ", ".join(m.name for m in maps)
         raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
@@ -257,13 +259,15 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
 
 
 def read_figures(path: Path) -> FitFigures | None:
-    """Return what the fit of a set reached, if its ``.npz`` file says it; errors as `read_head`."""
+    """Return the results of the fit from an ``.npz`` file, if any; errors as for `read_head`."""
     if not set(FIGURES) <= set(npz.sizes_of(path)):
         return None
-    found = npz.read(path, FORMAT, VERSIONS[FORMAT], FIGURES)
-    values, source = found["figures"], str(found["source"])
+    members = npz.read(path, FORMAT, VERSIONS[FORMAT], FIGURES)
+    values, source = members["figures"], str(members["source"])
     if values.shape != (3,) or not (np.isfinite(values[2]) and 0 <= values[2] < 1 << 53):
-        raise ValueError(f"{path}: figures are {values.tolist()}, expected two PSNR and the steps")
+        raise ValueError(
+            f"{path}: figures are {values.tolist()}, expected two PSNRs and the number of steps"
+        )
     return FitFigures(float(values[0]), float(values[1]), int(values[2]), printable(source))
 
 
@@ -273,10 +277,10 @@ def read(path: Path, sections: int | None = None) -> SetData:
         if packed.is_packed(path):
             data = packed.read_set(path, sections)
         elif sections is not None:
-            raise BadValue("has no sections; pass sections only for .egs files")
+            raise BadValue("has no sections; pass sections for .egs files only")
         else:
-            found = npz.read(path, *_layout_of(path))
-            data = SetData({name: found[name] for name in ARRAYS}, *_properties(found))
+            members = npz.read(path, *_layout_of(path))
+            data = SetData({name: members[name] for name in ARRAYS}, *_properties(members))
         check(data)
     return data
 
@@ -284,8 +288,8 @@ def read(path: Path, sections: int | None = None) -> SetData:
 def check(data: SetData) -> None:
     """Raise `BadValue` if a part of a set is invalid.
 
-    This one function decides for files that are read and written, and for arrays. Shapes must fit
-    each other, the space and the maps. Values must be finite, a and c positive, colours within
+    This function is used for reading and writing files, and for arrays. Shapes must match each
+    other, the space and the maps. Values must be finite, a and c positive, colours within
     `MAX_SUM`, sides from 1 to `MAX_SET_SIDE` pixels, and the cutoff in (0, `MAX_CUTOFF`].
     """
     arrays, size, space, cutoff, maps = data
@@ -317,7 +321,7 @@ def check(data: SetData) -> None:
 
 
 def check_sides(size: tuple[int, ...]) -> None:
-    """Raise `BadValue` unless a size is two sides that a set can have."""
+    """Raise `BadValue` unless a size consists of two valid sides."""
     if len(size) != 2 or not all(1 <= side <= MAX_SET_SIDE for side in size):
         raise BadValue(f"size is {size}, expected two sides from 1 to {MAX_SET_SIDE}")
 
@@ -329,7 +333,7 @@ def _check_properties(
     cutoff: float,
     maps: tuple[TextureMap, ...],
 ) -> None:
-    """Raise `BadValue` if what a set says beside its arrays is invalid."""
+    """Raise `BadValue` if a property of a set, apart from its arrays, is invalid."""
     check_sides(size)
     if not 0 < cutoff <= MAX_CUTOFF:
         raise BadValue(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
@@ -346,16 +350,16 @@ def _check_properties(
 
 
 MAX_VALUES = (1 << 32) - 1
-"""Largest number of values of an image, channels included. Kernels index them by 32 bits, as Dr.Jit
-does its arrays: larger indices would wrap to the first pixels without an error."""
+"""Largest number of values of an image, channels included. Kernels use 32-bit indices, as Dr.Jit
+does for its arrays: larger indices would silently wrap to the first pixels."""
 
 
 def check_index_range(
     width: int, height: int, channels: int, tile: tuple[int, int] = (1, 1)
 ) -> None:
-    """Refuse an image with more values than 32-bit indices can number.
+    """Reject an image with too many values for 32-bit indices.
 
-    The limit is 37,837 pixels a side with three channels, and 8,191 with 64.
+    The limit is 37,837 pixels per side with three channels, and 8,191 with 64.
 
     Parameters
     ----------
@@ -363,12 +367,12 @@ def check_index_range(
         Size in pixels.
     channels : int
     tile : (int, int), optional
-        Width and height of a tile: sides are rounded up to whole tiles.
+        Width and height of a tile; sides are rounded up to complete tiles.
 
     Raises
     ------
     ValueError
-        If the image, in whole tiles, has more than `MAX_VALUES` values.
+        If the image, in complete tiles, has more than `MAX_VALUES` values.
     """
     columns, rows = (
         -(-side // unit) * unit for side, unit in zip((width, height), tile, strict=True)

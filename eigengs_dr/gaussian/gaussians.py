@@ -1,6 +1,6 @@
 """Sets of 2D Gaussians: parameters, bounds, and operations on whole sets.
 
-A set comes from NumPy arrays, a file, tensors of Dr.Jit, or several sets that are joined. It forms
+A set is created from NumPy arrays, a file, Dr.Jit tensors, or several other sets. It represents
 one image, or several maps that share means and shapes.
 """
 
@@ -27,14 +27,14 @@ from .channels import TextureMap, find_map
 from .file import CUTOFF, Arrays, SetData, check, read, write
 
 MIN_DEVIATION = 0.25
-"""Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can fall
+"""Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can lie
 between pixel centres, where it has no gradient."""
 
 
 @class_of_doors
 @dataclass(repr=False, eq=False)
 class Gaussians:
-    """N two-dimensional Gaussians and a constant background: an image of any size.
+    """N two-dimensional Gaussians and a constant background, which represent an image.
 
     ``I(x) = background + sum_n color_n exp(-1/2 |F_n (x - mean_n)|^2)`` with
     ``F = [[a, b], [0, c]]``. The covariance ``(F^T F)^-1`` is positive definite for any a, c > 0. x
@@ -60,10 +60,10 @@ class Gaussians:
         ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the Gaussians that end
         before it.
     maps : tuple of TextureMap
-        Groups of channels, if the set has several maps, such as those of a material, see
-        `eigengs_dr.gaussian.channels.TextureMap`: ``gaussians["albedo"]`` is then the set of one
-        map, and the space is "data": each map in its own units. They have at most 16 channels
-        together.
+        Groups of channels, if the set has several maps, as a material has; see
+        `eigengs_dr.gaussian.channels.TextureMap`. ``gaussians["albedo"]`` is then the set of one
+        map, and `space` is "data", because each map has its own. Together, maps have at most 16
+        channels.
 
     Examples
     --------
@@ -121,7 +121,7 @@ class Gaussians:
         Raises
         ------
         ValueError
-            If shapes do not fit each other, or a value is not finite or out of range.
+            If shapes do not match, or a value is out of range or not finite.
         """
         arrays = _arrays(mean, factor, color, background)
         return cls.from_data(SetData(arrays, size, space, cutoff, tuple(maps)), backend, dtype)
@@ -171,7 +171,7 @@ class Gaussians:
         return arrays | {"background": stacked(self.background, 1)[0]}
 
     def __reduce__(self) -> tuple:
-        """Travel to another process as NumPy arrays, without derivatives."""
+        """Pickle the set as NumPy arrays, without derivatives."""
         types = types_of(self.mean)
         kind = np.dtype(f"f{types.bits // 8}")
         return _received, (self.data(), types.backend, kind)
@@ -197,7 +197,7 @@ class Gaussians:
     def __getitem__(self, selection: Any) -> Gaussians:
         """Select Gaussians by a slice, an integer array or a boolean mask, or a map by its name.
 
-        Differentiable. Selected Gaussians have the background of the set. The set of a map has all
+        Differentiable. The result has the background of the set. The set of a map has all
         Gaussians, and shares the memory of their means and shapes.
 
         Raises
@@ -218,15 +218,15 @@ class Gaussians:
 
     def _map(self, name: str) -> Gaussians:
         try:
-            found, own = find_map(self.maps, name)
+            texture_map, part = find_map(self.maps, name)
         except BadValue as error:
             raise KeyError(f"Gaussians: {error}") from None
         kind = type(self.color)
-        color, background = kind(list(self.color)[own]), kind(list(self.background)[own])
-        return replace(self, color=color, background=background, space=found.space, maps=())
+        color, background = kind(list(self.color)[part]), kind(list(self.background)[part])
+        return replace(self, color=color, background=background, space=texture_map.space, maps=())
 
     def scaled(self, width: int, height: int) -> Gaussians:
-        """Scale the picture to another native size, in pixels; differentiable.
+        """Scale the image to another native size, in pixels; differentiable.
 
         Raises
         ------
@@ -238,7 +238,7 @@ class Gaussians:
         if (width, height) == (self.width, self.height):
             return self
         types = types_of(self.mean)
-        # In arrays: as literals they would compile the program for every size.
+        # In arrays: as literals, every size would compile a program of its own.
         sx, sy, rx, ry = (
             dr.opaque(types.Float, ratio)
             for ratio in (
@@ -260,14 +260,14 @@ class Gaussians:
     def bounded(self, size: tuple[Float, Float] | None = None) -> Gaussians:
         """Clip every parameter to its bounds.
 
-        A mean lies in the image. a and c lie between 1 / (twice the longer side) and
-        1 / `MIN_DEVIATION`, and b within +-1 / `MIN_DEVIATION`. A mean that is not finite becomes
-        the centre of the image, a and c become 1 / `MIN_DEVIATION`, b and colours become 0.
+        Means are clipped to the image, a and c to the range from 1 / (twice the longer side) to 1 /
+        `MIN_DEVIATION`, and b to +-1 / `MIN_DEVIATION`. Values that are not finite are replaced: a
+        mean by the centre of the image, a and c by 1 / `MIN_DEVIATION`, b and colours by 0.
 
         Parameters
         ----------
         size : pair of Float, shape (1,), optional
-            The native width and height in arrays, if a frozen program shall serve every size.
+            The native width and height in arrays, for a frozen program that serves every size.
         """
         types = types_of(self.mean)
         if size is None:
@@ -291,7 +291,7 @@ class Gaussians:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the set as an ``.npz`` file in single precision, completely or not at all.
+        """Write the set atomically as an ``.npz`` file in single precision.
 
         Raises
         ------
@@ -321,7 +321,7 @@ class Gaussians:
             Number of sections to read from the start of an ``.egs`` file, which may end after
             them. By default all sections.
         dtype : {numpy.float32, numpy.float64}, optional
-            As for `from_arrays`. Files hold single precision.
+            As for `from_arrays`. Files are in single precision.
 
         Raises
         ------
@@ -343,7 +343,7 @@ def _arrays(
 
 
 def _received(data: SetData, backend: str, kind: DTypeLike) -> Gaussians:
-    """Return a set that came from another process, perhaps of a machine with a GPU."""
+    """Unpickle a set, which may come from a machine with a GPU."""
     try:
         return Gaussians.from_data(data, backend, kind)
     except BackendError:
@@ -351,7 +351,7 @@ def _received(data: SetData, backend: str, kind: DTypeLike) -> Gaussians:
 
 
 def take(gaussians: Gaussians, index: UInt) -> Gaussians:
-    """Return the Gaussians of an index, differentiably, also in a frozen program."""
+    """Return the Gaussians of an index; differentiable, and usable in a frozen program."""
     Float = types_of(gaussians.mean).Float
 
     def pick(rows: Rows) -> Rows:
@@ -362,24 +362,24 @@ def take(gaussians: Gaussians, index: UInt) -> Gaussians:
 
 
 def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
-    """Return rows with an entry for each Gaussian; a row may have a single one for all."""
+    """Return rows with one entry per Gaussian; a row of length 1 is broadcast."""
     return [row + dr.zeros(type(row), len(gaussians)) for row in rows]
 
 
 @door
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
-    """Join sets and add their backgrounds: the result renders as the sum of the sets.
+    """Concatenate sets and add their backgrounds: the rendering is the sum of those of the sets.
 
     Parameters
     ----------
     sets : sequence of Gaussians
-        At least one. All have the same native size, space, cutoff, channels, maps and backend.
+        At least one. All must have the same native size, space, cutoff, channels, maps and backend.
 
     Returns
     -------
     Gaussians
         The Gaussians of the first set, then those of the second, and so on. A single set is
-        returned as it is.
+        returned unchanged.
 
     Raises
     ------
@@ -409,7 +409,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         color=join("color"),
         background=sum((g.background for g in sets[1:]), first.background),
     )
-    dr.eval(joined)  # no scatter is left for what the caller does next, see `settle`
+    dr.eval(joined)  # leaves no pending scatters, see `settle`
     return joined
 
 
@@ -431,11 +431,11 @@ def like(
 
 
 class Fitted(Protocol):
-    """What holds the set of a fit, as `eigengs_dr.Fit` does."""
+    """An object with the set of a fit, such as `eigengs_dr.Fit`."""
 
     @property
     def gaussians(self) -> Gaussians:
-        """The set."""
+        """The set of Gaussians."""
 
     @property
     def mean_image(self) -> NDArray[np.float32] | None:
@@ -448,14 +448,16 @@ def set_of(source: Gaussians | Fitted) -> Gaussians:
     Raises
     ------
     TypeError
-        If the source is something else.
+        If the source is neither.
     ValueError
         If the fit has a mean image of pixels, which the set lacks.
     """
     if isinstance(source, Gaussians):
         return source
     if not hasattr(source, "trace") or not hasattr(source, "gaussians"):
-        raise TypeError(f"{type(source).__name__} is no set of Gaussians; pass Gaussians or a Fit")
+        raise TypeError(
+            f"{type(source).__name__} is not a set of Gaussians; pass Gaussians or a Fit"
+        )
     if source.mean_image is not None:
         raise ValueError("the fit has a mean image of pixels, which its set lacks; use .gaussians")
     return source.gaussians
@@ -507,7 +509,7 @@ def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
         Any of mean, factor, color and background, with the shapes that `to_tensors` returns. Other
         keys are ignored.
     like : Gaussians
-        Set that gives the size, the space, the cutoff and the parameters that `tensors` lacks.
+        Set from which the size, the space, the cutoff and missing parameters are taken.
 
     Returns
     -------
@@ -517,9 +519,9 @@ def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     Raises
     ------
     ValueError
-        If shapes do not fit each other.
+        If shapes do not match.
     TypeError
-        If a value is no tensor of Dr.Jit.
+        If a value is not a Dr.Jit tensor.
 
     Examples
     --------
@@ -529,13 +531,13 @@ def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """
     given = {name: tensors[name] for name in FIELDS if name in tensors}
     counts = [given[name].shape[0] for name in ("mean", "factor", "color") if name in given]
-    # The number of Gaussians may only differ from `like` if all of its Gaussians are replaced.
+    # The number of Gaussians may differ from `like` only if all parameters of Gaussians are given.
     count = max(counts) if len(counts) == 3 else len(like)
     for name, tensor in given.items():
         if not dr.is_tensor_v(tensor):
             raise TypeError(
-                f"{name} is a {type(tensor).__module__}.{type(tensor).__name__}, expected a tensor "
-                "of Dr.Jit; drjit.wrap makes them for functions of PyTorch and JAX"
+                f"{name} is a {type(tensor).__module__}.{type(tensor).__name__}, expected a Dr.Jit "
+                "tensor; drjit.wrap converts those of PyTorch and JAX functions"
             )
         columns = FIELDS[name] or like.channels
         expected = (columns,) if name == "background" else (count, columns)
@@ -559,7 +561,7 @@ def _columns_of(like: Rows, tensor: Tensor) -> Rows:
     """Return the columns of a tensor as a nested array with the type of `like`."""
     types = types_of(like)
     number = tensor.shape[-1]
-    values = types.Float(tensor.array)  # of another precision, perhaps
+    values = types.Float(tensor.array)  # the tensor may have another precision
     index = dr.arange(types.UInt, dr.width(values) // number) * number
     return type(like)([dr.gather(types.Float, values, index + k) for k in range(number)])
 
@@ -574,7 +576,7 @@ def scale_channels(gaussians: Gaussians, factors: Sequence[float]) -> Gaussians:
 
 
 def one_image(gaussians: Gaussians) -> Gaussians:
-    """Return a set of one image as it is.
+    """Return a set of one image unchanged, and reject a set with maps.
 
     Raises
     ------
@@ -584,12 +586,12 @@ def one_image(gaussians: Gaussians) -> Gaussians:
     if gaussians.maps:
         names = ", ".join(m.name for m in gaussians.maps)
         first = gaussians.maps[0].name
-        raise ValueError(f"the set has the maps {names}; choose one, as gaussians[{first!r}]")
+        raise ValueError(f"the set has the maps {names}; choose one, e.g. gaussians[{first!r}]")
     return gaussians
 
 
 def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
-    """Return Gaussians of the same shapes with other colours.
+    """Return Gaussians of the same shapes with new colours.
 
     Parameters
     ----------

@@ -1,7 +1,6 @@
-"""Packed sets, ``.egs``, for what reads sets of any format.
+"""Access to packed sets, ``.egs``, for code that reads sets of any format.
 
-The codec, which is above this folder, reads them: `eigengs_dr` puts functions of
-`eigengs_dr.codec.egs` here.
+The codec, a layer above, reads them: `eigengs_dr` assigns functions of `eigengs_dr.codec.egs` here.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-TYPE_CHECKING = False  # the package imports this module before all else
+TYPE_CHECKING = False  # imported first; `typing` takes long
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from .file import SetData
 
 MAGIC = b"\x89EGS"
-"""First bytes of a file. The first byte is no ASCII character, so no text file starts with it."""
+"""First bytes of a file. The first byte is not ASCII, so no text file starts with it."""
 
 read_set: Callable[[Path, int | None], SetData]
 """``read_set(path, sections)`` reads a set; `sections` is a number, or None for all."""
@@ -27,6 +26,6 @@ read_maps: Callable[[Path], tuple[TextureMap, ...]]
 
 
 def is_packed(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file is a packed set; `OSError` if it cannot be opened."""
+    """Return whether a file is a packed set; raise `OSError` if it cannot be opened."""
     with open(path, "rb") as file:
         return file.read(len(MAGIC)) == MAGIC

@@ -1,4 +1,4 @@
-"""The part of a set that a region shows, in NumPy arrays."""
+"""The part of a set inside a region, in NumPy arrays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def crop(
     size: tuple[int, int],
     scale: tuple[float, float] = (1.0, 1.0),
 ) -> SetData:
-    """Return the Gaussians that touch a region, as a set of the region's own size.
+    """Return the Gaussians that touch a region, as a set with the size of the region.
 
     Parameters
     ----------
@@ -25,21 +25,21 @@ def crop(
     size : (int, int)
         Width and height of the region in pixels of the result.
     scale : (float, float), optional
-        Pixels of the result for a native pixel, along x and y.
+        Pixels of the result per native pixel, along x and y.
 
     Returns
     -------
     SetData
-        It renders as the region does in the whole set, up to rounding. The Gaussians keep their
-        order. The set may be empty: then the region shows the background alone.
+        Its rendering equals the region in the rendering of the full set, up to rounding. The
+        Gaussians keep their order. The set is empty if the region shows only the background.
     """
     mean = data.arrays["mean"]
-    seen = np.ones(len(mean), bool)
+    touches = np.ones(len(mean), bool)
     for axis, reach in enumerate(reaches(data)):
         half = 0.5 * size[axis] / scale[axis]
-        away = np.abs(mean[:, axis] - np.float32(corner[axis] + half))
-        seen &= away <= reach * np.float32(1.001) + np.float32(half + 1)
-    arrays = {name: values[seen] for name, values in data.arrays.items() if name != "background"}
+        distance = np.abs(mean[:, axis] - np.float32(corner[axis] + half))
+        touches &= distance <= reach * np.float32(1.001) + np.float32(half + 1)
+    arrays = {name: values[touches] for name, values in data.arrays.items() if name != "background"}
     arrays["background"] = data.arrays["background"]
     x, y = scale
     arrays["mean"] = ((arrays["mean"].astype(np.float64) - corner) * scale).astype(np.float32)
@@ -48,7 +48,7 @@ def crop(
 
 
 def reaches(data: SetData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return how far from its mean each Gaussian reaches along x and along y, in native pixels."""
+    """Return the extent of each Gaussian from its mean along x and along y, in native pixels."""
     a, b, c = data.arrays["factor"].T
     # The covariance (F^T F)^-1 has the entries xx = (1 + (b / c)^2) / a^2 and yy = 1 / c^2.
     across = data.cutoff * np.hypot(np.float32(1), b / c) / a

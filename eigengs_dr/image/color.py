@@ -1,8 +1,8 @@
 """Colour spaces: gamma-encoded RGB, studio-range YCbCr of ITU-R BT.601, linear light, and codes.
 
-Light that may exceed 1 has codes: logarithms to compute with, PU21 to compare by. A unit vector n
-is stored as ``(n + 1) / 2``, as in files of normal maps. The images of a family have one size, one
-colour space, and a row for each channel.
+Light that may exceed 1 is encoded by logarithms for fitting, and by PU21 for comparisons. A unit
+vector n is stored as ``(n + 1) / 2``, as in files of normal maps. The images of a family have one
+size and one colour space, and are stored with one row per channel.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 Samples = Any
-"""Floats of NumPy, of Python, or a flat, nested or tensor array of floats of Dr.Jit: no type of
-these fits all operations that a function does."""
+"""NumPy or Python floats, or a flat, nested or tensor array of Dr.Jit floats; no single type
+supports all operations of a function."""
 
 Function = Callable[..., Samples]
 
 FloatImage = NDArray[np.floating]
-"""Floats of NumPy."""
+"""A NumPy array of floats."""
 
 SPACES = ("ycbcr", "rgb", "linear", "data", "radiance", "log", "normal")
-"""Names of the colour spaces that the channels of a set of Gaussians may have.
+"""Names of the colour spaces of the channels of a set of Gaussians.
 
 ``"ycbcr"`` is studio-range YCbCr / 255, ``"rgb"`` is gamma-encoded RGB, ``"linear"`` is linear RGB,
-``"radiance"`` is linear RGB that may exceed 1, ``"log"`` is logarithms of it (see
-`eigengs_dr.image.color`), ``"normal"`` is a normal map (see `eigengs_dr.image.color`), and
-``"data"`` is anything else (roughness, heights, ...), with any number of channels.
+``"radiance"`` is linear RGB that may exceed 1, ``"log"`` is its logarithm (see `to_log`),
+``"normal"`` is a normal map (see `renormalize`), and ``"data"`` is anything else (roughness,
+heights, ...), with any number of channels.
 """
 
 LIGHT = ("linear", "radiance")
@@ -39,7 +39,7 @@ UNBOUNDED = ("radiance", "log")
 """Spaces of light that may exceed 1."""
 
 MAX_CHANNELS = 64
-"""Largest number of channels: a program holds the sums of all channels of a tile in registers."""
+"""Largest number of channels: a program keeps the sums of all channels of a tile in registers."""
 
 RGB_TO_YCBCR: NDArray[np.float64] = (
     np.array(
@@ -145,8 +145,8 @@ def to_linear(coded: Samples) -> Samples:
     array([0.   , 0.214, 1.   ])
     """
     select, maximum, power = _functions(coded)
-    # Clamping keeps infinite slopes and NaN out of the power: reverse mode multiplies them by zero,
-    # which gives NaN.
+    # Clamping avoids infinite slopes and NaN in the power: in reverse mode, zero times these is
+    # NaN.
     curved = power((maximum(coded, 0.04045) + 0.055) * (1 / 1.055), 2.4)
     return select(coded <= 0.04045, coded * (1 / 12.92), curved)
 
@@ -154,8 +154,8 @@ def to_linear(coded: Samples) -> Samples:
 def to_coded(linear: Samples) -> Samples:
     """Encode linear light as sRGB: ``12.92 x``, above 0.0031308 ``1.055 x^(1 / 2.4) - 0.055``.
 
-    This is the inverse of `to_linear`. The constants of the standard leave a step of 3e-8 between
-    both parts.
+    This is the inverse of `to_linear`. With the constants of the standard, there is a step of 3e-8
+    between the two branches.
 
     Parameters
     ----------
@@ -178,14 +178,14 @@ def to_coded(linear: Samples) -> Samples:
 
 
 def to_picture(space: str, rendered: FloatImage) -> FloatImage:
-    """Convert a rendering of a set to what people look at: light becomes sRGB.
+    """Convert a rendering of a set to display values: linear light is encoded as sRGB.
 
     Parameters
     ----------
     space : str
         Space of the set.
     rendered : ndarray of float, shape (..., C)
-        Rows of the result of `eigengs_dr.render`.
+        The result of `eigengs_dr.render`, or rows of it.
 
     Returns
     -------
@@ -198,7 +198,7 @@ def to_picture(space: str, rendered: FloatImage) -> FloatImage:
 
 
 def from_sum(space: str, summed: Samples) -> Samples:
-    """Convert the sums of Gaussians to what a rendering holds, where decoding colours cannot.
+    """Convert sums of Gaussians to rendered values, for spaces whose decoding is not affine.
 
     Parameters
     ----------
@@ -209,8 +209,8 @@ def from_sum(space: str, summed: Samples) -> Samples:
     Returns
     -------
     array, same shape and type
-        Light for logarithms, normals of length 1 for normals; else `summed`. Dr.Jit tensors carry
-        derivatives.
+        Light for ``"log"``, unit vectors for ``"normal"``; otherwise `summed`. Differentiable for
+        Dr.Jit tensors.
     """
     if space == "log":
         return from_log(summed)
@@ -218,7 +218,7 @@ def from_sum(space: str, summed: Samples) -> Samples:
 
 
 def rendered_as(space: str) -> str | None:
-    """Return what renderings of a set of a space are: "srgb", "linear", or None for data."""
+    """Return the encoding of renderings of a set of a space: "srgb", "linear", or None for data."""
     if space in ("data", "normal"):
         return None
     return "srgb" if space in ("ycbcr", "rgb") else "linear"
@@ -258,7 +258,7 @@ def decode(space: str, channels: Sequence[Samples]) -> list[Samples]:
 
 
 def _functions(array: Samples) -> tuple[Function, Function, Function]:
-    """Return select, maximum and power for a NumPy or a Dr.Jit array; refuse integers of NumPy."""
+    """Return select, maximum and power for a NumPy or Dr.Jit array; reject NumPy integers."""
     if not isinstance(array, np.ndarray | np.generic | float):
         import drjit as dr  # loads libLLVM
 
@@ -270,7 +270,7 @@ def _functions(array: Samples) -> tuple[Function, Function, Function]:
 
 
 def _check_rgb(image: FloatImage) -> FloatImage:
-    """Refuse an image without three float channels: bytes would be read as values in [0, 1]."""
+    """Reject an image without three float channels: bytes would be taken for values in [0, 1]."""
     image = np.asarray(image)
     if image.shape[-1:] != (3,):
         raise ValueError(f"image has shape {image.shape}; expected (..., 3)")
@@ -279,23 +279,23 @@ def _check_rgb(image: FloatImage) -> FloatImage:
 
 
 LOG_SLOPE = 100.0
-"""Factor of light in `to_log`. With 5,000 Gaussians and 300 steps, three made-up environments of
-512x256 pixels end at 33.2, 35.0, 36.9, 37.9, 38.3, 38.4 and 38.4 dB in PU21 for 1, 3, 10, 30, 100,
+"""Factor of light in `to_log`. With 5,000 Gaussians and 300 steps, three synthetic environments of
+512x256 pixels reach 33.2, 35.0, 36.9, 37.9, 38.3, 38.4 and 38.4 dB in PU21 for 1, 3, 10, 30, 100,
 300 and 1,000."""
 
 PU21_WHITE = 100.0
-"""Luminance of light of 1, in cd/m^2, for `to_pu21`: that of a common display."""
+"""Luminance of the value 1, in cd/m^2, for `to_pu21`: that of a common display."""
 
 PU21_RANGE = (0.005, 10_000.0)
-"""Luminances that PU21 knows, in cd/m^2."""
+"""Range of luminances of PU21, in cd/m^2."""
 
 _PU21 = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204)
 
 
 def to_log(light: FloatImage) -> FloatImage:
-    """Encode light above 0 by logarithms: ``log(1 + 100 I) / log(101)``, so that 1 stays 1.
+    """Encode light above 0 by a logarithm: ``log(1 + 100 I) / log(101)``, so that 1 stays 1.
 
-    Below 0 the code goes on as a straight line.
+    Below 0 the code continues as a straight line.
 
     Parameters
     ----------
@@ -329,7 +329,7 @@ def from_log(codes: Samples) -> Samples:
     Returns
     -------
     array, same shape and type
-        Light, of at most 2^126 for finite codes.
+        Light; at most 2^126 for finite codes.
     """
     factor = math.log1p(LOG_SLOPE)
     if isinstance(codes, np.ndarray):
@@ -341,26 +341,26 @@ def from_log(codes: Samples) -> Samples:
 
 
 def to_pu21(light: Samples) -> Samples:
-    """Encode linear light so that equal differences are about equally visible, also above 1.
+    """Encode linear light, also above 1, so that equal differences are about equally visible.
 
-    The code is logarithmic in bright light and nearly linear in the dark. Light is clamped to
+    The code is logarithmic for bright light and nearly linear for dark light. Light is clamped to
     [5e-5, 100].
 
     Parameters
     ----------
     light : NumPy or Dr.Jit array of floats, any shape
-        Linear light; 1 is a luminance of `PU21_WHITE`.
+        Linear light; 1 is the luminance `PU21_WHITE`.
 
     Returns
     -------
     array, same shape and type
-        Codes from 0 to 2.3; 1 for light of 1.
+        Codes from 0 to 2.3; the code of 1 is 1.
 
     References
     ----------
     R. K. Mantiuk, M. Azimi: PU21: A novel perceptually uniform encoding for adapting existing
-    quality metrics for HDR. Picture Coding Symposium, 2021; the curve "banding and glare", whose
-    constants are those of the authors' program. Its codes are divided by that of white, 256.
+    quality metrics for HDR. Picture Coding Symposium, 2021; the curve "banding and glare", with the
+    constants of the authors' program. Its codes are divided by the code of white, 256.
 
     Examples
     --------
@@ -377,22 +377,22 @@ def to_pu21(light: Samples) -> Samples:
     return codes / white
 
 
-SHORTEST = 1e-6
-"""Squared length below which a vector has no direction; it stays nearly zero."""
+MIN_SQUARED_LENGTH = 1e-6
+"""Squared length below which a vector counts as having no direction, and stays nearly zero."""
 
 
 def renormalize(codes: Samples) -> Samples:
-    """Scale the vectors of a normal map to the length 1.
+    """Scale the vectors of a normal map to unit length.
 
     Parameters
     ----------
     codes : ndarray of float, shape (..., 3), or Dr.Jit tensor, shape (H, W, 3)
-        Codes; 0.5 is a component of 0.
+        Codes; 0.5 encodes the component 0.
 
     Returns
     -------
     array, same shape and type
-        Codes of unit vectors. Dr.Jit tensors carry derivatives.
+        Codes of unit vectors. Differentiable for Dr.Jit tensors.
     """
     if isinstance(codes, np.ndarray):
         unit = unit_codes(list(np.moveaxis(codes, -1, 0)))
@@ -410,22 +410,22 @@ def renormalize(codes: Samples) -> Samples:
 
 
 def unit_codes(channels: Sequence[Samples]) -> list[Samples]:
-    """Return the codes of the unit vectors along three channels of codes; see `renormalize`."""
+    """Return the codes of unit vectors from three channels of codes; see `renormalize`."""
     vector = [2 * channel - 1 for channel in channels]
     square = sum((v * v for v in vector[1:]), vector[0] * vector[0])
     if isinstance(square, np.ndarray):
-        scale = 0.5 / np.sqrt(np.maximum(square, SHORTEST))
+        scale = 0.5 / np.sqrt(np.maximum(square, MIN_SQUARED_LENGTH))
     else:
         import drjit as dr
 
         from ..backend.arrays import rsqrt
 
-        scale = 0.5 * rsqrt(dr.maximum(square, SHORTEST))
+        scale = 0.5 * rsqrt(dr.maximum(square, MIN_SQUARED_LENGTH))
     return [v * scale + 0.5 for v in vector]
 
 
 BASIS_SPACES = ("ycbcr", "rgb")
-"""Colour spaces of a family."""
+"""Colour spaces of an image family."""
 
 
 def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:
@@ -444,7 +444,7 @@ def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:
     planes = np.ascontiguousarray(image.reshape(-1, 3).T)
     if space == "rgb":
         return planes
-    # No matrix product: the threads of BLAS would compete with the decoding threads for cores.
+    # Not a matrix product, because BLAS threads would compete with the decoding threads.
     result = np.einsum("ij,jn->in", RGB_TO_YCBCR.astype(np.float32), planes)
     result += YCBCR_OFFSET.astype(np.float32)[:, None]
     return result

@@ -1,8 +1,8 @@
-"""Files of floats and of more than 8 bits, but TIFF: EXR, Radiance HDR, PNG, and the netpbm family.
+"""Files of floats and of more than 8 bits except TIFF: EXR, Radiance HDR, PNG, and netpbm files.
 
-OpenImageIO, from the extra ``hdr``, is one wheel of 8 MB that needs NumPy alone and does EXR,
-Radiance HDR and PNG of 16 bits; imageio does it by a download or by OpenCV. The netpbm files, PGM,
-PPM and PFM, are a header of four words and rows of numbers. Pillow keeps 8 bits of PPM, and
+OpenImageIO, from the extra ``hdr``, is one wheel of 8 MB that only needs NumPy and reads EXR,
+Radiance HDR and 16-bit PNG; imageio needs a download or OpenCV for these. A netpbm file (PGM, PPM
+or PFM) consists of a header of four words and rows of numbers. Pillow keeps 8 bits of PPM, and
 OpenImageIO 3.2 returns PFM upside down.
 """
 
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .header import TURNED, Header
+from .header import TRANSPOSED, Header
 from .pictures import exif_orientation, picture_header, png_chunks
 from .pixels import ImageError
 from .strips import Pixels, by_strips
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[oiio.ImageInput]:
-    """Open a file; its colours and alpha stay as they are stored."""
+    """Open a file without converting its colours and alpha."""
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
@@ -52,7 +52,7 @@ def read_openimageio(path: Path, number: int = 0) -> Pixels:
     Raises
     ------
     OSError
-        If it cannot be decoded.
+        If the file cannot be decoded.
     """
     with _opened(path) as file:
         if number and not file.seek_subimage(number, 0):
@@ -65,9 +65,9 @@ def read_openimageio(path: Path, number: int = 0) -> Pixels:
 
 
 def png_header(path: Path) -> Header:
-    """Return what a PNG file of 16-bit colour says."""
+    """Return the header of a PNG file of 16-bit colour."""
     header, chunks = picture_header(path), png_chunks(path)
-    # Values of 2 bytes in rows of OpenImageIO, once more for NumPy.
+    # 2 bytes per value in the rows of OpenImageIO, and again in the NumPy array.
     return header._replace(
         orientation=exif_orientation(chunks.get(b"eXIf", b"")),
         bytes_per_pixel=4 * (header.channels + 1),
@@ -75,7 +75,7 @@ def png_header(path: Path) -> Header:
 
 
 def exr_header(path: Path) -> Header:
-    """Return what an EXR file says; refuse by name what is no picture."""
+    """Return the header of an EXR file; reject files that are not pictures."""
     import OpenImageIO as oiio
 
     with _opened(path) as file:
@@ -86,13 +86,13 @@ def exr_header(path: Path) -> Header:
         if spec.deep:
             raise ImageError("holds deep pixels; flatten it first")
         if len(names) > 1 and names not in (("R", "G", "B"), ("R", "G", "B", "A")):
-            shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+            listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
             raise ImageError(
-                f"holds the channels {shown}; save the layer that is meant, as R, G and B, "
+                f"holds the channels {listed}; save the layer that is meant, as R, G and B, "
                 "to a file of its own"
             )
         if spec.format == oiio.UINT32:
-            raise ImageError("holds numbers of objects, no colours; convert it to floats")
+            raise ImageError("holds object IDs instead of colours; convert it to floats")
         alpha = "light" if len(names) == 4 else "none"
         channels = 1 if len(names) == 1 else 3
         needed = 4 * len(names) + 4 * len(names) * (_display(spec) != _data(spec))
@@ -103,7 +103,7 @@ def exr_header(path: Path) -> Header:
 
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""Chromaticities of red, green, blue and white, as in an EXR file."""
+"""Chromaticities of red, green, blue and white, in the format of an EXR file."""
 
 
 def _exr_notes(spec: oiio.ImageSpec) -> tuple[str, ...]:
@@ -131,14 +131,13 @@ def read_exr(path: Path) -> Pixels:
     pixels = read_openimageio(path)
     if _display(spec) == _data(spec):
         return pixels
-    shown = np.zeros((spec.full_height, spec.full_width, pixels.shape[2]), pixels.dtype)
+    window = np.zeros((spec.full_height, spec.full_width, pixels.shape[2]), pixels.dtype)
     left, top = spec.x - spec.full_x, spec.y - spec.full_y
     right, bottom = left + spec.width, top + spec.height
-    here = np.s_[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
-    target = shown[here]
-    there = pixels[max(-top, 0) :, max(-left, 0) :][: target.shape[0], : target.shape[1]]
-    target[:] = there
-    return shown
+    target = window[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]
+    source = pixels[max(-top, 0) :, max(-left, 0) :]
+    target[:] = source[: target.shape[0], : target.shape[1]]
+    return window
 
 
 _RESOLUTION = re.compile(rb"\n([-+][XY]) +\d+ +([-+][XY]) +\d+\n")
@@ -146,11 +145,11 @@ _RESOLUTION = re.compile(rb"\n([-+][XY]) +\d+ +([-+][XY]) +\d+\n")
 _RADIANCE = {
     b"-Y+X": 1, b"-Y-X": 2, b"+Y-X": 3, b"+Y+X": 4, b"+X-Y": 5, b"-X-Y": 6, b"-X+Y": 7, b"+X+Y": 8,
 }  # fmt: skip
-"""EXIF orientation by the order of pixels in a Radiance file. OpenImageIO 3.2 swaps 6 and 8."""
+"""EXIF orientation for each order of pixels in a Radiance file. OpenImageIO 3.2 swaps 6 and 8."""
 
 
 def hdr_header(path: Path) -> Header:
-    """Return what a Radiance file says."""
+    """Return the header of a Radiance file."""
     with path.open("rb") as file:
         text = file.read(1 << 14)
     if b"32-bit_rle_xyze" in text:
@@ -160,7 +159,7 @@ def hdr_header(path: Path) -> Header:
     order = _RESOLUTION.search(text)
     orientation = _RADIANCE.get(order[1] + order[2], 1) if order else 1
     width, height = spec.width, spec.height
-    if orientation in TURNED:
+    if orientation in TRANSPOSED:
         width, height = height, width
     return Header(width, height, 3, 12, "linear", orientation)
 
@@ -172,12 +171,12 @@ def hdr_header(path: Path) -> Header:
 _GAP = rb"(?:\s|#[^\n]*\n)+"
 _NUMBER = rb"(\d{1,9})"
 _PFM = re.compile(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+(-?[0-9.eE+-]+)\s")
-"""Kind (PF is RGB, Pf is grey), width, height, and a scale that is negative for little endian."""
+"""Kind (PF is RGB, Pf is grey), width, height, and a scale whose sign is the byte order."""
 _PNM = re.compile(rb"(P[2356])" + _GAP + _NUMBER + _GAP + _NUMBER + _GAP + _NUMBER + rb"\s")
 """Kind (P2 and P3 are text; P3 and P6 are RGB), width, height, and the value of white."""
 
 MAX_HEADER = 1 << 16
-"""Bytes in which the header of a portable map ends; it may have comments."""
+"""Largest size in bytes of the header of a portable map, which may contain comments."""
 
 
 class _Map:
@@ -188,7 +187,7 @@ class _Map:
             start = file.read(MAX_HEADER)
         header = _PFM.match(start) or _PNM.match(start)
         if not header:
-            raise ValueError("no header of a portable map")
+            raise ValueError("the header of the portable map is damaged")
         self.kind, self.start = header[1], header.end()
         self.width, self.height = int(header[2]), int(header[3])
         self.channels = 3 if self.kind in (b"P3", b"P6", b"PF") else 1
@@ -198,7 +197,7 @@ class _Map:
             return
         self.white = int(header[4])
         if not 1 <= self.white <= 65535:
-            raise ValueError(f"its white is {self.white}, not 1 to 65,535")
+            raise ValueError(f"its white is {self.white}, expected 1 to 65,535")
         self.dtype = np.dtype("u1" if self.white < 256 else ">u2")
 
     @property
@@ -207,18 +206,18 @@ class _Map:
 
 
 def netpbm_header(path: Path) -> Header:
-    """Return what a PGM, PPM or PFM file says."""
+    """Return the header of a PGM, PPM or PFM file."""
     header = _Map(path)
     encoding = "linear" if header.floats else "srgb"
-    several = not header.floats and not header.text
-    more = several and path.stat().st_size > header.start + 2 * header.bytes
+    may_hold_several = not header.floats and not header.text
+    more = may_hold_several and path.stat().st_size > header.start + 2 * header.bytes
     needed = header.channels * (8 if header.text else header.dtype.itemsize)
     notes = ("holds several images, the first is used",) if more else ()
     return Header(header.width, header.height, header.channels, needed, encoding, notes=notes)
 
 
 def read_netpbm(path: Path) -> Pixels:
-    """Return the pixels of a PGM, PPM or PFM file; those whose white is another are floats."""
+    """Return the pixels of a PGM, PPM or PFM file; as floats unless white is 255 or 65,535."""
     header = _Map(path)
     shape = header.height, header.width, header.channels
     with path.open("rb") as file:
@@ -228,7 +227,7 @@ def read_netpbm(path: Path) -> Pixels:
         numbers = re.sub(rb"#[^\n]*", b"", content).split(maxsplit=int(np.prod(shape)))
         values = np.array(numbers[: int(np.prod(shape))], np.float32)
     elif len(content) != header.bytes:
-        raise ValueError("its size is not that of its header")
+        raise ValueError("its size does not match its header")
     else:
         values = np.frombuffer(content, header.dtype)
     pixels = values.reshape(shape)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..backend.messages import warn
 from ..backend.types import PathLike, Record, Values
 from .color import BASIS_SPACES, to_planes
-from .formats import LEFT_SUFFIXES, READ_SUFFIXES
+from .formats import READ_SUFFIXES, UNREAD_SUFFIXES
 from .io import check_image, load_image
 from .pixels import ImageError, check_size
 from .remote import is_url, list_urls
@@ -30,8 +30,8 @@ THREADS = min(8, available_cores())
 """Number of threads that decode files; Pillow and NumPy release the interpreter lock."""
 
 MAX_WAITING, MAX_WAITING_BYTES = 512, 1 << 25
-"""Largest number of images that wait in memory, and their bytes, as far as the largest image until
-then tells. One image may wait whatever its size."""
+"""Largest number of decoded images that wait in memory, and their total bytes, estimated from the
+largest image so far. One image may always wait."""
 
 MAX_NAMED = 3
 """Largest number of files that a warning names."""
@@ -39,14 +39,14 @@ MAX_NAMED = 3
 FileOrImage = PathLike | Values
 
 TrainingImages = FileOrImage | Iterable[FileOrImage]
-"""A folder or its URL, an array of images, or any iterable of files, of URLs and of such arrays."""
+"""A folder or its URL, an array of images, or an iterable of files, URLs and such arrays."""
 
 ReadProgress = Callable[[int, int | None, Record], None]
 """``progress(done, total, row)``; the total is None if it is unknown."""
 
 
 class PreparedImage(NamedTuple):
-    """One image of a block, or the reason why it cannot be read.
+    """One image of a block, or the reason why it could not be read.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ def image_files(folder: str | Path) -> list[Path]:
     Warns
     -----
     UserWarning
-        If files with a suffix of `LEFT_SUFFIXES` are left out.
+        If files with a suffix of `UNREAD_SUFFIXES` are left out.
 
     Raises
     ------
@@ -88,14 +88,14 @@ def image_files(folder: str | Path) -> list[Path]:
     try:
         entries = sorted(folder.iterdir())
     except NotADirectoryError:
-        raise ImageError(f"{folder}: is a file; name the folder that holds it") from None
+        raise ImageError(f"{folder}: is a file; give the folder that holds it") from None
     except OSError as error:
         raise ImageError(f"{folder}: not a readable folder ({error.strerror}); check it") from None
     entries = [entry for entry in entries if entry.name[0] != "." and entry.is_file()]
     files = [entry for entry in entries if entry.suffix.lower() in READ_SUFFIXES]
-    left = [entry.name for entry in entries if entry.suffix.lower() in LEFT_SUFFIXES]
-    if left:
-        warn(f"{folder}: {len(left)} files of kinds that are not read are left out: {_names(left)}")
+    skipped = [entry.name for entry in entries if entry.suffix.lower() in UNREAD_SUFFIXES]
+    if skipped:
+        warn(f"{folder}: {len(skipped)} files of unsupported kinds are left out: {_names(skipped)}")
     if not files:
         known = " ".join(READ_SUFFIXES)
         raise ImageError(f"{folder}: holds no images; expected files ending in {known}")
@@ -103,7 +103,7 @@ def image_files(folder: str | Path) -> list[Path]:
 
 
 def _names(names: list[str]) -> str:
-    """Return the first names of a list."""
+    """Return the first names of a list as text."""
     return ", ".join(names[:MAX_NAMED]) + (", ..." if len(names) > MAX_NAMED else "")
 
 
@@ -122,14 +122,14 @@ def list_images(images: str | os.PathLike[str]) -> Sequence[str | Path]:
     Raises
     ------
     ImageError
-        If there is none.
+        If there are no images.
     """
     if is_url(images):
         return list_urls(str(images))
     if glob.has_magic(os.fspath(images)) and not os.path.exists(images):
         files = sorted(Path(name) for name in glob.glob(os.fspath(images), recursive=True))
         if not files:
-            raise ImageError(f"{images}: no file has such a name; check the pattern")
+            raise ImageError(f"{images}: no file matches; check the pattern")
         return files
     return image_files(Path(images))
 
@@ -143,15 +143,16 @@ def read_blocks(
 ) -> Generator[NDArray[np.float32], None, None]:
     """Read images in blocks, in the order of the source.
 
-    Every `length` consecutive images of the source form one block, without the files that cannot be
-    read. A run that stopped after n blocks can continue with image ``n * length`` of the source.
+    Every `length` consecutive images of the source form one block; files that cannot be read are
+    left out. A run that stopped after n blocks can continue with image ``n * length`` of the
+    source.
 
     Parameters
     ----------
     source : path, array or iterable
         A folder or its URL, an array of images (n, H, W, 3) or (n, H, W), or an iterable of files,
-        of URLs, of arrays of images or of RGB images (H, W, 3). Pixels as for
-        `eigengs_dr.image.io.check_image`. An iterator may overwrite an array after the next one is
+        URLs, arrays of images, or RGB images (H, W, 3). Pixels as for
+        `eigengs_dr.image.io.check_image`. An iterator may overwrite an array when the next one is
         requested.
     size : (int, int)
         Width and height in pixels. Images of another size are centre-cropped and resized.
@@ -165,8 +166,8 @@ def read_blocks(
     Yields
     ------
     ndarray of float32, shape (b, 3, height * width)
-        0 <= b <= length. The caller may overwrite the block, and should delete it before the next
-        request: otherwise two blocks are in memory.
+        0 <= b <= length. The caller may overwrite the block, and should delete it before it
+        requests the next one: otherwise two blocks are in memory.
 
     Raises
     ------
@@ -178,7 +179,8 @@ def read_blocks(
     Warns
     -----
     UserWarning
-        At the end: how many images were skipped, with the first names, and how many were resized.
+        At the end, with the number of skipped images and the first names, and the number of resized
+        images.
     """
     size = check_size(size)
     if space not in BASIS_SPACES:
@@ -206,7 +208,7 @@ def _blocks(
     total: int | None,
     progress: ReadProgress | None,
 ) -> Generator[NDArray[np.float32], None, None]:
-    """Collect images in blocks, and warn at the end of skipped and resized images."""
+    """Collect images in blocks, and warn about skipped and resized images at the end."""
     pixels = size[0] * size[1]
     done = fitted = 0
     problems: list[str] = []
@@ -227,11 +229,13 @@ def _blocks(
             if done == before:
                 break
             yield block[:filled]
-            del block  # frees the memory before the next block
+            del block  # frees the memory before the next block is allocated
     if done == 0:
         raise ImageError("the source holds no images; check the source")
     if len(problems) == done:
-        raise ImageError(f"none of {done} images can be read, as {problems[0]}; check the files")
+        raise ImageError(
+            f"none of {done} images can be read, for example {problems[0]}; check the files"
+        )
     if problems:
         warn(f"{len(problems)} of {done} images were skipped: {_names(problems)}")
     if fitted:
@@ -248,23 +252,24 @@ def read_ahead(
     is_file: Callable[[Item], bool],
     bytes_of: Callable[[Read], int],
 ) -> Generator[Read, None, None]:
-    """Read items in threads while the caller works on earlier ones.
+    """Read items in threads while the caller processes earlier ones.
 
     Parameters
     ----------
     items : iterable
     read : callable
-        Returns what is yielded for an item.
+        Returns the result for an item.
     is_file : callable
-        Whether threads may read an item. Others are read at once: the owner of an array may
-        overwrite it when the next one is requested.
+        Whether threads may read an item. Others are read at once, because the owner of an array
+        may overwrite it when the next one is requested.
     bytes_of : callable
-        Memory of what was read.
+        Memory that a result takes, in bytes.
 
     Yields
     ------
     object
-        In the order of the items. At most `MAX_WAITING` and about `MAX_WAITING_BYTES` wait.
+        Results in the order of the items. At most `MAX_WAITING`, and about `MAX_WAITING_BYTES`,
+        wait.
     """
     waiting: deque[Future[Read]] = deque()
     largest = 0
@@ -276,12 +281,12 @@ def read_ahead(
             else:
                 waiting.append(Future())
                 waiting[-1].set_result(read(item))
-            most = MAX_WAITING_BYTES // largest if largest else THREADS
-            while len(waiting) > min(max(1, most), MAX_WAITING):
-                found = waiting.popleft().result()
-                largest = max(largest, bytes_of(found))
-                yield found
-                del found  # frees the memory before the next one is awaited
+            limit = MAX_WAITING_BYTES // largest if largest else THREADS
+            while len(waiting) > min(max(1, limit), MAX_WAITING):
+                result = waiting.popleft().result()
+                largest = max(largest, bytes_of(result))
+                yield result
+                del result  # frees the memory before waiting for the next one
         while waiting:
             yield waiting.popleft().result()
     finally:
@@ -289,7 +294,7 @@ def read_ahead(
 
 
 def _singles(source: Iterable[FileOrImage]) -> Iterator[FileOrImage]:
-    """Yield files and single images."""
+    """Yield files and single images; arrays of images are split."""
     for item in source:
         if isinstance(item, str | os.PathLike):
             yield item if is_url(item) else Path(item)
@@ -306,7 +311,7 @@ def _prepare(numbered: tuple[int, Any], size: tuple[int, int], space: str) -> Pr
     except (ImageError, OSError) as error:
         if not loaded:
             raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None
-        # A warning that lists several files has room for the name and the reason only.
+        # A warning lists several files, so each gets its name and the reason only.
         reason = str(error).removeprefix(f"{item}: ").split("; ")[0]
         return PreparedImage(None, False, f"{Path(item).name} ({reason})")
     width, height = size
@@ -324,6 +329,6 @@ def _images(item: object) -> Sequence[Values]:
     """Return the images of an array as a sequence."""
     if not isinstance(item, np.ndarray) or item.ndim not in (3, 4):
         kind = f"shape {item.shape}" if isinstance(item, np.ndarray) else type(item).__name__
-        raise ImageError(f"images: found {kind}, expected (n, H, W, 3) or (n, H, W); pass arrays")
-    # A last axis of 1 or 3 holds channels: no grey image is so narrow.
+        raise ImageError(f"images: got {kind}, expected (n, H, W, 3) or (n, H, W); pass arrays")
+    # A last axis of length 1 or 3 holds channels: no grey image is so narrow.
     return [item] if item.ndim == 3 and item.shape[2] in (1, 3) else list(item)

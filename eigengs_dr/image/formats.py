@@ -1,6 +1,6 @@
-"""Suffixes of image files, and which library writes them: Pillow, tifffile, OpenImageIO.
+"""Suffixes of image files, and the libraries that write them: Pillow, tifffile, OpenImageIO.
 
-OpenImageIO, from the extra ``hdr``, writes EXR, Radiance HDR and PNG of 16-bit colour.
+OpenImageIO, from the extra ``hdr``, writes EXR, Radiance HDR and PNG files of 16-bit colour.
 """
 
 from __future__ import annotations
@@ -26,28 +26,29 @@ BITS: dict[str, tuple[int, ...]] = {
     ".hdr": (32,),
     ".pfm": (32,),
 }
-"""Suffixes of files that are written, with the bits of a value; the first number is the default. 32
-are floats, and so are 16 in an EXR file. An HDR file stores 8 bits of a value and an exponent."""
+"""Suffixes of files that can be written, with the possible bits per value; the first number is the
+default. 32 bits are floats, and so are 16 in an EXR file. An HDR file stores 8 bits per value and a
+shared exponent."""
 
 SUFFIXES = tuple(BITS)
-"""Suffixes of files that are written."""
+"""Suffixes of files that can be written."""
 
 READ_SUFFIXES = (
     *SUFFIXES,
     *(".jfif", ".jpe", ".apng", ".avif", ".gif", ".tga", ".dib"),
     *(".jp2", ".j2k", ".jpf", ".jpx", ".pgm", ".pbm", ".pnm"),
 )
-"""Suffixes of files that are read from a folder. A file that is named is read by its content."""
+"""Suffixes of files that are read from a folder. A single file is read by its content."""
 
-LEFT_SUFFIXES = (
+UNREAD_SUFFIXES = (
     *(".heic", ".heif", ".jxl", ".jpc", ".svg", ".psd", ".psb", ".xcf", ".kra", ".eps", ".ico"),
     *(".dds", ".ktx", ".ktx2", ".hif", ".rgbe", ".sgi", ".pcx", ".dng", ".cr2", ".cr3", ".nef"),
     *(".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".fits", ".fit", ".dcm", ".npy", ".pam"),
 )
-"""Suffixes of other images, which a folder names as left out."""
+"""Suffixes of images that cannot be read; a warning names those in a folder."""
 
 PICTURE_SUFFIXES = tuple(suffix for suffix, bits in BITS.items() if 8 in bits)
-"""Suffixes of files of 8 bits, which Pillow writes."""
+"""Suffixes of 8-bit files, which Pillow writes."""
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 
@@ -56,11 +57,11 @@ LOSSY = (".jpg", ".jpeg", ".webp")
 ADVICE = "needs OpenImageIO; type: pip install 'eigengs-dr[hdr]'"
 
 MAX_HALF = 65_504.0
-"""Largest finite float of 16 bits."""
+"""Largest finite 16-bit float."""
 
 
 def write_file(path: Path, pixels: Pixels, bits: int) -> None:
-    """Write pixels (H, W, C): float32, uint16 for PNG and TIFF files of 16 bits, or uint8.
+    """Write pixels (H, W, C): float32, uint16 for 16-bit PNG and TIFF files, or uint8.
 
     Raises
     ------
@@ -93,11 +94,11 @@ def has_openimageio() -> bool:
 
 
 def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
-    """Write an EXR or HDR file, or a PNG of 16 bits; 16-bit floats are clamped to +-65,504."""
+    """Write an EXR or HDR file, or a 16-bit PNG; 16-bit floats are clamped to +-65,504."""
     import OpenImageIO as oiio
 
     suffix = path.suffix.lower()
-    if suffix == ".hdr":  # it has three channels
+    if suffix == ".hdr":  # always has three channels
         pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))
     kind = "uint16" if pixels.dtype == np.uint16 else ("half" if bits == 16 else "float")
     if kind == "half":

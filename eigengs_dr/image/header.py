@@ -1,4 +1,4 @@
-"""What the header of an image file says, before any of its pixels is decoded."""
+"""Headers of image files, which are read before any pixel is decoded."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from .formats import ADVICE
 from .pixels import ImageError, peak_of, reason_of, scale
 from .strips import Pixels, by_strips
 
-TURNED = range(5, 9)
+TRANSPOSED = range(5, 9)
 """EXIF orientations that swap width and height."""
 
 ORIENTATION = 0x0112
-"""EXIF tag, and tag of TIFF, of the orientation."""
+"""Tag of the orientation in EXIF and TIFF."""
 
 
 class Header(NamedTuple):
-    """What the header of a file says of its pixels.
+    """The header of an image file: the properties of its pixels.
 
     Attributes
     ----------
     width, height : int
-        Pixels, as the image is shown.
+        Size in pixels, after the orientation is applied.
     channels : int
         1 for grey, 3 for colours; alpha does not count.
     bytes_per_pixel : int
-        Memory while the file is decoded.
+        Memory that decoding takes, in bytes per pixel.
     encoding : {"srgb", "linear"}
     orientation : int
         EXIF orientation of the decoded pixels.
     alpha : {"none", "straight", "associated", "light"}
-        Whether the last decoded channel is alpha. Colours may be multiplied by it already, as
-        sRGB ("associated") or as light, which is then shown over black ("light").
+        Whether the last decoded channel is alpha. Colours may already be multiplied by it, as sRGB
+        ("associated") or as light, which is then shown over black ("light").
     notes : tuple of str
-        Warnings.
+        Warnings about the file.
     """
 
     width: int
@@ -57,7 +57,7 @@ class Header(NamedTuple):
     notes: tuple[str, ...] = ()
 
     def check_memory(self, path: Path, as_floats: bool = True) -> None:
-        """Refuse a file whose pixels take too much memory; see `check_content`.
+        """Reject a file whose pixels take too much memory; see `check_content`.
 
         Raises
         ------
@@ -74,13 +74,13 @@ class Header(NamedTuple):
 
 @contextmanager
 def image_errors(path: Path) -> Iterator[None]:
-    """Turn the errors of a block that reads a file into errors of `load_image`, with its name."""
+    """Convert errors of a block that reads a file to `ImageError`s that name the file."""
     from PIL import UnidentifiedImageError
 
     try:
         state = path.stat()
         if stat.S_ISCHR(state.st_mode) or stat.S_ISBLK(state.st_mode):
-            raise ImageError("is a device; name an image file")
+            raise ImageError("is a device; give an image file")
         if state.st_size == 0 and stat.S_ISREG(state.st_mode):
             raise ImageError("the file is empty (0 bytes); copy or export it again")
         yield
@@ -89,21 +89,21 @@ def image_errors(path: Path) -> Iterator[None]:
         raise ImageError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
     except Exception as error:  # on damaged files decoders raise many types
         reason = reason_of(error)
-        known = {
+        messages = {
             FileNotFoundError: "no such file; check the path",
-            IsADirectoryError: "is a folder; name an image file in it",
-            PermissionError: "may not be read; check its permissions",
+            IsADirectoryError: "is a folder; give an image file in it",
+            PermissionError: "permission denied; check its permissions",
             UnidentifiedImageError: "not an image that Pillow knows; save it as PNG or JPEG",
             ImportError: ADVICE,
         }
         damaged = f"damaged or unsupported ({reason}); export it again"
-        text = next((text for kind, text in known.items() if isinstance(error, kind)), damaged)
+        text = next((text for kind, text in messages.items() if isinstance(error, kind)), damaged)
         raise ImageError(f"{path}: {text}") from error
 
 
 def oriented(pixels: Pixels, orientation: int) -> Pixels:
-    """Turn decoded pixels (H, W, C) as an EXIF orientation says; a view."""
-    if orientation in TURNED:
+    """Apply an EXIF orientation to decoded pixels (H, W, C); returns a view."""
+    if orientation in TRANSPOSED:
         pixels = pixels.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
         pixels = pixels[::-1]
@@ -111,7 +111,7 @@ def oriented(pixels: Pixels, orientation: int) -> Pixels:
 
 
 def over_background(pixels: Pixels, alpha: str) -> tuple[Pixels, bool]:
-    """Return colours without alpha, and whether some of them were transparent.
+    """Return colours without alpha, and whether some pixels were transparent.
 
     Parameters
     ----------
@@ -127,42 +127,42 @@ def over_background(pixels: Pixels, alpha: str) -> tuple[Pixels, bool]:
     if alpha == "light":
         return pixels[..., :-1], True
 
-    def show(rows: Pixels) -> NDArray[np.float32]:
+    def blend(rows: Pixels) -> NDArray[np.float32]:
         rows = scale(rows, peak)
         if alpha == "associated":
             return rows[..., :-1] + (1 - rows[..., -1:])
         return 1 - rows[..., -1:] * (1 - rows[..., :-1])
 
-    return by_strips(show, pixels, channels=pixels.shape[2] - 1), True
+    return by_strips(blend, pixels, channels=pixels.shape[2] - 1), True
 
 
 def transparency_note(alpha: str) -> str:
-    """Return the warning for transparent pixels."""
+    """Return the warning about transparent pixels."""
     return f"transparent pixels are shown over {'black' if alpha == 'light' else 'white'}"
 
 
 def frames_note(frames: int, name: str = "frames") -> tuple[str, ...]:
-    """Return the warning for a file of several images."""
+    """Return the warning about a file with several images."""
     return (f"holds {frames} {name}, the first is used",) if frames > 1 else ()
 
 
-PATCHES = (0, 64, 128, 192, 255)
-"""Levels of red, green and blue by which a colour profile is compared with sRGB."""
+PROFILE_LEVELS = (0, 64, 128, 192, 255)
+"""Levels of red, green and blue at which a colour profile is compared with sRGB."""
 
-SAME_COLOR = 4
-"""Largest difference of levels of 255 between profiles that count as equal."""
+PROFILE_TOLERANCE = 4
+"""Largest difference, in levels of 255, between colour profiles that count as equal."""
 
 
 @lru_cache(64)  # images of one camera share a profile
 def profile_note(profile: bytes, encoding: str) -> tuple[str, ...]:
-    """Return a warning if an ICC profile gives other colours than sRGB, or than light.
+    """Return a warning if an ICC profile differs from sRGB, or from linear light.
 
     Parameters
     ----------
     profile : bytes
-        Empty for none.
+        Empty if there is no profile.
     encoding : {"srgb", "linear"}
-        What the pixels count as.
+        The assumed encoding of the pixels.
     """
     if not profile:
         return ()
@@ -173,15 +173,15 @@ def profile_note(profile: bytes, encoding: str) -> tuple[str, ...]:
         name = ImageCms.getProfileDescription(opened).strip()
         mode = {"GRAY": "L", "CMYK": "CMYK"}.get(opened.profile.xcolor_space.strip(), "RGB")
         if mode != "CMYK":
-            grid = np.stack(np.meshgrid(PATCHES, PATCHES, PATCHES), axis=-1)
+            grid = np.stack(np.meshgrid(*[PROFILE_LEVELS] * 3), axis=-1)
             levels = grid.reshape(5, 25, 3).astype(np.uint8)
             levels = levels[..., 0] if mode == "L" else levels
-            shown = ImageCms.profileToProfile(
+            converted = ImageCms.profileToProfile(
                 Image.fromarray(levels), opened, ImageCms.createProfile("sRGB"), outputMode="RGB"
             )
             codes = levels / 255 if encoding == "srgb" else to_coded(levels / 255)
             codes = codes[..., None] if mode == "L" else codes
-            if np.abs(np.asarray(shown) - 255 * codes).max() <= SAME_COLOR:
+            if np.abs(np.asarray(converted) - 255 * codes).max() <= PROFILE_TOLERANCE:
                 return ()
     except Exception:  # Little CMS raises several types on damaged profiles, or is missing
         return ("its colour profile cannot be read, and is ignored",)

@@ -1,4 +1,4 @@
-"""Image files: load and save; photos of scikit-image."""
+"""Loading and saving of image files; photos of scikit-image."""
 
 from __future__ import annotations
 
@@ -43,39 +43,39 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
 
     The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation. It
     ignores colour profiles, with a warning if one is not sRGB. Integers are divided by their
-    largest value, so that 1 is white. Floats stay as they are. EXR, Radiance HDR, and PNG of 16-bit
-    colour need OpenImageIO, from the extra ``hdr``; without it, the last has 8 bits and a warning.
-    The manual has a table of all kinds of files.
+    largest value, so that 1 is white. Floats are not converted. EXR, Radiance HDR, and PNG of
+    16-bit colour need OpenImageIO, from the extra ``hdr``; without it, such a PNG is read with 8
+    bits and a warning. The manual has a table of all kinds of files.
 
     Parameters
     ----------
     path : str or Path
-        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PGM, PPM and PFM. Or a
-        pipe, or the URL of such a file, which needs fsspec, from the extra ``cluster``; both are
-        read up to 1 GB.
+        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PGM, PPM and PFM. A
+        pipe, or the URL of such a file, of up to 1 GB is accepted too; URLs need fsspec, from the
+        extra ``cluster``.
     keep_grey : bool, optional
-        Return one channel if the file is opaque grey.
+        Return one channel if the file is grey and opaque.
 
     Returns
     -------
     ndarray of float32, shape (H, W, 3) or (H, W, 1)
-        What the file holds: sRGB in [0, 1], or light without a bound, of a file of floats. Pass
-        such an array on with ``encoding="linear"``; a function that takes the file itself, as
-        `fit` does, knows what the file holds.
+        sRGB in [0, 1], or linear light without bounds if the file holds floats. Pass an array of
+        light on with ``encoding="linear"``; functions that take the file itself, such as `fit`,
+        know its encoding.
 
     Warns
     -----
     UserWarning
         If the image has transparent pixels, which are shown over white, or over black in an EXR
-        file. If the file holds several images, of which the first is used; channels that are no
+        file. If the file holds several images, of which the first is used; channels that are not
         colours; colours that are not sRGB; or more bits than are read.
 
     Raises
     ------
     ImageError
-        If the file is missing, empty, damaged, not an image, or of a kind that has no meaning here;
-        its pixels would take much more memory than the file is likely to need; a pixel is not
-        finite; or an EXR file holds one channel without `keep_grey`, or several layers.
+        If the file is missing, empty, damaged, not an image, or of an unsupported kind; its pixels
+        would take implausibly much memory for its size; a pixel is not finite; or an EXR file holds
+        one channel without `keep_grey`, or several layers.
     OSError
         If a URL cannot be read.
     """
@@ -85,9 +85,9 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
 def read_file(
     path: str | Path, keep_grey: bool = False, encoding: str | None = None
 ) -> EncodedImage:
-    """Read an image file as `load_image` does, and say what its pixels are.
+    """Read an image file as `load_image` does, and return its encoding too.
 
-    `encoding` overrules the file: by default files of floats hold light, others sRGB.
+    `encoding` overrides the default: files of floats hold linear light, others sRGB.
     """
     check_encoding(encoding)
     if not is_copied(path):
@@ -100,20 +100,20 @@ def read_file(
 
 
 def _read_local(path: Path, name: str, keep_grey: bool, encoding: str | None) -> EncodedImage:
-    """Read a file that warnings call `name`."""
+    """Read a file that warnings refer to as `name`."""
     header = read_header(path)
     header.check_memory(path)
     decoded = decode(path, header, keep_grey, name)
-    said = encoding or decoded.encoding
-    pixels = to_floats(decoded.pixels, name, keep_grey, copy=False, encoding=said)
-    return EncodedImage(pixels, said)
+    encoding = encoding or decoded.encoding
+    pixels = to_floats(decoded.pixels, name, keep_grey, copy=False, encoding=encoding)
+    return EncodedImage(pixels, encoding)
 
 
 def read_image(image: object, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
-    """Read an image that is a file or a URL; say of anything else what its pixels are.
+    """Read an image from a file or a URL; add the encoding to any other image.
 
-    For parameters and errors see `read_file` and `eigengs_dr.image.pixels.encoding_of`. Pixels of
-    which nobody says what they are count as sRGB.
+    For parameters and errors see `read_file` and `eigengs_dr.image.pixels.encoding_of`. Pixels
+    without a known encoding count as sRGB.
     """
     if isinstance(image, (str, os.PathLike)):
         return read_file(image, keep_grey, encoding)  # type: ignore[arg-type]
@@ -123,7 +123,7 @@ def read_image(image: object, keep_grey: bool = False, encoding: str | None = No
 
 
 def pixels_of(image: object) -> Any:
-    """Return what a `PIL.Image.Image` shows, grey or RGB over white; anything else as it is."""
+    """Return a `PIL.Image.Image` as grey or RGB pixels over white; anything else unchanged."""
     if not is_picture(image):
         return image
     try:
@@ -140,31 +140,31 @@ def pixels_of(image: object) -> Any:
 def read_floats(
     image: object, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
 ) -> EncodedImage:
-    """Read an image and convert it to float32 as `load_image` does: light stays light.
+    """Read an image and convert it to float32 as `load_image` does, without changing its encoding.
 
     For parameters and errors see `check_image`.
     """
-    pixels, said = read_image(image, keep_grey, encoding)
-    return EncodedImage(to_floats(pixels, "image", keep_grey, copy, said), said)
+    pixels, encoding = read_image(image, keep_grey, encoding)
+    return EncodedImage(to_floats(pixels, "image", keep_grey, copy, encoding), encoding)
 
 
 def check_image(
     image: object, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
 ) -> NDArray[np.float32]:
-    """Convert an image to sRGB in float32, and refuse what is not an image.
+    """Convert an image to sRGB in float32, and reject what is not an image.
 
     Parameters
     ----------
     image : array_like, shape (H, W), (H, W, 1) or (H, W, 3); or path-like or URL; or PIL image
         Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats with 1 as white. sRGB may
         overshoot [0, 1] by 0.5, as in resampled images; it is not clamped. Light may have any
-        finite value. A file and a ``mitsuba.Bitmap`` say themselves what they hold.
+        finite value. The encoding of a file or a ``mitsuba.Bitmap`` is known.
     keep_grey : bool, optional
         Return one channel if the image is grey.
     copy : bool, optional
-        Without it, a C-contiguous image of float32 in sRGB is returned as it is.
+        If false, a C-contiguous float32 image in sRGB is returned without a copy.
     encoding : {"srgb", "linear"}, optional
-        What the pixels are. By default what the image says, else "srgb".
+        The encoding of the pixels. By default that of the image if it is known, else "srgb".
 
     Returns
     -------
@@ -186,26 +186,27 @@ def check_image(
     array([[0. , 0.2],
            [0.4, 1. ]], dtype=float32)
     """
-    found = read_image(image, keep_grey, encoding)
-    light = found.encoding == "linear"
-    pixels = read_floats(found, keep_grey, copy and not light).pixels
+    encoded = read_image(image, keep_grey, encoding)
+    light = encoded.encoding == "linear"
+    pixels = read_floats(encoded, keep_grey, copy and not light).pixels
     return by_strips(to_coded, pixels) if light else pixels
 
 
 def check_data(image: object, copy: bool = True) -> NDArray[np.float32]:
-    """Convert an image of data to float32: one channel or three, of any finite values.
+    """Convert an image of data to float32: one to three channels, of any finite values.
 
-    For parameters, result and errors see `check_image`; integers are scaled to [0, 1], and nothing
-    is converted to sRGB.
+    For parameters, result and errors see `check_image`; integers are scaled to [0, 1], and values
+    are not converted to sRGB.
     """
-    return read_floats(image, keep_grey=True, copy=copy, encoding="linear").pixels
+    pixels, said = read_image(image, keep_grey=True, encoding="linear")
+    return to_floats(pixels, "image", keep_grey=True, copy=copy, encoding=said, known=(1, 2, 3))
 
 
 @takes_numbers
 def save_image(
     path: str | Path, image: ArrayLike, encoding: str | None = None, bits: int | None = None
 ) -> None:
-    """Write an image file, completely or not at all.
+    """Write an image file atomically.
 
     Parameters
     ----------
@@ -218,11 +219,11 @@ def save_image(
         RGB, or grey, which is written with one channel. Types as for `check_image`. Integers are
         clamped to [0, 1]; floats are not.
     encoding : {"srgb", "linear"}, optional
-        What the pixels are. They are converted where the file holds something else: light becomes
-        sRGB in a .png file, sRGB becomes light in an .exr file. By default what the image says,
-        see `check_image`; an array that says nothing is written as it is.
+        The encoding of the pixels. They are converted to that of the file: light to sRGB in a .png
+        file, sRGB to light in an .exr file. By default that of the image, see `check_image`; an
+        array of unknown encoding is written without conversion.
     bits : {8, 16, 32}, optional
-        Bits of a value: 8 or 16 in .png; 8, 16 or 32 (floats) in .tif; 16 or 32, both floats, in
+        Bits per value: 8 or 16 in .png; 8, 16 or 32 (floats) in .tif; 16 or 32, both floats, in
         .exr. By default 32 in .exr, .hdr and .pfm, else 8.
 
     Warns
@@ -233,35 +234,35 @@ def save_image(
     Raises
     ------
     ImageError
-        If the array is not an image, the suffix is unknown, the format has no such bits, a package
-        is missing or the file cannot be written. An existing file does not change.
+        If the array is not an image, the suffix is unknown, the format does not support the bits, a
+        package is missing or the file cannot be written. An existing file does not change.
     """
     refuse_url(path)
     path = Path(path)
     bits = bits_of(path, bits)
     image = pixels_of(image)
-    said = encoding_of(image, encoding)
-    if bits == 8 and said != "linear" and getattr(image, "dtype", None) == np.uint8:
+    encoding = encoding_of(image, encoding)
+    if bits == 8 and encoding != "linear" and getattr(image, "dtype", None) == np.uint8:
         array = np.asarray(image)
         if array.size and array.shape[2:] in ((1,), (3,)):
             return write_pixels(path, array, bits)  # large pictures need no copy
     floats = to_floats(image, "image", keep_grey=True, copy=False)
     kind = dtype_of(path, bits)
-    if said != "linear" and kind != np.float32 and MAX_PIXEL < floats.mean() <= 255:
+    if encoding != "linear" and kind != np.float32 and MAX_PIXEL < floats.mean() <= 255:
         raise ImageError(
             f"{path}: pixels run from {floats.min():g} to {floats.max():g}, and 1 is white; "
-            "divide by 255, or say encoding='linear' for light"
+            "divide by 255, or pass encoding='linear' for light"
         )
-    write_pixels(path, by_strips(lambda part: to_file(part, said, kind), floats, kind), bits)
+    write_pixels(path, by_strips(lambda part: to_file(part, encoding, kind), floats, kind), bits)
 
 
 def bits_of(path: Path, bits: int | None = None) -> int:
-    """Return the bits of a value in a file to be written, by its suffix if they are not given.
+    """Return the bits per value of a file to be written, by default those of its suffix.
 
     Raises
     ------
     ImageError
-        If the suffix is unknown, the format has no such bits, or OpenImageIO is missing.
+        If the suffix is unknown, the format does not support the bits, or OpenImageIO is missing.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -269,8 +270,8 @@ def bits_of(path: Path, bits: int | None = None) -> int:
         raise ImageError(f"{path}: image suffix {suffix!r} is unknown; use one of {known}")
     known_bits = BITS[suffix]
     if bits is not None and bits not in known_bits:
-        shown = " or ".join(map(str, sorted(known_bits)))
-        raise ImageError(f"{path}: bits is {bits}; a {suffix} file has {shown}")
+        supported = " or ".join(map(str, sorted(known_bits)))
+        raise ImageError(f"{path}: bits is {bits}; a {suffix} file has {supported}")
     if suffix in (".exr", ".hdr") and not has_openimageio():
         raise ImageError(f"{path}: {ADVICE}")
     return bits or known_bits[0]
@@ -289,9 +290,9 @@ def to_file(pixels: NDArray[np.floating], encoding: str | None, kind: type[np.ge
     ----------
     pixels : ndarray of float
     encoding : {"srgb", "linear"} or None
-        What the pixels are; None writes them as they are.
+        Encoding of the pixels; with None they are not converted.
     kind : dtype
-        uint8 and uint16 hold sRGB, clamped and rounded; float32 holds light.
+        uint8 and uint16 hold sRGB, clamped and rounded; float32 holds linear light.
 
     Returns
     -------
@@ -305,7 +306,7 @@ def to_file(pixels: NDArray[np.floating], encoding: str | None, kind: type[np.ge
 
 
 def write_pixels(path: Path, pixels: Pixels, bits: int) -> None:
-    """Write pixels (H, W, C) of the type of `dtype_of`, completely or not at all.
+    """Write pixels (H, W, C) of the type from `dtype_of` atomically.
 
     Raises
     ------
@@ -338,7 +339,7 @@ def to_8bit(image: Pixels, out: Pixels | None = None) -> Pixels:
     Returns
     -------
     ndarray, same shape and dtype
-        Whole numbers from 0 to 255; NaN stays NaN.
+        Integer values from 0 to 255; NaN stays NaN.
     """
     clipped = np.clip(image, 0, 1, out=out)
     clipped *= 255
@@ -360,16 +361,16 @@ SAMPLES = {
     "retina": "retina.jpg",
     "rocket": "rocket.jpg",
 }
-"""Files inside the scikit-image wheel, by name; its other photos need a download."""
+"""Files in the scikit-image wheel, by name; its other photos need a download."""
 
 
 def sample(name: str) -> NDArray[np.float32]:
-    """Load a photo that is part of scikit-image, without a download.
+    """Load a photo that ships with scikit-image, without a download.
 
     Parameters
     ----------
     name : str
-        One of `SAMPLES`, for instance ``"astronaut"``, ``"chelsea"`` (a cat) or ``"coffee"``.
+        One of `SAMPLES`, for example ``"astronaut"``, ``"chelsea"`` (a cat) or ``"coffee"``.
 
     Returns
     -------
@@ -383,8 +384,8 @@ def sample(name: str) -> NDArray[np.float32]:
     """
     if name not in SAMPLES:
         raise ImageError(f"sample {name!r} is unknown; use one of {', '.join(SAMPLES)}")
-    # find_spec finds the folder without the slow import of scikit-image.
+    # find_spec locates the folder without the slow import of scikit-image.
     [folder] = find_spec("skimage").submodule_search_locations  # type: ignore[union-attr, misc]
     path = Path(folder) / "data" / SAMPLES[name]
-    header = read_header(path)._replace(notes=())  # the profile of one is another
+    header = read_header(path)._replace(notes=())  # one photo has another colour profile
     return to_floats(decode(path, header, keep_grey=False).pixels, name)

@@ -1,8 +1,8 @@
 """Similarity of two images: PSNR in RGB and YCbCr, SSIM and MS-SSIM, strip by strip.
 
-The sums of SSIM are this package's own. Its blur, sums of shifted planes, takes a quarter of the
-time of `scipy.ndimage.correlate1d`, which converts every row and column to double precision: 2.4
-and 11 ns a pixel of float32 with 7 taps along both axes.
+SSIM is implemented here. Its blur, sums of shifted planes, takes a quarter of the time of
+`scipy.ndimage.correlate1d`, which converts every row and column to double precision: 2.4 and 11 ns
+per float32 pixel with 7 taps along both axes.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from .pixels import check_weight, peak_of
 from .strips import Pixels, map_threads, strips
 
 C1, C2 = 0.01**2, 0.03**2
-"""Constants of SSIM for pictures whose white is 1."""
+"""Constants of SSIM for images whose white is 1."""
 
 MAX_PSNR = 100.0
-"""Upper bound of reported PSNRs, in dB: above it, only rounding errors differ."""
+"""Upper bound of reported PSNRs, in dB: above it, differences are rounding errors."""
 
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the finest scale to the coarsest, Wang et al. 2003, section 3.2."""
@@ -41,8 +41,9 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb", weight: ArrayLike | Non
     the official EigenGS code. The range of Y spans 219/255 of the peak. Therefore ``"ycbcr"`` gives
     higher numbers than ``"rgb"``: 4.94 dB more for white noise, 6.09 dB more for an error in grey.
     ``"data"`` compares the channels with peak 1 and neither clamps nor rounds.
-    ``"pu21"`` compares light, also above 1, as the eye does: it decodes sRGB and compares codes of
-    `eigengs_dr.image.color.to_pu21`, whose peak, 1, is white. Light above 100 counts as 100.
+    ``"pu21"`` compares light, also above 1, perceptually: it decodes sRGB and compares codes of
+    `eigengs_dr.image.color.to_pu21`, with the code of white, 1, as the peak. Light above 100 counts
+    as 100.
 
     Parameters
     ----------
@@ -54,14 +55,14 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb", weight: ArrayLike | Non
         Space in which the mean squared error over all pixels and channels is computed.
     weight : array_like, shape (H, W), (H, W, 1) or (H, W, C), optional
         Factors of the squared errors of pixels, or of their channels in that space; finite and at
-        least 0. The mean squared error is then ``sum w e^2 / sum w``. What has the weight 0 does
-        not count; it may be NaN.
+        least 0. The mean squared error is then ``sum w e^2 / sum w``. Pixels of weight 0 do not
+        count, and may be NaN.
 
     Returns
     -------
     float
         ``10 log10(peak^2 / mse)``; infinite for equal images, NaN if a pixel is NaN. Computed in
-        double precision, strip by strip: the function makes no copy of an image.
+        double precision, strip by strip, without a copy of an image.
 
     Raises
     ------
@@ -79,10 +80,10 @@ def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb", weight: ArrayLike | Non
 
 
 def squared_error(a: ArrayLike, b: ArrayLike, space: str, weight: ArrayLike | None = None) -> float:
-    """Return the sum of the squared errors of two images, of which `psnr` takes the mean.
+    """Return the sum of the squared errors of two images, from which `psnr` is computed.
 
-    Sums of the parts of an image add up to that of the whole. Grey images count as three channels.
-    Weights are divided by their mean. For parameters and errors see `psnr`.
+    Sums of the parts of an image add up to the sum of the image. Grey images count as three
+    channels. Weights are divided by their mean. For parameters and errors see `psnr`.
     """
     if space not in PSNR_SPACES:
         raise ValueError(f"space {space!r} is unknown; use one of {', '.join(PSNR_SPACES)}")
@@ -107,11 +108,11 @@ def _sum_squares(
         a, b = to_pu21(to_linear(a)), to_pu21(to_linear(b))
     np.subtract(a, b, out=a)
     if weight is not None:
-        with np.errstate(invalid="ignore"):  # what has the weight 0 may be any number
+        with np.errstate(invalid="ignore"):  # pixels of weight 0 may have any value
             squares = weight * np.square(a @ RGB_TO_YCBCR.T if space == "ycbcr" else a)
         return float(squares.sum(where=weight > 0)) / (255**2 if space == "rgb" else 1)
     if space == "ycbcr":
-        # |M d|^2 = trace(M d d^T M^T): the sums of the products of R, G and B are enough.
+        # |M d|^2 = trace(M d d^T M^T): the sums of the products of R, G and B suffice.
         difference = a.reshape(-1, 3)
         products = difference.T @ difference
         with np.errstate(invalid="ignore"):  # an image that is not finite has the PSNR NaN
@@ -123,8 +124,8 @@ def _sum_squares(
 def float_space(space: str) -> str:
     """Return the space in which psnr_ycbcr compares sets of a `space`.
 
-    Data and normals have no YCbCr, so their channels are compared directly. Light above 1
-    is compared in PU21, which has bounds.
+    Data and normals have no YCbCr, so their channels are compared directly. Light above 1 is
+    compared in PU21, which is bounded.
     """
     if space in UNBOUNDED:
         return "pu21"
@@ -132,16 +133,16 @@ def float_space(space: str) -> str:
 
 
 def target_key(space: str, target_space: str) -> str:
-    """Return the key of the figure in a trace that a target PSNR means, for sets of a `space`.
+    """Return the key of the trace to which a target PSNR refers, for sets of a `space`.
 
-    It is "psnr_rgb" or "psnr_ycbcr" for images. Data, normals and light above 1 may exceed what
-    psnr_rgb clamps, so that for them it is psnr_ycbcr, which compares as `float_space` says.
+    It is "psnr_rgb" or "psnr_ycbcr" for images. Data, normals and light above 1 may exceed the
+    range to which psnr_rgb clamps; for these it is psnr_ycbcr, computed in `float_space`.
     """
     return "psnr_rgb" if target_space == "rgb" and float_space(space) == "ycbcr" else "psnr_ycbcr"
 
 
 def psnr_from_mse(mse: float) -> float:
-    """Return ``10 log10(1 / mse)``, the PSNR of a mean squared error whose peak is 1; inf for 0."""
+    """Return ``10 log10(1 / mse)``, the PSNR of a mean squared error for peak 1; inf for 0."""
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
@@ -164,34 +165,34 @@ def ssim(a: Any, b: Any, weight: Any = None) -> Any:
     taken over the channels and over the pixels whose window lies inside the image. If a side is
     shorter than 11 pixels, the window shrinks to the largest odd size that fits.
 
-    Of tensors of Dr.Jit, such as those of `eigengs_dr.render`, the function is differentiable in
-    forward and reverse mode, by both images. It clamps neither of the two then, so that values
+    For Dr.Jit tensors, such as those from `eigengs_dr.render`, the function is differentiable with
+    respect to both images in forward and reverse mode. It then clamps neither image, so that values
     outside [0, 1] have derivatives too.
 
     Parameters
     ----------
     a, b : array_like, shape (H, W, 3) or (H, W, 1); or Dr.Jit tensor, shape (H, W, C)
         RGB or grey: floats with 1 as white, or bool, uint8, uint16 (scaled to
-        [0, 1]). Their order does not matter. Tensors are of floats from ``drjit.llvm.ad`` or that
-        of another backend, with any number of channels. An array beside a tensor is uploaded at
-        every call; what `drjit.freeze` records keeps the array that it saw.
+        [0, 1]). Their order does not matter. Tensors hold floats of ``drjit.llvm.ad`` or of another
+        backend, and have any number of channels. If one image is an array, it is uploaded at every
+        call; a function recorded by `drjit.freeze` keeps the array of the recording.
     weight : array_like, or tensor, shape (H, W), (H, W, 1) or (H, W, C), optional
         Factors w of the similarity s of the window around each pixel, or of each channel of it;
-        finite and at least 0, which is not checked of a tensor. The mean is then
-        ``sum w s / sum w``. Windows of weight 0 do not count, but their pixels belong to the
-        windows of others: NaN there gives NaN. Weights get no derivatives.
+        finite and at least 0, which is not checked for a tensor. The mean is then
+        ``sum w s / sum w``. Windows of weight 0 do not count, but their pixels belong to other
+        windows too: NaN there gives NaN. Weights get no derivatives.
 
     Returns
     -------
     float; or Float, shape (1,)
-        At most 1; 1 for equal images. An array of Dr.Jit if `a` or `b` is such a tensor, in double
-        precision if one of them is.
+        At most 1; 1 for equal images. A Dr.Jit array if `a` or `b` is a tensor, in double precision
+        if one of them is.
 
     Raises
     ------
     ValueError
-        If the shapes differ, or shapes or dtypes are not as above, or a weight is negative or not
-        finite, or all weights of windows are 0; or if tensors are too large for indices of 32 bits.
+        If the shapes differ, shapes or dtypes are not as above, a weight is negative or not finite,
+        all weights of windows are 0, or tensors are too large for 32-bit indices.
 
     References
     ----------
@@ -200,11 +201,11 @@ def ssim(a: Any, b: Any, weight: Any = None) -> Any:
 
     Notes
     -----
-    The result equals that of `skimage.metrics.structural_similarity` to 7 digits, which returns no
-    contrast-structure term: `ms_ssim` would need a second way. By strips of rows 4096x4096 pixels
-    take 5.4 s and no memory that counts; scikit-image takes 10.3 s and 726 MiB. 512x512 pixels take
-    0.16 s, in scikit-image 0.06 s (2 cores). 1200x1024 pixels take 0.18 s, in scikit-image 0.36 s
-    by the same strips and 0.53 s at once (1 core).
+    The result equals that of `skimage.metrics.structural_similarity` to 7 digits. That function
+    does not return the contrast-structure term, which `ms_ssim` needs. By strips of rows, 4096x4096
+    pixels take 5.4 s and negligible memory; scikit-image takes 10.3 s and 726 MiB. 512x512 pixels
+    take 0.16 s, in scikit-image 0.06 s (2 cores). 1200x1024 pixels take 0.18 s, in scikit-image
+    0.36 s by the same strips and 0.53 s at once (1 core).
 
     Examples
     --------
@@ -243,8 +244,8 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     pads it with zeros.
 
     The smaller side of the coarsest scale has at least 11 pixels, so an image needs 176 pixels for
-    all five scales. With fewer scales, their exponents are scaled up to the same sum. If the
-    smaller side is below 11 pixels, the window shrinks to the largest odd size that fits.
+    all five scales. With fewer scales, the exponents are scaled to the same sum. If the smaller
+    side is below 11 pixels, the window shrinks to the largest odd size that fits.
 
     Parameters
     ----------
@@ -275,7 +276,7 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     x, y = _pair(a, b)
     convert: Convert = rgb_to_ycbcr if space == "ycbcr" else np.asarray
     side = min(x.shape[:2])
-    scales = max(1, sum(side >> j >= WINDOW for j in range(len(SCALE_WEIGHTS))))
+    scales = max(1, sum(side >> j >= WINDOW_SIDE for j in range(len(SCALE_WEIGHTS))))
     weights = np.array(SCALE_WEIGHTS[:scales]) * (sum(SCALE_WEIGHTS) / sum(SCALE_WEIGHTS[:scales]))
 
     product = np.ones(3)
@@ -287,7 +288,7 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
 
 def _scaled(image: Pixels) -> Pixels:
-    """Scale integers to [0, 1] by their type; floats stay as they are."""
+    """Scale integers to [0, 1] by their type; floats are not changed."""
     peak = peak_of(image.dtype)
     return image if image.dtype.kind == "f" else image / np.float64(peak)
 
@@ -303,16 +304,16 @@ def _pair(a: ArrayLike, b: ArrayLike) -> tuple[Pixels, Pixels]:
 def _check_shapes(
     a: tuple[int, ...], b: tuple[int, ...], channels: tuple[int, ...] | None = None
 ) -> None:
-    """Raise ValueError unless two images have one shape (H, W, C), with certain numbers C."""
+    """Raise ValueError unless both images have the same shape (H, W, C) with an allowed C."""
     if a != b:
         raise ValueError(f"images have shapes {a} and {b}; crop or scale one of them")
     if len(a) != 3 or (channels and a[2] not in channels) or 0 in a:
         shapes = " or ".join(f"(H, W, {c})" for c in channels or "C")
-        raise ValueError(f"images have shape {a}; expected {shapes} with pixels in it")
+        raise ValueError(f"images have shape {a}; expected {shapes}, not empty")
 
 
 def _weight_of(shape: tuple[int, ...], weight: ArrayLike | None) -> Singles | None:
-    """Return weights of images of a shape as shape (H, W, 1) or (H, W, C), with mean 1."""
+    """Return the weights of images as an array (H, W, 1) or (H, W, C) with mean 1."""
     factors = check_weight(weight)
     if factors is None:
         return None
@@ -332,7 +333,7 @@ def _check_weight_shape(shape: tuple[int, ...], weight: tuple[int, ...]) -> None
 
 
 def _weight_of_windows(shape: tuple[int, ...], weight: Any) -> Any:
-    """Check the weights of SSIM; those in arrays then have the mean 1 over the windows."""
+    """Check the weights of SSIM, and normalize arrays to the mean 1 over the windows."""
     if is_tensor(weight):
         _check_weight_shape(shape, weight.shape)
         return weight
@@ -349,23 +350,24 @@ def _weight_of_windows(shape: tuple[int, ...], weight: Any) -> Any:
     return factors / np.float32(mean)
 
 
-WINDOW = 11
+WINDOW_SIDE = 11
 """Side of the Gaussian window of SSIM and MS-SSIM, in pixels."""
 
-SIGMA = 1.5
-"""Standard deviation of that window, in pixels."""
+WINDOW_DEVIATION = 1.5
+"""Standard deviation of the window, in pixels."""
 
 Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]
-"""Changes the values of some rows of an image, in double precision."""
+"""Converts rows of an image in double precision."""
 
 
 def _window(shape: tuple[int, ...]) -> Doubles:
-    """Return one half of the window of SSIM along an axis of images of a shape (H, W, C)."""
-    return gaussian_taps(SIGMA, min(WINDOW // 2, (min(shape[:2]) - 1) // 2) / SIGMA)
+    """Return one half of the window of SSIM along an axis, for images of shape (H, W, C)."""
+    radius = min(WINDOW_SIDE // 2, (min(shape[:2]) - 1) // 2)
+    return gaussian_taps(WINDOW_DEVIATION, radius / WINDOW_DEVIATION)
 
 
 def is_tensor(value: object) -> TypeGuard[Tensor]:
-    """Whether a value is a tensor of floats of Dr.Jit that may have derivatives."""
+    """Return whether a value is a Dr.Jit tensor of floats that may have derivatives."""
     kind = type(value)
     if not (kind.__module__.startswith("drjit.") and kind.__module__.endswith(".ad")):
         return False
@@ -379,9 +381,9 @@ def _similarity(
 ) -> tuple[Doubles, Doubles]:
     """Return mean SSIM and mean contrast-structure term per channel of two (H, W, 3) images.
 
-    The images are converted and compared strip by strip: large ones need no copy in double
+    The images are converted and compared strip by strip, so that large ones need no copy in double
     precision. Only pixels whose window lies inside the image count. Weights (H, W, 1) or (H, W, 3)
-    have the mean 1 there.
+    have the mean 1 over these pixels.
     """
     taps = _window(x.shape)
     radius = len(taps) - 1
@@ -402,8 +404,8 @@ def _similarity(
             ]
         )
 
-    whole, structure = (sum(map_threads(sums, strips(rows, columns))) / (rows * columns)).T
-    return whole, structure
+    similarity, structure = (sum(map_threads(sums, strips(rows, columns))) / (rows * columns)).T
+    return similarity, structure
 
 
 def _similarity_sums(
@@ -416,10 +418,12 @@ def _similarity_sums(
     covariance, variances = blur(x * y, taps) - product, blur(x * x + y * y, taps) - squares
     structure = (2 * covariance + C2) / (variances + C2)
     luminance = (2 * product + C1) / (squares + C1)
-    whole = luminance * structure
+    similarity = luminance * structure
     if weight is not None:
-        whole, structure = (np.where(weight > 0, weight * term, 0) for term in (whole, structure))
-    return float(whole.sum()), float(structure.sum())
+        similarity, structure = (
+            np.where(weight > 0, weight * term, 0) for term in (similarity, structure)
+        )
+    return float(similarity.sum()), float(structure.sum())
 
 
 def halve(image: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -473,11 +477,11 @@ def blur(plane: NDArray[np.floating], taps: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _along_rows(plane: NDArray[np.floating], taps: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Blur the axis before the last; a view with swapped axes blurs the other one."""
+    """Blur the second-to-last axis; with swapped axes, the last one."""
     radius = len(taps) - 1
     height = plane.shape[-2] - 2 * radius
     total = plane[..., radius : radius + height, :] * taps[0]
-    pair = np.empty_like(total)  # with the order of the axes of `total` in memory
+    pair = np.empty_like(total)  # same memory layout as `total`
     for k in range(1, radius + 1):
         low, high = radius - k, radius + k
         np.add(plane[..., low : low + height, :], plane[..., high : high + height, :], out=pair)

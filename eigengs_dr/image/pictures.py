@@ -12,37 +12,37 @@ from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 
-from .header import ORIENTATION, TURNED, Header, frames_note, profile_note
+from .header import ORIENTATION, TRANSPOSED, Header, frames_note, profile_note
 from .pixels import ImageError
 from .strips import Pixels
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-GREY = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "F")
-"""Modes of Pillow of one channel and perhaps alpha."""
+GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "F")
+"""Pillow modes with one channel and optionally alpha."""
 
 OPAQUE_BYTES, TRANSPARENT_BYTES = {1: 4, 3: 10}, {1: 12, 3: 17}
-"""Bytes a pixel while a picture is decoded, by its channels, as measured with 36 to 44 megapixels:
-Pillow keeps colours in 4, and a copy to NumPy takes the 3 that stay, twice. Transparent ones become
-floats."""
+"""Bytes per pixel while a picture is decoded, by number of channels, measured with 36 to 44
+megapixels: Pillow stores colours in 4 bytes, and the copy to NumPy temporarily takes 3 bytes twice.
+Transparent pictures are converted to floats."""
 
 SRGB_GAMMA = 45_455
-"""Chunk gAMA of a PNG file of sRGB: 100,000 / 2.2."""
+"""Value of the gAMA chunk of an sRGB PNG file: 100,000 / 2.2."""
 
 TRANSFERS = {8: "linear light", 14: "Rec. 2020", 15: "Rec. 2020", 16: "PQ", 18: "HLG"}
-"""Transfer functions of ITU-T H.273 that are far from sRGB."""
+"""Transfer functions of ITU-T H.273 that differ much from sRGB."""
 
 PRIMARIES = {9: "Rec. 2020", 11: "P3", 12: "P3"}
-"""Primaries of ITU-T H.273 of wider gamuts."""
+"""Primaries of ITU-T H.273 with wider gamuts."""
 
 
 @contextmanager
 def open_picture(path: Path) -> Iterator[Image]:
-    """Open what `PIL.Image.open` opens, of any size, and close it; nothing is decoded yet.
+    """Open a file as `PIL.Image.open` does but of any size; nothing is decoded yet.
 
-    Pillow's limit on pixels is a variable of the whole process, which threads share;
-    `Header.check_memory` bounds what is decoded here.
+    Pillow's limit on pixels is a process-wide variable, which threads share; `Header.check_memory`
+    limits what is decoded here.
 
     Raises
     ------
@@ -69,10 +69,10 @@ def open_picture(path: Path) -> Iterator[Image]:
 
 
 def picture_header(path: Path) -> Header:
-    """Return what the header of a file says that `picture_pixels_of` reads."""
+    """Return the header of a file that `read_picture` reads."""
     with open_picture(path) as image:
         transparent = image.has_transparency_data
-        channels = 1 if image.mode in GREY else 3
+        channels = 1 if image.mode in GREY_MODES else 3
         notes = profile_note(image.info.get("icc_profile") or b"", "srgb")
         if image.format == "PNG":
             chunks = png_chunks(path)
@@ -82,18 +82,18 @@ def picture_header(path: Path) -> Header:
             orientation = image.getexif().get(ORIENTATION, 1)
             notes += _depth_notes(path, image.format)
         notes += frames_note(getattr(image, "n_frames", 1))
-        width, height = image.size[::-1] if orientation in TURNED else image.size
+        width, height = image.size[::-1] if orientation in TRANSPOSED else image.size
     needed = TRANSPARENT_BYTES[channels] if transparent else OPAQUE_BYTES[channels]
     alpha = "straight" if transparent else "none"
     return Header(width, height, channels, needed, alpha=alpha, notes=notes)
 
 
 def read_picture(path: Path) -> Pixels:
-    """Return the pixels of a file, turned as its EXIF header says; see `picture_pixels`."""
+    """Return the pixels of a file with its EXIF orientation applied; see `picture_pixels`."""
     from PIL import ImageOps
 
     with open_picture(path) as image:
-        ImageOps.exif_transpose(image, in_place=True)  # a copy only if it turns the image
+        ImageOps.exif_transpose(image, in_place=True)  # copies only if the image is turned
         return picture_pixels(image)
 
 
@@ -112,11 +112,11 @@ def picture_pixels(image: Image) -> Pixels:
     Raises
     ------
     ImageError
-        If the mode has no one meaning as a picture.
+        If the mode is ambiguous or not supported.
     """
     mode = image.mode
     if mode == "I" and image.format != "PNG":
-        raise ImageError("holds integers of 32 bits, whose white nobody knows; convert it to I;16")
+        raise ImageError("holds 32-bit integers, whose white is unknown; convert it to I;16")
     if mode == "LAB":
         raise ImageError("holds CIELab colours; convert it to RGB")
     if mode == "I":  # a PNG file of 16 bits, before Pillow 11
@@ -128,27 +128,27 @@ def picture_pixels(image: Image) -> Pixels:
         alpha = np.where(values == image.info["transparency"], 0, 65535).astype(np.uint16)
         return np.concatenate([values.astype(np.uint16), alpha], axis=2)
     if image.has_transparency_data:
-        kind = "LA" if mode in GREY else "RGBA"
+        kind = "LA" if mode in GREY_MODES else "RGBA"
         if mode == "La":
             image = image.convert("LA")
         return np.asarray(image if image.mode == kind else image.convert(kind))
-    # `convert` copies the image even if the mode stays.
+    # `convert` copies the image even if the mode is the same.
     pixels = np.asarray(image if mode in ("1", "L", "RGB") else image.convert("RGB"))
     return pixels if pixels.ndim == 3 else pixels[..., None]
 
 
 def is_picture(image: object) -> TypeGuard[Image]:
-    """Whether an image is a `PIL.Image.Image`; does not import Pillow."""
+    """Return whether an image is a `PIL.Image.Image`, without importing Pillow."""
     return "PIL.Image" in sys.modules and isinstance(image, sys.modules["PIL.Image"].Image)
 
 
 # ---------------------------------------------------------------------------------------------
-#  What Pillow does not say
+#  Metadata that Pillow does not provide
 # ---------------------------------------------------------------------------------------------
 
 
 def png_chunks(path: Path) -> dict[bytes, bytes]:
-    """Return the chunks of a PNG file by their names, without those of pixels."""
+    """Return the chunks of a PNG file by name, except those with pixels."""
     chunks: dict[bytes, bytes] = {}
     with path.open("rb") as file:
         file.seek(8)
@@ -163,7 +163,7 @@ def png_chunks(path: Path) -> dict[bytes, bytes]:
 
 
 def exif_orientation(exif: bytes) -> int:
-    """Return the orientation of EXIF data, 1 if they name none or are damaged."""
+    """Return the orientation in EXIF data, 1 if there is none or the data is damaged."""
     from PIL import Image
 
     data = Image.Exif()
@@ -174,7 +174,7 @@ def exif_orientation(exif: bytes) -> int:
 
 
 def _png_notes(chunks: dict[bytes, bytes]) -> tuple[str, ...]:
-    """Return warnings for colours that are not sRGB, by the chunk that counts most."""
+    """Return warnings about colours that are not sRGB, by the chunk of highest priority."""
     if len(code := chunks.get(b"cICP", b"")) == 4:
         return video_note(*code[:2])
     if b"iCCP" in chunks or b"sRGB" in chunks or len(chunks.get(b"gAMA", b"")) != 4:
@@ -186,7 +186,7 @@ def _png_notes(chunks: dict[bytes, bytes]) -> tuple[str, ...]:
 
 
 def video_note(primaries: int, transfer: int) -> tuple[str, ...]:
-    """Return a warning for codes of ITU-T H.273 that are not those of sRGB."""
+    """Return a warning about codes of ITU-T H.273 that are not those of sRGB."""
     names = {PRIMARIES.get(primaries, ""), TRANSFERS.get(transfer, "")} - {""}
     if not names:
         return ()
@@ -199,7 +199,7 @@ _SIZ = re.compile(rb"\xff\x4f\xff\x51.{38}(.)", re.S)
 
 
 def _depth_notes(path: Path, kind: str | None) -> tuple[str, ...]:
-    """Return warnings for what AVIF and JPEG 2000 files hold and Pillow leaves out."""
+    """Return warnings about properties of AVIF and JPEG 2000 files that Pillow ignores."""
     if kind not in ("AVIF", "JPEG2000"):
         return ()
     with path.open("rb") as file:
@@ -213,5 +213,5 @@ def _depth_notes(path: Path, kind: str | None) -> tuple[str, ...]:
         match = _SIZ.search(start)
         bits = (match[1][0] & 127) + 1 if match else 8
         grey = match is not None and match[0][-3:-1] == b"\0\1"
-        bits = 8 if grey and bits <= 16 else bits  # all of which Pillow keeps
+        bits = 8 if grey and bits <= 16 else bits  # Pillow keeps all bits of these
     return (*notes, f"keeps 8 of its {bits} bits") if bits > 8 else notes

@@ -1,8 +1,8 @@
-"""Pixels in arrays: what they are, and the checks of an array that shall be an image.
+"""Pixels in arrays: their encoding, and the checks of an image.
 
-A picture of a camera holds sRGB codes, a rendering holds linear light. The numbers do not tell:
-light that is decoded as sRGB is too dark. Files of integers hold sRGB, files of floats hold light,
-and a ``mitsuba.Bitmap`` tells itself; of other arrays the caller says it by ``encoding=``.
+A photo holds sRGB codes, a rendering holds linear light. The values do not show which: light that
+is decoded as sRGB is too dark. Files of integers hold sRGB, files of floats hold light, and a
+``mitsuba.Bitmap`` knows its encoding; for other arrays the caller passes ``encoding=``.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from ..backend.types import Singles
 from .strips import Pixels, by_strips
 
 ENCODINGS = ("srgb", "linear")
-"""Names of what pixels are."""
+"""Names of the encodings of pixels."""
 
 MIN_PIXEL, MAX_PIXEL = -0.5, 1.5
-"""Range of accepted sRGB pixels: resampled images overshoot [0, 1], but pixels in 0..255 are an
+"""Accepted range of sRGB pixels: resampled images overshoot [0, 1], but pixels in 0..255 are an
 error."""
 
 MAX_LIGHT = 1e9
-"""Largest absolute value of light and of data, with 1 for white; squares of errors stay far inside
-single precision."""
+"""Largest absolute value of light and of data, with 1 as white; squared errors stay well within the
+range of single precision."""
 
 
 class ImageError(ValueError):
@@ -41,7 +41,7 @@ def reason_of(error: BaseException) -> str:
 
 
 class EncodedImage(NamedTuple):
-    """The pixels of an image, and what they are.
+    """The pixels of an image, and their encoding.
 
     Attributes
     ----------
@@ -54,36 +54,36 @@ class EncodedImage(NamedTuple):
 
 
 def check_encoding(encoding: str | None) -> None:
-    """Raise ValueError if the name is unknown; None is no name, but the default."""
+    """Raise ValueError if the encoding is unknown; None stands for the default."""
     if encoding is not None and encoding not in ENCODINGS:
         known = ", ".join(ENCODINGS)
         raise ValueError(f"encoding {encoding!r} is unknown; use one of {known}")
 
 
 def encoding_of(image: object, encoding: str | None = None) -> str | None:
-    """Return what the pixels of an image are.
+    """Return the encoding of the pixels of an image.
 
     Parameters
     ----------
     image : object
     encoding : {"srgb", "linear"}, optional
-        What the caller says; it overrules the image.
+        Encoding given by the caller, which takes precedence.
 
     Returns
     -------
     {"srgb", "linear"} or None
-        None if neither the caller nor the image says it.
+        None if it is unknown.
 
     Warns
     -----
     UserWarning
-        If the image is a Dr.Jit tensor of three channels and the caller does not say: renderings
-        are light or sRGB.
+        If the image is a Dr.Jit tensor of three channels and `encoding` is None: renderings are
+        light or sRGB.
 
     Raises
     ------
     ValueError
-        If the name is unknown.
+        If the encoding is unknown.
     """
     check_encoding(encoding)
     if encoding is not None:
@@ -93,14 +93,14 @@ def encoding_of(image: object, encoding: str | None = None) -> str | None:
     is_tensor = type(image).__module__.startswith("drjit.")
     if is_tensor and tuple(getattr(image, "shape", ()))[2:] == (3,):
         warn(
-            "a Dr.Jit tensor does not say what its pixels are; say encoding='linear' for light, as "
-            "of mitsuba.render, or encoding='srgb'"
+            "the encoding of a Dr.Jit tensor is not known; pass encoding='linear' for light, e.g. "
+            "from mitsuba.render, or encoding='srgb'"
         )
     return None
 
 
 def peak_of(dtype: np.dtype) -> int:
-    """Return the value of white: the largest integer, or 1 for floats and bool.
+    """Return the value of white: the largest integer of a type, or 1 for floats and bool.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def peak_of(dtype: np.dtype) -> int:
 
 def scale(pixels: Pixels, peak: int) -> NDArray[np.float32]:
     """Divide pixels by the value of white."""
-    with np.errstate(over="ignore"):  # the infinities are clamped or refused later
+    with np.errstate(over="ignore"):  # infinities are clamped or rejected later
         return np.divide(pixels, peak, dtype=np.float32)
 
 
@@ -126,10 +126,13 @@ def to_floats(
     keep_grey: bool = False,
     copy: bool = True,
     encoding: str | None = None,
+    known: tuple[int, ...] = (1, 3),
 ) -> NDArray[np.float32]:
-    """Scale to float32 and replicate grey to RGB; errors call the image `name`.
+    """Scale to float32 and replicate grey to RGB; errors refer to the image as `name`.
 
-    The range of the pixels is checked by the encoding, and not at all without one.
+    Numbers of channels that are not `known` are refused.
+
+    The range of the pixels is checked if the encoding is given.
     """
     try:
         array = np.asarray(image)
@@ -137,9 +140,9 @@ def to_floats(
         raise ImageError(f"{name}: not an array; expected shape (H, W, 3)") from None
     if array.ndim == 2:
         array = array[..., None]
-    if array.ndim != 3 or array.shape[2] not in (1, 3):
-        alpha = array.ndim == 3 and array.shape[2] == 4
-        hint = "drop alpha, as in image[..., :3]" if alpha else "pass one grey or RGB image"
+    if array.ndim != 3 or array.shape[2] not in known:
+        hints = {2: "fit two channels as space='data'", 4: "drop alpha, as in image[..., :3]"}
+        hint = hints.get(array.shape[-1] if array.ndim == 3 else 0, "pass one grey or RGB image")
         raise ImageError(f"{name}: shape {array.shape}, expected (H, W) or (H, W, 3); {hint}")
     if array.size == 0:
         raise ImageError(f"{name}: shape {array.shape} has no pixels; check how it was cropped")
@@ -148,18 +151,18 @@ def to_floats(
         peak = peak_of(array.dtype)
     except ValueError as error:
         raise ImageError(f"{name}: {error}") from None
-    # The extremes are finite only if all pixels are; they need no array of flags.
+    # The extremes are finite only if all pixels are; this needs no array of flags.
     if array.dtype.kind == "f" and not (np.isfinite(array.min()) and np.isfinite(array.max())):
         bad = np.argwhere(~np.isfinite(array).all(axis=2))
         row, column = bad[0].tolist()
         raise ImageError(
             f"{name}: {len(bad)} of {array.shape[0] * array.shape[1]} pixels are not finite, "
-            f"the first at [{row}, {column}]; replace them, as with np.nan_to_num"
+            f"the first at [{row}, {column}]; replace them, e.g. with np.nan_to_num"
         )
     channels = array.shape[2] if keep_grey else 3
     pixels: NDArray[np.float32] = array
-    as_it_is = array.dtype == np.float32 and array.shape[2] == channels
-    if copy or not as_it_is or not array.flags.c_contiguous:
+    usable = array.dtype == np.float32 and array.shape[2] == channels
+    if copy or not usable or not array.flags.c_contiguous:
         pixels = by_strips(partial(scale, peak=peak), array, channels=channels)
     if encoding is not None:
         _check_range(pixels, name, encoding)
@@ -167,14 +170,14 @@ def to_floats(
 
 
 def _check_range(pixels: NDArray[np.float32], name: str, encoding: str) -> None:
-    """Refuse sRGB far outside [0, 1], and light whose squares would leave single precision."""
+    """Reject sRGB far outside [0, 1], and light whose squares would overflow single precision."""
     low, high = float(pixels.min()), float(pixels.max())
     if encoding == "linear":
         if max(-low, high) > MAX_LIGHT:
             raise ImageError(f"{name}: pixels run from {low:g} to {high:g}; scale it first")
     elif low < MIN_PIXEL or high > MAX_PIXEL:
         hint = "divide by 255" if 2 < high <= 255 and low >= 0 else "scale it"
-        light = ", or say encoding='linear' for light" if low >= 0 else ""
+        light = ", or pass encoding='linear' for light" if low >= 0 else ""
         raise ImageError(
             f"{name}: pixels run from {low:g} to {high:g}, not 0 to 1; {hint} first{light}"
         )

@@ -1,4 +1,4 @@
-"""Image files to pixels: one record says what a file holds, one function decodes it."""
+"""Reading of image files: for each kind, a function for the header and one for the pixels."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .strips import Pixels
 
 
 class Reader(NamedTuple):
-    """How files of a kind are read.
+    """The functions that read a kind of file.
 
     Attributes
     ----------
     header : callable
-        Returns what the header of a file says.
+        Returns the header of a file.
     pixels : callable
         Returns the decoded pixels (H, W, C).
     """
@@ -53,7 +53,7 @@ _STARTS = {
 }
 
 _DEEP_PNG = (2, 4, 6)
-"""Colour types of PNG of which Pillow keeps 8 bits only: RGB, grey with alpha, RGBA."""
+"""Colour types of PNG for which Pillow keeps only 8 bits: RGB, grey with alpha, RGBA."""
 
 
 def reader_of(path: Path) -> Reader:
@@ -74,12 +74,12 @@ def reader_of(path: Path) -> Reader:
 
 
 def read_header(path: Path) -> Header:
-    """Return what the header of an image file says; nothing is decoded.
+    """Return the header of an image file; no pixel is decoded.
 
     Raises
     ------
     ImageError
-        If it cannot be read, or what it says is not supported; see `load_image`.
+        If the header cannot be read or is not supported; see `load_image`.
     """
     with image_errors(path):
         reader = reader_of(path)
@@ -92,9 +92,10 @@ def read_header(path: Path) -> Header:
 
 
 def decode(path: Path, header: Header, keep_grey: bool, name: str = "") -> EncodedImage:
-    """Return the pixels of a file, grey or RGB in its own type, and what they are.
+    """Return the pixels of a file, grey or RGB in the type of the file, and their encoding.
 
-    Warnings call the file `name`, by default its path. For warnings and errors see `load_image`.
+    Warnings refer to the file as `name`, by default its path. For warnings and errors see
+    `load_image`.
     """
     with image_errors(path):
         reader = reader_of(path)

@@ -1,7 +1,7 @@
-"""Images behind URLs, such as ``s3://bucket/photos/*.jpg``, by fsspec.
+"""Images at URLs, such as ``s3://bucket/photos/*.jpg``, read with fsspec.
 
-fsspec comes with the extra ``cluster``. It knows ``http``, ``zip``, ``memory`` and others itself;
-stores such as ``s3`` and ``gcs`` need the package that its message names.
+fsspec comes with the extra ``cluster``. It supports ``http``, ``zip``, ``memory`` and others by
+itself; stores such as ``s3`` and ``gcs`` need the package that its error message names.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .pixels import ImageError, reason_of
 
 
 def is_url(name: object) -> bool:
-    """Whether a name is a URL, as in ``s3://bucket/a.png`` or ``zip://a.png::all.zip``."""
+    """Return whether a name is a URL, such as ``s3://bucket/a.png`` or ``zip://a.png::all.zip``."""
     return isinstance(name, str) and "://" in name
 
 
@@ -30,7 +30,7 @@ def stem_of(file: Path | str) -> str:
 
 
 def list_urls(url: str) -> list[str]:
-    """List the images of a folder or a glob behind a URL.
+    """List the images in a folder or matching a pattern at a URL.
 
     Parameters
     ----------
@@ -40,12 +40,12 @@ def list_urls(url: str) -> list[str]:
     Returns
     -------
     list of str
-        URLs of the files, sorted. Of a folder, the files with the suffix of an image.
+        URLs of the files, sorted. For a folder, the files with the suffix of an image.
 
     Raises
     ------
     ImageError
-        If the place cannot be read, or has no such file.
+        If the URL cannot be read, or has no such file.
     """
     fsspec = _fsspec()
     try:
@@ -66,7 +66,7 @@ def list_urls(url: str) -> list[str]:
 
 
 def is_copied(name: object) -> bool:
-    """Whether the content of a name can be read once only: that of a URL, a pipe or a socket."""
+    """Return whether a source can be read only once: a URL, a pipe or a socket."""
     if is_url(name):
         return True
     path = Path(str(name))
@@ -75,7 +75,7 @@ def is_copied(name: object) -> bool:
 
 @contextmanager
 def local_copy(name: str) -> Iterator[Path]:
-    """Copy what is behind a URL or a pipe to a temporary file for the time of a block.
+    """Copy a URL or a pipe to a temporary file, which exists during the block.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def local_copy(name: str) -> Iterator[Path]:
     ImageError
         If fsspec is missing, or there are more bytes than `download_limit`.
     OSError
-        If it cannot be read, which may pass; the message has the name.
+        If it cannot be read, perhaps temporarily; the message has the name.
     """
     limit = download_limit()
     with TemporaryDirectory() as folder:
@@ -98,7 +98,7 @@ def local_copy(name: str) -> Iterator[Path]:
         try:
             source = partial(_fsspec().open, name) if is_url(name) else Path(name).open
             with source("rb") as remote, file.open("wb") as copy:
-                while part := remote.read(min(PART, limit + 1 - copy.tell())):
+                while part := remote.read(min(CHUNK_BYTES, limit + 1 - copy.tell())):
                     copy.write(part)
                 size = copy.tell()
         except ImageError:
@@ -113,8 +113,8 @@ def local_copy(name: str) -> Iterator[Path]:
         yield file
 
 
-PART = 1 << 20
-"""Bytes that are copied at once."""
+CHUNK_BYTES = 1 << 20
+"""Number of bytes that are copied at once."""
 
 
 def _fsspec() -> ModuleType:
@@ -122,7 +122,7 @@ def _fsspec() -> ModuleType:
         import fsspec
     except ImportError:
         raise ImageError(
-            "images behind URLs need fsspec; type: pip install 'eigengs-dr[cluster]'"
+            "images at URLs need fsspec; type: pip install 'eigengs-dr[cluster]'"
         ) from None
     return fsspec
 

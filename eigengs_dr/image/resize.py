@@ -1,4 +1,4 @@
-"""Images resized by antialiased bicubic resampling."""
+"""Antialiased bicubic resampling of images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def resample(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.
     Returns
     -------
     ndarray of float32, shape (height, width, C)
-        Values are not clamped and may overshoot at edges by some percent. A copy if the size does
+        Values are not clamped and may overshoot at edges by a few percent. A copy if the size does
         not change.
 
     Raises
@@ -33,8 +33,8 @@ def resample(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.
 def center_crop(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
     """Crop an image to its largest centred part with the aspect ratio of the result, and resize it.
 
-    Parameters, result and errors as for `resample`. The part may begin inside a pixel: the centre
-    of the image stays the centre exactly. Filters also use the pixels around the part.
+    Parameters, result and errors as for `resample`. The part may begin inside a pixel, so that the
+    centre of the image is preserved exactly. Filters also use the pixels around the part.
     """
     rows, columns = image.shape[:2]
     scale = min(columns / max(width, 1), rows / max(height, 1))

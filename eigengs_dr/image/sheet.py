@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 GAP = 8
 """Width of the white border after every picture, in pixels."""
 
-SIZE = 10
+LETTER_HEIGHT = 10
 """Height of letters, in pixels."""
 
 Picture = NDArray[np.floating]
 
 
-def text_line(text: str, width: int, size: int = SIZE) -> Picture:
+def text_line(text: str, width: int, size: int = LETTER_HEIGHT) -> Picture:
     """Draw a line of text, black on white.
 
     Parameters
@@ -57,10 +57,10 @@ def join_pictures(pictures: Sequence[Picture], axis: int, gap: int = GAP) -> Pic
     ndarray of float, shape (H, W, 3)
         RGB, not clamped.
     """
-    most = max(picture.shape[1 - axis] for picture in pictures)
+    longest = max(picture.shape[1 - axis] for picture in pictures)
     padded = []
     for picture in pictures:
-        room = [(0, 0)] * 3
-        room[axis], room[1 - axis] = (0, gap), (0, most - picture.shape[1 - axis])
-        padded.append(np.pad(picture, room, constant_values=1))
+        padding = [(0, 0)] * 3
+        padding[axis], padding[1 - axis] = (0, gap), (0, longest - picture.shape[1 - axis])
+        padded.append(np.pad(picture, padding, constant_values=1))
     return np.concatenate(padded, axis)

@@ -16,14 +16,15 @@ import numpy as np
 from ..backend.types import Values
 
 STRIP_PIXELS = 1 << 19
-"""Pixels of a strip. A plane of it, in single precision, takes 2 MB: larger strips leave the cache,
-and with smaller ones threads wait for each other and borders of filters are computed twice."""
+"""Number of pixels of a strip. One plane of it takes 2 MB in single precision: larger strips do not
+fit into the cache; with smaller ones, threads wait for each other and borders of filters are
+computed twice."""
 
 MAX_THREADS = 8
-"""Largest number of threads: Python lets only one of them start an operation at a time."""
+"""Largest number of threads: in Python, only one of them starts an operation at a time."""
 
 Pixels = Values
-"""Pixels (H, W, C) of any dtype that an image may have."""
+"""Pixels (H, W, C) of any dtype."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -52,9 +53,9 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
     Parameters
     ----------
     function : callable
-        NumPy releases the lock of the interpreter, so operations on large arrays run in parallel.
+        NumPy releases the interpreter lock, so operations on large arrays run in parallel.
     items : iterable
-        A single item is handled without another thread.
+        A single item is processed in the calling thread.
 
     Returns
     -------
@@ -75,17 +76,17 @@ def by_strips(
     dtype: type[np.generic] = np.float32,
     channels: int | None = None,
 ) -> Pixels:
-    """Apply a function of single pixels to an image without large temporary arrays.
+    """Apply a pixelwise function to an image without large temporary arrays.
 
     Parameters
     ----------
     function : callable
-        ``function(rows)`` returns rows of the result, or one channel for all.
+        ``function(rows)`` returns rows of the result, or one channel that is broadcast.
     image : ndarray, shape (H, W, C)
     dtype : dtype, optional
         Type of the result.
     channels : int, optional
-        Channels of the result, by default those of the image.
+        Number of channels of the result, by default that of the image.
 
     Returns
     -------

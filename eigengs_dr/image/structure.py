@@ -1,19 +1,19 @@
-"""SSIM as an operation of Dr.Jit: the value and its derivatives, by blurs along one axis at a time.
+"""SSIM as a Dr.Jit operation: the value and its derivatives, by blurs along one axis at a time.
 
-With the window B of a pixel, a blur, SSIM is a function of four local means,
+With the blur B by the window of a pixel, SSIM is a function of four local means,
 
 ``s = (2 m_x m_y + C1) (2 v_xy + C2) / ((m_x^2 + m_y^2 + C1) (v + C2))``
 
 with ``m_x = B x``, ``m_y = B y``, ``v_xy = B(x y) - m_x m_y`` and
-``v = B(x^2 + y^2) - m_x^2 - m_y^2``. For the derivative of a sum of s, the transpose of B returns
-to each pixel what it brought to its windows:
+``v = B(x^2 + y^2) - m_x^2 - m_y^2``. The derivative of a sum of s follows from the transpose of B:
 
 ``ds/dx = B^T(ds/dm_x) + 2 x B^T(ds/dB(x^2 + y^2)) + y B^T(ds/dB(x y))``
 
-Blurs go along lines: columns and rows of a channel. A lane owns `BLOCK` neighbours of a line, and
-reads these and all within the radius. What it writes is a run: `BLOCK` values of each plane in one
-piece of memory. Where the next blur crosses the lines of the last one, neighbouring lanes read
-neighbours of runs, so both axes are read in pieces. No two lanes write to one place.
+Blurs are along lines: the columns or the rows of a channel. A lane computes `BLOCK` neighbouring
+values of a line, from these and those within the radius. It writes a run: `BLOCK` values of each
+plane, contiguous in memory. If the next blur is along the other axis, neighbouring lanes read
+adjacent values of runs, so that memory accesses are contiguous for both axes. No two lanes write to
+the same location.
 """
 
 from __future__ import annotations
@@ -36,22 +36,23 @@ from ..backend.types import Bool, Doubles, Float, Tensor, UInt, Values
 from .metrics import C1, C2, is_tensor
 
 BLOCK = 8
-"""Values of a line that a lane computes. With 16 it reads a quarter less, but the registers of a
-CPU do not hold them: value and derivative took twice the time."""
+"""Number of values of a line that a lane computes. With 16 it reads a quarter less, but the values
+do not fit into the registers of a CPU: value and derivative took twice the time."""
 
 PLANES = 4
-"""Planes that are blurred at once, at most."""
+"""Largest number of planes that are blurred at once."""
 
 
 @door
 def similarity(
     a: Tensor | Values, b: Tensor | Values, weight: Tensor | Values | None, taps: Doubles
 ) -> Float:
-    """Compute the mean SSIM of two pictures; differentiable by both in both modes.
+    """Compute the mean SSIM of two pictures; differentiable with respect to both, in both modes.
 
-    Value and derivative take 4 programs; their costs stand at their functions. They hold 7 planes
-    of the size of a picture at once, or 10 with derivatives by both. In single precision the value
-    has an error of 1e-6 for photos and up to 1e-4 for flat pictures, where variances cancel.
+    Value and derivative take 4 programs, whose costs are documented at their functions. They need
+    memory for 7 planes of the size of a picture, or 10 with derivatives with respect to both. In
+    single precision the error of the value is 1e-6 for photos and up to 1e-4 for flat pictures,
+    where variances cancel.
 
     Parameters
     ----------
@@ -65,12 +66,12 @@ def similarity(
     Returns
     -------
     Float, shape (1,)
-        ``sum w s / sum w`` over the windows inside of the pictures and over the channels.
+        ``sum w s / sum w`` over the windows inside the pictures and over the channels.
 
     Raises
     ------
     ValueError
-        If the pictures are too large for indices of 32 bits.
+        If the pictures are too large for 32-bit indices.
     """
     tensors = [types_of(v) for v in (a, b) if is_tensor(v)]
     types = max(tensors, key=lambda types: types.bits)
@@ -104,22 +105,22 @@ class Size(NamedTuple):
 
     @property
     def reach(self) -> int:
-        """Rows or columns of a window without the first one: twice its radius."""
+        """Number of rows or columns of a window, minus one: twice its radius."""
         return 2 * (len(self.taps) - 1)
 
     @property
     def rows(self) -> int:
-        """Rows of pixels whose window lies inside of the pictures."""
+        """Number of rows of pixels whose window lies inside the pictures."""
         return self.height - self.reach
 
     @property
     def columns(self) -> int:
-        """Columns of pixels whose window lies inside of the pictures."""
+        """Number of columns of pixels whose window lies inside the pictures."""
         return self.width - self.reach
 
 
 class _Similarity(dr.CustomOp):
-    """The mean SSIM. As it is one number, both modes take its derivatives by all values."""
+    """The mean SSIM, one number: both modes use its derivatives with respect to all values."""
 
     def eval(self, x: Float, y: Float, weight: Float | None, size: Size, wanted: str) -> Float:
         self.pictures, self.size, self.wanted = {"x": x, "y": y}, size, wanted
@@ -145,7 +146,7 @@ class _Similarity(dr.CustomOp):
 
 
 def _totals(values: list[Float]) -> list[Float]:
-    """Add values in double precision: sums over large pictures keep their digits."""
+    """Add values in double precision, so that sums over large pictures are accurate."""
     Float, Double = type(values[0]), dr.float64_array_t(type(values[0]))
     values = [Double(v) for v in values]
     dr.eval(values)  # one program for all
@@ -163,12 +164,12 @@ class Lanes(NamedTuple):
     Attributes
     ----------
     place : UInt32
-        Number of the line among those of a channel: its column or row.
+        Index of the line in a channel: its column or row.
     channel : UInt32
     block : UInt32
-        Number of the block among those of a line.
+        Index of the block in a line.
     places, channels, blocks : UInt32, shape (1,)
-        How many there are of each.
+        Number of each.
     length : UInt32, shape (1,)
         Number of values of a line of the result.
     """
@@ -183,21 +184,21 @@ class Lanes(NamedTuple):
 
     @property
     def first(self) -> UInt:
-        """Number of the first value on the line."""
+        """Index of the first value in the line."""
         return self.block * BLOCK
 
     @property
     def line(self) -> UInt:
-        """Number of the line among those of all channels; those of a place are neighbours."""
+        """Index of the line among those of all channels; the lines of a place are adjacent."""
         return self.place * self.channels + self.channel
 
     @property
     def run(self) -> UInt:
-        """Number of the run that the lane writes; those of a line are neighbours."""
+        """Index of the run that the lane writes; the runs of a line are adjacent."""
         return self.line * self.blocks + self.block
 
     def inside(self, k: int) -> Bool:
-        """Whether the line has the value k of the block."""
+        """Return whether the value k of the block lies in the line."""
         return self.first + k < self.length
 
 
@@ -208,28 +209,29 @@ def lanes_of(types: ArrayTypes, places: int, channels: int, length: int, order: 
     ----------
     places, channels, length : int
     order : str
-        What differs between lanes, as words: first that of neighbouring lanes.
+        "place", "channel" and "block", separated by blanks, from the fastest varying index to the
+        slowest.
     """
     counts = {"place": places, "channel": channels, "block": -(-length // BLOCK)}
-    rest, found = dr.arange(types.UInt, places * channels * counts["block"]), {}
+    rest, indices = dr.arange(types.UInt, places * channels * counts["block"]), {}
     *names, last = order.split()
     for name in names:
-        rest, found[name] = make_divisor(types, counts[name]).divmod(rest)
-    found[last] = rest
+        rest, indices[name] = make_divisor(types, counts[name]).divmod(rest)
+    indices[last] = rest
     sizes = [dr.opaque(types.UInt, n) for n in (*counts.values(), length)]
-    return Lanes(*(found[name] for name in counts), *sizes)
+    return Lanes(*(indices[name] for name in counts), *sizes)
 
 
 class Runs(NamedTuple):
-    """What the lanes of a blur wrote.
+    """The output of the lanes of a blur.
 
     Attributes
     ----------
     values : Float
-        Run after run; in a run plane after plane.
+        Run after run; in a run, plane after plane.
     planes : int
     lanes : Lanes
-        Those that wrote it.
+        The lanes that wrote the values.
     """
 
     values: Float
@@ -237,13 +239,13 @@ class Runs(NamedTuple):
     lanes: Lanes
 
     def across(self, reader: Lanes, shift: int, number: int) -> list[list[Float]]:
-        """Return neighbours of each plane on lines that cross the lines of the runs.
+        """Return neighbouring values of each plane on lines across the lines of the runs.
 
-        They are those from the place ``reader.first - shift`` on, and 0 outside of the runs. Such a
-        line has the place of its reader on all lines that it crosses.
+        These are `number` values from place ``reader.first - shift`` on, 0 outside of the runs. The
+        reader's place is the position on all lines that are crossed.
         """
         types, (writer, start) = types_of(self.values), (self.lanes, reader.first - shift)
-        line = start * writer.channels + reader.channel  # may wrap around, which is outside
+        line = start * writer.channels + reader.channel  # may wrap around to an index outside
         run = line * writer.blocks + reader.place // BLOCK
         index = run * (self.planes * BLOCK) + reader.place % BLOCK
         step = writer.channels * writer.blocks * (self.planes * BLOCK)
@@ -257,15 +259,15 @@ class Runs(NamedTuple):
         ]
 
     def along(self, reader: Lanes, shift: int) -> list[list[Float]]:
-        """Return neighbours of each plane on the lines of the runs, 0 outside.
+        """Return neighbouring values of each plane on the lines of the runs, 0 outside.
 
-        They are those from the value ``reader.first - shift`` on, ``shift + BLOCK`` for each plane.
-        Lanes read whole runs, in packets.
+        These are ``shift + BLOCK`` values per plane, from ``reader.first - shift`` on. Lanes read
+        complete runs, in packets.
         """
         types, length = types_of(self.values), self.planes * BLOCK
         before, runs = -(-shift // BLOCK), []
         for k in range(before, -1, -1):
-            block = reader.block - k  # may wrap around, which is outside
+            block = reader.block - k  # may wrap around to an index outside
             run = reader.line * self.lanes.blocks + block
             runs.append(gather_run(types, self.values, run, length, block < self.lanes.blocks))
         lines = ([v for r in runs for v in r[k : k + BLOCK]] for k in range(0, length, BLOCK))
@@ -273,7 +275,7 @@ class Runs(NamedTuple):
 
 
 def write(planes: list[list[Float]], lanes: Lanes) -> Runs:
-    """Return what lanes computed: of each plane, the values of a block."""
+    """Write the values that lanes computed: for each plane, those of a block."""
     types, values = types_of(planes[0][0]), [v for plane in planes for v in plane]
     result = dr.empty(types.Float, dr.width(lanes.run) * len(values))
     dr.scatter(result, types.FloatX(values), lanes.run)
@@ -281,7 +283,7 @@ def write(planes: list[list[Float]], lanes: Lanes) -> Runs:
 
 
 def blur(values: list[Float], taps: tuple[float, ...]) -> list[Float]:
-    """Return the weighted sums of neighbours, where all of them are given."""
+    """Return the weighted sums of neighbours, for values whose neighbours are all given."""
     radius = len(taps) - 1
     results = []
     for k in range(radius, len(values) - radius):
@@ -293,13 +295,13 @@ def blur(values: list[Float], taps: tuple[float, ...]) -> list[Float]:
     return results
 
 
-#  The four programs: along columns and along rows, and back
+#  The four programs: along columns, along rows, and their transposes
 
 
 def blur_columns(x: Float, y: Float, size: Size) -> Runs:
     """Blur x, y, the sum of their squares and their product along columns.
 
-    Cost of a value: 4.5 reads, 44 operations for the window.
+    Cost per value: 4.5 reads, 44 operations for the window.
     """
     types = types_of(x)
     lanes = lanes_of(types, size.width, size.channels, size.rows, "channel place block")
@@ -318,9 +320,9 @@ def blur_columns(x: Float, y: Float, size: Size) -> Runs:
 def compare(
     columns: Runs, weight: Float | None, size: Size, wanted: str
 ) -> tuple[Float, Float, Runs | None]:
-    """Blur along rows, and compare the local means of all windows.
+    """Blur along rows, and compute SSIM from the local means of all windows.
 
-    Cost of a value: 9 reads, 44 operations for the window, 40 for SSIM and its derivatives.
+    Cost per value: 9 reads, 44 operations for the window, 40 for SSIM and its derivatives.
 
     Parameters
     ----------
@@ -328,15 +330,15 @@ def compare(
     weight : Float, shape (H * W,) or (H * W * C,), optional
     size : Size
     wanted : str
-        Names of the pictures by which derivatives are wanted: some of "xy".
+        Names of the pictures, "x" or "y" or both, whose derivatives are needed.
 
     Returns
     -------
     similar, area : Float
         For each lane, the sums of ``w s`` and of w.
     slopes : Runs or None
-        The derivatives of the sum of ``w s`` by the local means: of the squares, of the products,
-        and of each picture whose name is wanted.
+        The derivatives of the sum of ``w s`` with respect to the local means of the squares, of the
+        products, and of each picture in `wanted`.
     """
     types = types_of(columns.values)
     lanes = lanes_of(types, size.rows, size.channels, size.columns, "place channel block")
@@ -364,7 +366,7 @@ def compare(
 
 
 def weights_of(types: ArrayTypes, weight: Float | None, lanes: Lanes, size: Size) -> list[Float]:
-    """Return the weights of the windows of a block of a row; 0 behind the end of the row."""
+    """Return the weights of the windows of a block of a row; 0 beyond the end of the row."""
     inside = [lanes.inside(k) for k in range(BLOCK)]
     if weight is None:
         return [dr.select(i, types.Float(1), 0) for i in inside]
@@ -377,9 +379,9 @@ def weights_of(types: ArrayTypes, weight: Float | None, lanes: Lanes, size: Size
 
 
 def return_to_rows(slopes: Runs, size: Size) -> Runs:
-    """Blur slopes along rows by the transpose, from the columns of windows to those of pixels.
+    """Apply the transposed blur along rows to slopes, from columns of windows to columns of pixels.
 
-    Cost of a value: 3 reads in packets and 11 operations for each plane.
+    Cost per value: 3 reads in packets and 11 operations for each plane.
     """
     types = types_of(slopes.values)
     lanes = lanes_of(types, size.rows, size.channels, size.width, "block channel place")
@@ -390,9 +392,9 @@ def return_to_rows(slopes: Runs, size: Size) -> Runs:
 def return_to_pixels(
     slopes: Runs, pictures: dict[str, Float], size: Size, wanted: str, factor: Float
 ) -> dict[str, Float]:
-    """Blur slopes along columns by the transpose; return the derivatives, times a factor.
+    """Apply the transposed blur along columns to slopes; return the derivatives, times a factor.
 
-    Cost of a value: 2.3 reads and 11 operations for each plane, 2 reads for each picture.
+    Cost per value: 2.3 reads and 11 operations for each plane, 2 reads for each picture.
     """
     types = types_of(slopes.values)
     lanes = lanes_of(types, size.width, size.channels, size.height, "channel place block")
@@ -401,13 +403,13 @@ def return_to_pixels(
     step = dr.opaque(types.UInt, size.width * size.channels)
     results = {}
     for name, by_mean in zip(wanted, by_means, strict=True):
-        own, other = pictures[name], pictures["y" if name == "x" else "x"]
-        results[name] = result = dr.empty(types.Float, dr.width(own))
+        picture, other = pictures[name], pictures["y" if name == "x" else "x"]
+        results[name] = result = dr.empty(types.Float, dr.width(picture))
         for k in range(BLOCK):
             place, inside = (lanes.first + k) * step + lanes.line, lanes.inside(k)
-            u, v = (dr.gather(types.Float, p, place, inside) for p in (own, other))
+            u, v = (dr.gather(types.Float, p, place, inside) for p in (picture, other))
             slope = dr.fma(2 * u, by_squares[k], dr.fma(v, by_product[k], by_mean[k]))
-            # Without the promise that all places differ, each value becomes a program.
+            # Without the promise that there are no conflicts, each value becomes a program.
             mode = dr.ReduceMode.NoConflicts
             dr.scatter(result, slope * factor, place, inside, mode=mode)
     return results

@@ -1,8 +1,8 @@
-"""TIFF files: every tag that changes what a pixel means is followed, or refused by its name.
+"""TIFF files: every tag that changes the meaning of a pixel is applied, or rejected by name.
 
-tifffile reads plain, Deflate and LZMA segments, and all others with the package imagecodecs. Where
-it cannot, OpenImageIO is asked, which knows LZW, PackBits, JPEG, the predictor of floats and odd
-numbers of bits; then Pillow, which keeps 8 bits.
+tifffile reads uncompressed, Deflate and LZMA segments, and all others with the package imagecodecs.
+Files that it cannot read are passed to OpenImageIO, which supports LZW, PackBits, JPEG, the float
+predictor and odd numbers of bits, and then to Pillow, which keeps 8 bits.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from .deep import read_openimageio
 from .formats import has_openimageio
-from .header import ORIENTATION, TURNED, Header, frames_note, over_background, profile_note
+from .header import ORIENTATION, TRANSPOSED, Header, frames_note, over_background, profile_note
 from .pictures import open_picture, picture_pixels
 from .pixels import ImageError, peak_of, reason_of, scale
 from .strips import Pixels, by_strips
@@ -27,48 +27,49 @@ if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
 COLORS = {0: "inverted", 1: "grey", 2: "rgb", 3: "palette", 5: "cmyk", 6: "ycbcr"}
-"""Photometric interpretations that are read."""
+"""Supported photometric interpretations."""
 
 CHANNELS = {"rgb": 3, "cmyk": 4, "ycbcr": 3}
-"""Samples of a colour, where they are more than 1."""
+"""Number of samples of a colour, if it is more than 1."""
 
 KINDS = {2: "signed integers", 5: "complex integers", 6: "complex numbers"}
-"""Sample formats that are refused."""
+"""Sample formats that are rejected."""
 
 BITS = {"integers": (1, 2, 4, 8, 10, 12, 14, 16, 32), "floats": (16, 24, 32, 64)}
-"""Bits of a value that are read."""
+"""Supported numbers of bits per value."""
 
-MAX_SEGMENT = 1 << 26
-"""Values of the largest strip or tile that is decoded for a window. A file of one compressed strip
-is better decoded once."""
+MAX_SEGMENT_VALUES = 1 << 26
+"""Number of values of the largest strip or tile that is decoded for a window. A file that consists
+of one compressed strip is better decoded once."""
 
-UNBOUNDED: dict[int, Callable] = {
+DECOMPRESSORS: dict[int, Callable] = {
     8: zlib.decompressobj,
     32946: zlib.decompressobj,
     34925: lzma.LZMADecompressor,
 }
-"""Compressions whose segments tifffile decodes to whatever size they have."""
+"""Decompressors of the formats whose segments tifffile decodes without a limit of size."""
 
-TRUSTED_SEGMENT = 1 << 17
-"""Bytes of a segment that is decoded at once: Deflate makes 130 MB of it at most."""
+TRUSTED_SEGMENT_BYTES = 1 << 17
+"""Size of a compressed segment that is decoded without a check: Deflate expands it to at most
+130 MB."""
 
 
 class Layout(NamedTuple):
-    """How a page stores its pixels.
+    """The storage layout of the pixels of a page.
 
     Attributes
     ----------
     color : str
         One of the values of `COLORS`.
     bits : int
-        Bits of a sample.
+        Bits per sample.
     floats : bool
     samples : int
-        Samples of a pixel: those of the colour, then others.
+        Samples per pixel: first those of the colour, then others.
     alpha : int or None
-        The sample that is alpha.
+        Index of the alpha sample.
     associated : bool
-        Whether the colours are multiplied by alpha already.
+        Whether the colours are already multiplied by alpha.
     """
 
     color: str
@@ -80,12 +81,12 @@ class Layout(NamedTuple):
 
     @property
     def channels(self) -> int:
-        """Channels of the picture without alpha."""
+        """Number of channels of the image without alpha."""
         return 1 if self.color in ("grey", "inverted") else 3
 
 
 def tiff_header(path: Path) -> Header:
-    """Return what the first image of a file says."""
+    """Return the header of the first image of a file."""
     import tifffile
 
     with tifffile.TiffFile(path) as file:
@@ -98,7 +99,7 @@ def tiff_header(path: Path) -> Header:
         others = layout.samples - CHANNELS.get(layout.color, 1) - (layout.alpha is not None)
         if others:
             notes += (f"{others} of {layout.samples} channels are no colours, and are left out",)
-    if orientation in TURNED:
+    if orientation in TRANSPOSED:
         width, height = height, width
     alpha = "none" if layout.alpha is None else ("associated" if layout.associated else "straight")
     needed = layout.samples * -(-layout.bits // 8)
@@ -119,13 +120,13 @@ def read_tiff(path: Path) -> Pixels:
                 _check_segments(file, page)
                 samples = page.asarray(squeeze=False)[:, 0]
                 samples = np.moveaxis(samples, 0, 2).reshape(*samples.shape[1:3], -1)
-                return to_colors(_whole_range(samples, layout), layout, page.colormap)
+                return to_colors(_full_range(samples, layout), layout, page.colormap)
             except ImageError:
                 raise
             except Exception as error:  # tifffile raises many types, also for missing codecs
                 reason = reason_of(error)
     if layout.color != "ycbcr" and has_openimageio():
-        with suppress(OSError):  # Pillow may know it
+        with suppress(OSError):  # Pillow may be able to read it
             return _read_openimageio(path, number, layout)
     integers = not layout.floats and not layout.associated
     if integers and (layout.bits <= 8 or (layout.bits == 16 and layout.color == "grey")):
@@ -144,7 +145,7 @@ def read_tiff(path: Path) -> Pixels:
 def _read_openimageio(path: Path, number: int, layout: Layout) -> Pixels:
     """Read a page of a file with OpenImageIO, which scales integers to 8, 16 or 32 bits.
 
-    It looks palettes up, and inverts up to 8 bits where white is 0, and no more.
+    It applies palettes, and inverts images whose white is 0 if they have at most 8 bits.
     """
     samples = read_openimageio(path, number)
     color = layout.color
@@ -153,18 +154,18 @@ def _read_openimageio(path: Path, number: int, layout: Layout) -> Pixels:
     elif color == "inverted" and samples.dtype == np.uint8:
         color = "grey"
     layout = layout._replace(color=color, bits=8 * samples.dtype.itemsize)
-    return to_colors(_whole_range(samples, layout), layout, None)
+    return to_colors(_full_range(samples, layout), layout, None)
 
 
 def _first_page(file: TiffFile) -> tuple[TiffPage, int, int]:
-    """Return the first page that is no small copy or mask of another, its number, and their count.
+    """Return the first page that is not a thumbnail or a mask, its index, and the number of images.
 
-    The number counts all pages, the count those that are images.
+    The index counts all pages.
     """
     numbered = enumerate(cast("Iterable[TiffPage]", file.pages))
     pages = [(k, page) for k, page in numbered if not _tag(page, 254, 0) & 5]
     if not pages:
-        raise ImageError("holds a thumbnail alone, its image is in a sub-IFD; export it as TIFF")
+        raise ImageError("holds only a thumbnail, its image is in a sub-IFD; export it as TIFF")
     number, page = pages[0]
     return page, number, len(pages)
 
@@ -174,7 +175,7 @@ def _tag(page: TiffPage, code: int, default: object) -> Any:
 
 
 def _layout(page: TiffPage) -> Layout:
-    """Return how a page stores its pixels; refuse by name what has no meaning here."""
+    """Return the layout of a page; reject unsupported kinds by name."""
     color = COLORS.get(int(page.photometric))
     name = getattr(page.photometric, "name", page.photometric)
     if color is None:
@@ -183,11 +184,13 @@ def _layout(page: TiffPage) -> Layout:
     floats, samples = kind == 3, page.samplesperpixel
     numbers = "floats" if floats else "integers"
     if kind in KINDS or bits not in BITS[numbers]:
-        what = KINDS.get(kind, numbers)
-        raise ImageError(f"holds {what} of {bits} bits; export it with 8 or 16 bits, or floats")
-    each = np.atleast_1d(_tag(page, 258, 1))
-    if (each != each[0]).any():
-        raise ImageError(f"its channels have {each.tolist()} bits; export it with 8 or 16")
+        sample_type = KINDS.get(kind, numbers)
+        raise ImageError(
+            f"holds {sample_type} of {bits} bits; export it with 8 or 16 bits, or floats"
+        )
+    channel_bits = np.atleast_1d(_tag(page, 258, 1))
+    if (channel_bits != channel_bits[0]).any():
+        raise ImageError(f"its channels have {channel_bits.tolist()} bits; export it with 8 or 16")
     if page.imagedepth != 1:
         raise ImageError("holds a volume; export a slice of it")
     if (color == "ycbcr" and bits != 8) or (floats and color not in ("grey", "rgb")):
@@ -207,14 +210,14 @@ def _layout(page: TiffPage) -> Layout:
 def to_colors(samples: Pixels, layout: Layout, palette: Pixels | None) -> Pixels:
     """Convert samples (H, W, S) of a page to grey or RGB, with alpha as the last channel, if any.
 
-    Integers are those of `_whole_range`.
+    Integers are those of `_full_range`.
     """
     first, color = CHANNELS.get(layout.color, 1), layout.color
     if color in ("grey", "rgb") and layout.alpha == first:
         return samples[..., : first + 1]
     colors = samples[..., :first]
     if color == "palette":
-        table = np.asarray(palette)  # of 16 bits, of which viewers take the upper 8
+        table = np.asarray(palette)  # of 16 bits; viewers use the upper 8
         table = table >> 8 if table.max() > 255 else table
         colors = table.T.astype(np.uint8)[colors[..., 0]]
     elif color == "inverted":
@@ -230,10 +233,10 @@ def to_colors(samples: Pixels, layout: Layout, palette: Pixels | None) -> Pixels
     return np.concatenate([colors, alpha], axis=2)
 
 
-def _whole_range(samples: Pixels, layout: Layout) -> Pixels:
-    """Scale integers of any number of bits to uint8 or uint16, or those of 32 to floats.
+def _full_range(samples: Pixels, layout: Layout) -> Pixels:
+    """Scale integers of any number of bits to uint8 or uint16, 32-bit integers to floats.
 
-    Indices of a palette and floats stay.
+    Palette indices and floats are not changed.
     """
     bits = layout.bits
     if layout.floats or layout.color == "palette" or bits in (8, 16):
@@ -246,20 +249,20 @@ def _whole_range(samples: Pixels, layout: Layout) -> Pixels:
 
 
 def _cmyk_to_rgb(rows: Pixels, peak: int) -> Pixels:
-    """Convert inks to colours as Pillow does: without a profile."""
+    """Convert CMYK to RGB without a colour profile, as Pillow does."""
     rows = scale(rows, peak)
     return (1 - rows[..., :3]) * (1 - rows[..., 3:])
 
 
 def _check_segments(file: TiffFile, page: TiffPage) -> None:
-    """Refuse segments that unfold to more than their size: a few kilobytes may make gigabytes."""
-    if page.compression not in UNBOUNDED:
+    """Reject segments that expand to more than their size: kilobytes may become gigabytes."""
+    if page.compression not in DECOMPRESSORS:
         return
     size = int(np.prod(page.chunks)) * -(-page.bitspersample // 8) * (page.samplesperpixel + 1)
     for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-        if count > TRUSTED_SEGMENT:
+        if count > TRUSTED_SEGMENT_BYTES:
             file.filehandle.seek(offset)
-            decoder = UNBOUNDED[page.compression]()
+            decoder = DECOMPRESSORS[page.compression]()
             if len(decoder.decompress(file.filehandle.read(count), size + 1)) > size:
                 raise ImageError(
                     "damaged: a strip or tile holds more than its size; export it again"
@@ -272,10 +275,10 @@ def _check_segments(file: TiffFile, page: TiffPage) -> None:
 
 
 def has_windows(path: Path) -> bool:
-    """Return whether `read_window` reads parts of a file whose header is known to be good.
+    """Return whether `read_window` can read parts of a file whose header is valid.
 
-    Its strips or tiles are plain, or have a compression that tifffile knows here, and their samples
-    lie side by side.
+    Its strips or tiles must be uncompressed, or have a compression that tifffile supports here, and
+    the samples of a pixel must be interleaved.
     """
     import tifffile
 
@@ -287,12 +290,12 @@ def has_windows(path: Path) -> bool:
             if _layout(page).color == "ycbcr" or page.bitspersample not in (8, 16, 24, 32, 64):
                 return False
             if not page.is_memmappable:
-                if np.prod(page.chunks, dtype=np.int64) > MAX_SEGMENT:
+                if np.prod(page.chunks, dtype=np.int64) > MAX_SEGMENT_VALUES:
                     return False
                 _check_segments(file, page)
                 _decode(file, page, 0)
             return True
-    except Exception:  # tifffile raises many types; other readers know it, or say why not
+    except Exception:  # tifffile raises many types; other readers may succeed or report why not
         return False
 
 
@@ -308,7 +311,7 @@ def read_window(path: str, rows: slice, columns: slice) -> Pixels:
     Returns
     -------
     ndarray, shape (R, C, 1) or (R, C, 3)
-        As `eigengs_dr.load_image` shows them, in the type of the file.
+        As from `eigengs_dr.load_image`, but in the type of the file.
 
     Raises
     ------
@@ -322,12 +325,12 @@ def read_window(path: str, rows: slice, columns: slice) -> Pixels:
             page, _, _ = _first_page(file)
             layout, palette = _layout(page), page.colormap
             if page.is_memmappable:
-                whole = page.asarray(out="memmap").reshape(page.imagelength, page.imagewidth, -1)
-                samples = np.array(whole[rows, columns], whole.dtype.newbyteorder("="))
+                image = page.asarray(out="memmap").reshape(page.imagelength, page.imagewidth, -1)
+                samples = np.array(image[rows, columns], image.dtype.newbyteorder("="))
             else:
                 samples = _from_segments(file, page, rows, columns)
         alpha = "associated" if layout.associated else "straight"
-        pixels = to_colors(_whole_range(samples, layout), layout, palette)
+        pixels = to_colors(_full_range(samples, layout), layout, palette)
         return over_background(pixels, "none" if layout.alpha is None else alpha)[0]
     except Exception as error:  # tifffile raises many types
         reason = reason_of(error)
@@ -335,7 +338,7 @@ def read_window(path: str, rows: slice, columns: slice) -> Pixels:
 
 
 def _from_segments(file: TiffFile, page: TiffPage, rows: slice, columns: slice) -> Pixels:
-    """Decode the strips or tiles that a window touches. One without data is black."""
+    """Decode the strips or tiles that a window touches. Segments without data are black."""
     height, width = page.chunks[:2]
     across = -(-page.imagewidth // width)
     shape = (rows.stop - rows.start, columns.stop - columns.start, page.samplesperpixel)
@@ -344,14 +347,14 @@ def _from_segments(file: TiffFile, page: TiffPage, rows: slice, columns: slice) 
         for column in range(columns.start // width, -(-columns.stop // width)):
             segment = _decode(file, page, row * across + column)
             if segment is not None:
-                here, there = _shared(rows, row * height, segment.shape[0])
-                left, right = _shared(columns, column * width, segment.shape[1])
-                result[here, left] = segment[there, right]
+                target_rows, source_rows = _overlap(rows, row * height, segment.shape[0])
+                target_columns, source_columns = _overlap(columns, column * width, segment.shape[1])
+                result[target_rows, target_columns] = segment[source_rows, source_columns]
     return result
 
 
-def _shared(part: slice, start: int, length: int) -> tuple[slice, slice]:
-    """Return what a part shares with a segment, counted from the start of each."""
+def _overlap(part: slice, start: int, length: int) -> tuple[slice, slice]:
+    """Return the overlap of a part and a segment, relative to the start of each."""
     first, last = max(part.start, start), min(part.stop, start + length)
     return slice(first - part.start, last - part.start), slice(first - start, last - start)
 

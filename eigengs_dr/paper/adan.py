@@ -23,14 +23,14 @@ class Adan:
         p_t = p_{t-1} - lr (m_t / (1 - beta_1^t) + beta_2 v_t / (1 - beta_2^t))
                           / (sqrt(n_t / (1 - beta_3^t)) + epsilon)
 
-    The betas are those of the authors' implementation: one minus the betas of the paper.
+    The betas follow the convention of the authors' code: one minus the betas of the paper.
 
     Parameters
     ----------
     betas : (float, float, float), optional
         Decay factors of the moving averages, each in [0, 1).
     epsilon : float, optional
-        Number that bounds the step if gradients vanish.
+        Bounds the step if gradients vanish.
 
     Raises
     ------
@@ -46,7 +46,7 @@ class Adan:
             raise ValueError(f"Adan: betas are {self.betas}; each must be in [0, 1)")
 
     def start(self, value: Rows) -> tuple[Rows, ...]:
-        """Return the moments and the gradient before the first step; see `Optimizer`."""
+        """Return the initial moments and gradient; see `Optimizer`."""
         return tuple(zeros_like(value) for _ in range(4))
 
     def step(
@@ -59,6 +59,6 @@ class Adan:
         m = dr.lerp(gradient, m, beta_1)
         v = dr.lerp(change, v, beta_2)
         n = dr.lerp(dr.square(dr.fma(change, beta_2, gradient)), n, beta_3)
-        move = m / debias(beta_1, time) + beta_2 * v / debias(beta_2, time)
-        move /= dr.sqrt(n / debias(beta_3, time)) + self.epsilon
-        return dr.fma(move, -rate, value), (m, v, n, gradient)
+        direction = m / debias(beta_1, time) + beta_2 * v / debias(beta_2, time)
+        direction /= dr.sqrt(n / debias(beta_3, time)) + self.epsilon
+        return dr.fma(direction, -rate, value), (m, v, n, gradient)

@@ -13,7 +13,7 @@ from ..gaussian.covariance import cholesky_from_factor, factor_from_cholesky
 from ..gaussian.gaussians import Gaussians
 
 CHOLESKY_BOUND = 0.5
-"""Pixels added to the diagonal of the Cholesky factor, as GaussianImage does."""
+"""Pixels that are added to the diagonal of the Cholesky factor, as in GaussianImage."""
 
 MIN_DIAGONAL = 0.01
 """Smallest diagonal entry of the Cholesky factor in pixels. GaussianImage has no such bound, but an
@@ -56,12 +56,12 @@ class Cholesky:
         if "cholesky" not in variables:
             return variables
         l1, l2, l3 = variables["cholesky"]
-        least = MIN_DIAGONAL - CHOLESKY_BOUND
-        inside = type(variables["cholesky"])(dr.maximum(l1, least), l2, dr.maximum(l3, least))
-        return {**variables, "cholesky": inside}
+        minimum = MIN_DIAGONAL - CHOLESKY_BOUND
+        bounded = type(variables["cholesky"])(dr.maximum(l1, minimum), l2, dr.maximum(l3, minimum))
+        return {**variables, "cholesky": bounded}
 
     def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[FloatLike, float]:
-        """Return how far ellipses reach; see `eigengs_dr.fitting.variables.Coordinates`."""
+        """Return the growth of ellipses; see `eigengs_dr.fitting.variables.Coordinates`."""
         side = 0.5 * max(fixed.width, fixed.height)  # the slope of tanh is at most 1
         return moves.get("mean", 0.0) * side + moves.get("cholesky", 0.0) * fixed.cutoff, 1.0
 

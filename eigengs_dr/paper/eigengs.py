@@ -1,8 +1,8 @@
 """The method of EigenGS, for `eigengs_dr.fit`.
 
 Source: Tai et al., "EigenGS Representation: From Eigenspace to Gaussian Image Space" (CVPR 2025).
-It descends as GaussianImage does, from the projection of the image on the eigenbasis. The mean
-image of the family stays pixels, which are no part of the Gaussians.
+It uses the descent of GaussianImage, starting from the projection of the image on the eigenbasis.
+The mean image of the family is stored as pixels, which are not part of the Gaussians.
 """
 
 from __future__ import annotations
@@ -29,27 +29,26 @@ class EigenGSMethod(Method):
     def start_from_model(
         self, objective: Pixels, model: Model, pixels: NDArray[np.float32]
     ) -> tuple[Pixels, Gaussians]:
-        """Return the objective less the mean image, and the projection of the image.
+        """Return the objective minus the mean image, and the projection of the image.
 
-        The picture of the objective has the mean image as its base.
+        The mean image becomes the base of the picture of the objective.
         """
         mean = model.dense_mean(*objective.size)
         assert objective.model.target is not None
-        left = objective.model.target - batch_to_tiles(objective.types, mean)
+        target = objective.model.target - batch_to_tiles(objective.types, mean)
         base = batch_to_tiles(objective.types, mean_picture(mean, objective.space))
         pictures = tuple(picture._replace(base=base) for picture in objective.pictures)
-        objective = replace(
-            objective, model=objective.model._replace(target=left), pictures=pictures
-        )
+        model_of_error = objective.model._replace(target=target)
+        objective = replace(objective, model=model_of_error, pictures=pictures)
         gaussians = model.encode(pixels, "projected", "dense")
         return objective, replace(gaussians, cutoff=float(self.cutoff))
 
 
 def mean_picture(mean: NDArray[np.float32], space: str) -> NDArray[np.float32]:
-    """Return a mean image (H, W, C) as RGB to add: a rendering already holds the RGB of zeros."""
+    """Return a mean image (H, W, C) as RGB minus the RGB of zeros, which a rendering includes."""
     rgb = np.stack(decode(space, list(np.moveaxis(mean, 2, 0))), axis=2)
     return np.asarray(rgb - np.array(decode(space, [0.0] * mean.shape[2]), np.float32))
 
 
 EIGENGS = EigenGSMethod(**{f.name: getattr(GAUSSIANIMAGE, f.name) for f in fields(Method)})
-"""The method of EigenGS; it needs a model as the start of the fit."""
+"""The method of EigenGS, which needs a model to start from."""

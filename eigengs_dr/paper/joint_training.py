@@ -1,8 +1,8 @@
-"""Joint training of the shapes and the weights of all components, as the authors of EigenGS do.
+"""Joint training of the shapes and the weights of all components, as in EigenGS.
 
 Source: Tai et al., "EigenGS Representation: From Eigenspace to Gaussian Image Space", CVPR 2025.
-Gradient descent moves N Gaussians and their weights in all principal components at once. The loss
-is the mean squared error of the rendered components, with each channel scaled to [0, 1].
+Gradient descent optimises N Gaussians and their weights in all principal components together. The
+loss is the mean squared error of the rendered components, with each channel scaled to [0, 1].
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from .cholesky import Cholesky
 Planes = NDArray[np.float32]
 
 State = dict[str, NDArray]
-"""What a training keeps: plain arrays, for a checkpoint."""
+"""The state of a training as plain arrays, for a checkpoint."""
 
 CHOLESKY = Cholesky()
 
 
 class Components(Protocol):
-    """Components that some Gaussians serve, as `eigengs_dr.eigenbasis` divides them."""
+    """Components and the number of their Gaussians, as `eigengs_dr.eigenbasis` divides them."""
 
     @property
     def number(self) -> int:
@@ -62,7 +62,7 @@ def joint_shapes(state: State, band: Components, backend: str | None = None) -> 
 
 
 def joint_weights(state: State, band: Components) -> list[Planes]:
-    """Return the weights of the components of a state without the scaling.
+    """Return the weights of the components of a state, with the scaling undone.
 
     The scaled weight ``w_nj`` of Gaussian n in component j and the bounds of the channel give
     ``psi'_nj = w_nj (max - min)`` and ``beta_j = min``.
@@ -106,16 +106,16 @@ def decode_shapes(rows: Sequence[Float], size: tuple[int, int]) -> Gaussians:
 RATE = 1e-3
 """Initial learning rate of all variables."""
 
-HALVED = 20_000
-"""Steps between two halvings of the learning rate."""
+HALVING_STEPS = 20_000
+"""Number of steps after which the learning rate is halved."""
 
-ROUND = 20
-"""Steps between two states; they take some 5 s for 900 components of 256x256 pixels and 5,000
+STATE_STEPS = 20
+"""Number of steps between two states, about 5 s for 900 components of 256x256 pixels and 5,000
 Gaussians."""
 
-GROUP = 8
-"""Number of components in one rendering. More do not fit into the registers; fewer evaluate the
-Gaussians more often."""
+GROUP_COMPONENTS = 8
+"""Number of components per rendering. More would not fit into registers; with fewer, Gaussians are
+evaluated more often."""
 
 OPTIMIZER = Adan()
 
@@ -147,18 +147,18 @@ def train_jointly(
         Total number of steps.
     backend : {"llvm", "cuda"}, optional
     state : dict of str to ndarray, optional
-        Resume from this state, without the seed. The result has the bits of an unbroken run.
+        Resume from this state, without the seed. The result is bit-identical to that of an
+        uninterrupted run.
 
     Yields
     ------
     dict of str to ndarray
-        The state after every `ROUND` steps and after the last step; nothing if `state` has all
-        steps. Between two states, `KeyboardInterrupt` may become another error, see
-        `eigengs_dr.backend.interrupts.defer_interrupts`. "step" is the number of finished steps;
-        "rows", shape (5, 5 + P, N) for P components, the variables, then m, v, n and the last
-        gradient of `eigengs_dr.paper.adan.Adan`. The first 5 rows of each are the
-        mean and the factor in `Cholesky` coordinates, each other row the scaled weights of one
-        component.
+        The state after every `STATE_STEPS` steps and after the last step; nothing if `state` is
+        complete. Between two states, `KeyboardInterrupt` may become another error, see
+        `eigengs_dr.backend.interrupts.defer_interrupts`. "step" is the number of finished steps.
+        "rows" has shape (5, 5 + P, N) for P components: the variables, then m, v, n and the last
+        gradient of `eigengs_dr.paper.adan.Adan`. The first 5 rows of each are the mean and the
+        factor in `Cholesky` coordinates, the others the scaled weights of one component each.
 
     Raises
     ------
@@ -167,8 +167,8 @@ def train_jointly(
 
     Notes
     -----
-    A step costs one rendering and one adjoint for each component. Beside the components, it needs
-    4 P W H bytes for scaled components, 20 P N for weights and moments, and 20 P N for each state.
+    A step costs one rendering and one adjoint per component. In addition to the components, it
+    needs 4 P W H bytes for scaled components, 20 P N for weights and moments, and 20 P N per state.
     """
     if not any(map(len, band.components)):
         raise ValueError("the images give no components to train on; use preset 'default'")
@@ -176,7 +176,7 @@ def train_jointly(
 
 
 def _start(band: Components, seed: int, backend: str | None) -> State:
-    """Draw an initial state, with moments of 0."""
+    """Draw a random initial state, with moments of 0."""
     generator = np.random.default_rng(seed)
     count = band.number
     mean, factor = random_shapes(band.size, count, generator)
@@ -208,12 +208,12 @@ def _train(band: Components, state: State, steps: int, backend: str | None) -> I
     scale = dr.opaque(types.Float, 2 / number)
     with freeze_program(_move_group) as move, freeze_program(_move_shape) as move_shape:
         for step in range(int(state["step"]), steps):
-            rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVED))
+            rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVING_STEPS))
             time = dr.opaque(types.Float, step + 1)
             current = decode_shapes(shape[0], size)
             values = kernel_shape(current)
             dr.eval(values)
-            # New lists in every step are cheaper than larger lists that last several steps.
+            # Building lists in every step is cheaper than larger lists that last several steps.
             lists = bin_gaussians(current)
             slopes = [dr.opaque(types.Float, 0, dr.width(v)) for v in values]
             for k, target in enumerate(targets):
@@ -221,7 +221,7 @@ def _train(band: Components, state: State, steps: int, backend: str | None) -> I
                     groups[k], target, values, lists, radius, scale, slopes, rate, time
                 )
             shape = move_shape(shape, slopes, size, rate, time)
-            if (step + 1) % ROUND == 0 or step + 1 == steps:
+            if (step + 1) % STATE_STEPS == 0 or step + 1 == steps:
                 rows = np.concatenate([_download(o) for o in (shape, *groups)], axis=1)
                 rows = rows[:, : start.shape[1]]  # without the padding of the last group
                 yield {"step": np.array(step + 1), "rows": rows}
@@ -238,22 +238,22 @@ def _move_group(
     rate: Float,
     time: Float,
 ) -> tuple[list, list]:
-    """Move the weights of a group, and add its gradient of the shapes to `slopes`."""
+    """Take a step with the weights of a group, and add its gradient of the shapes to `slopes`."""
     moments: Sequence[Rows]
     rows, *moments = group
     packed = pack_parameters([*shape, *rows])
-    delta, _ = residual(packed, [type(target)(0)] * GROUP, lists, radius, target)
-    gradient = [g * scale for g in adjoint(packed, delta, GROUP, lists, radius)]
+    delta, _ = residual(packed, [type(target)(0)] * GROUP_COMPONENTS, lists, radius, target)
+    gradient = [g * scale for g in adjoint(packed, delta, GROUP_COMPONENTS, lists, radius)]
     added = [s + g for s, g in zip(slopes, gradient[:NUM_SHAPE_PARAMS], strict=True)]
-    own = type(rows)(gradient[NUM_SHAPE_PARAMS:])
-    rows, moments = OPTIMIZER.step(rows, own, tuple(moments), rate, time)
+    weight_gradient = type(rows)(gradient[NUM_SHAPE_PARAMS:])
+    rows, moments = OPTIMIZER.step(rows, weight_gradient, tuple(moments), rate, time)
     return [rows, *moments], added
 
 
 def _move_shape(
     shape: list, gradient: list, size: tuple[int, int], rate: Float, time: Float
 ) -> list:
-    """Move the means and factors of all Gaussians along the gradient of the kernels' parameters."""
+    """Take a step with all means and factors, from the gradient of the kernels' parameters."""
     moments: Sequence[Rows]
     rows, *moments = shape
     with dr.resume_grad():
@@ -272,16 +272,16 @@ def _upload(types: ArrayTypes, rows: Planes) -> list:
 
 
 def _download(parts: list) -> Planes:
-    """Copy the state of an optimiser to NumPy, as `_upload` takes it."""
+    """Copy the state of an optimiser to NumPy; the inverse of `_upload`."""
     return np.stack([dr.detach(part).numpy() for part in parts])
 
 
 def _split(array: Planes, axis: int) -> Iterator[Planes]:
-    """Yield `GROUP` components after `GROUP` components, the last ones with zeros.
+    """Yield groups of `GROUP_COMPONENTS` components, the last one padded with zeros.
 
-    The padding stays 0: a zero component with zero weights has no gradient.
+    The padding remains 0, because a zero component with zero weights has no gradient.
     """
-    for part in np.split(array, range(GROUP, array.shape[axis], GROUP), axis):
+    for part in np.split(array, range(GROUP_COMPONENTS, array.shape[axis], GROUP_COMPONENTS), axis):
         missing = np.zeros((array.ndim, 2), int)
-        missing[axis, 1] = GROUP - part.shape[axis]
+        missing[axis, 1] = GROUP_COMPONENTS - part.shape[axis]
         yield np.pad(part, missing)

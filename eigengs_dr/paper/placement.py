@@ -1,4 +1,4 @@
-"""The start of GaussianImage: random Gaussians with random colours on black."""
+"""The initialization of GaussianImage: random Gaussians with random colours on black."""
 
 from __future__ import annotations
 

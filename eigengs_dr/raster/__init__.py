@@ -1,11 +1,11 @@
-"""What a Gaussian contributes to a pixel, and the sum of all Gaussians.
+"""Rasterization: the weight of a Gaussian at a pixel, and the sum over all Gaussians.
 
 - ``evaluate``: the weight of one Gaussian at a block of pixels, and its derivatives
-- ``parameters``: Gaussians in the units of the kernels, and where they lie in memory
+- ``parameters``: Gaussians in the units of the kernels, and their layout in memory
 - ``binning``: which Gaussians touch which tile
-- ``kernels``: the sum over all Gaussians and its error
-- ``adjoint``: its gradient
-- ``render``: the differentiable operation, `render`, and the picture by strips of rows
-- ``reference``: slow renderers to compare with
+- ``kernels``: the sum over all Gaussians, and its error against a target
+- ``adjoint``: the gradient of the sum
+- ``render``: the differentiable operation, `render`, and tile layout
+- ``reference``: slow renderers for comparison
 - ``lookup``: the sum at scattered points, for textures
 """

@@ -24,8 +24,9 @@ def adjoint(
 ) -> list:
     """Return the gradient of ``<delta, forward(packed)>`` with respect to all parameters.
 
-    A lane owns a piece of a Gaussian, visits its tiles, gathers delta there and sums in registers;
-    `sum_pieces` adds the pieces. Without atomic operations, every run gives the same result.
+    Each lane owns a piece of a Gaussian, visits its tiles, gathers delta there and accumulates in
+    registers; `sum_pieces` adds the pieces. There are no atomic operations, so that every run
+    gives the same result.
 
     Parameters
     ----------
@@ -41,8 +42,8 @@ def adjoint(
     color_only : bool, optional
         Omit the derivatives with respect to the shapes.
     factors : Float, optional
-        One or more images in tile layout. With `color_only`, the products ``<f, w^2>`` of each with
-        the squared weights follow the derivatives.
+        One or more images f in tile layout. With `color_only`, the derivatives are followed by the
+        products ``<f, w^2>`` of each image with the squared weights.
 
     Returns
     -------
@@ -71,27 +72,26 @@ def adjoint_pieces(
 ) -> Float:
     """Return the packed sums of every piece, for `sum_pieces`; parameters as for `adjoint`.
 
-    A lane owns the same rows of all tiles of its piece, see `Granularity.rows`. Cost per visit of
-    4x4 pixels: a gather of delta, 7 exponentials, and per pixel 2 operations for the weight, 2 for
-    the cutoff, 2 per channel and 5 for the shape.
+    A lane owns the same rows of all tiles of its piece, see `Granularity.rows`. Cost per visit to
+    4x4 pixels: one gather of delta, 7 exponentials, and per pixel 2 operations for the weight, 2
+    for the cutoff, 2 per channel and 5 for the shape.
     """
     types = types_of(packed)
     sizes, pieces, tile_size = lists.sizes, lists.pieces, lists.grid.tile
     assert pieces is not None
     rows, shares = shares_of(types, lists.grid)
-    index, begin, end, slot = pieces.splat, pieces.begin, pieces.end, pieces.slot
+    fields = [pieces.splat, pieces.begin, pieces.end, pieces.slot]
     part = types.UInt(0)
-    if shares > 1:  # neighbouring lanes visit the same tiles, and read one contiguous run together
-        lane = dr.arange(types.UInt, dr.width(slot) * shares)
+    if shares > 1:  # neighbouring lanes visit the same tiles, and together read a contiguous run
+        lane = dr.arange(types.UInt, dr.width(pieces.slot) * shares)
         part, owner = lane % shares, lane // shares
-        index, begin, end, slot = (
-            dr.gather(types.UInt, v, owner) for v in (index, begin, end, slot)
-        )
+        fields = [dr.gather(types.UInt, v, owner) for v in fields]
+    index, begin, end, slot = fields
     splat = unpack_parameters(packed, index, NUM_SHAPE_PARAMS + channels)
     shape, block = splat[:NUM_SHAPE_PARAMS], (tile_size[0], rows)
     length, images = block[0] * rows, _images_in(factors, lists)
 
-    def add_tile(steep: bool, end: UInt, i: UInt, sums: list) -> tuple:
+    def add_tile(exact_exp: bool, end: UInt, i: UInt, sums: list) -> tuple:
         active = i < end
         tile = gather_index(types, pieces.tile, i, active)
         d = gather_run(types, delta, tile * shares + part, length * channels, active)
@@ -107,30 +107,30 @@ def adjoint_pieces(
             return g
 
         if color_only:
-            own, f = sums[channels:], []
+            products, f = sums[channels:], []
             if factors is not None:
                 f = gather_run(types, factors, tile * shares + part, length * images, active)
-            for k, w in enumerate(weights(shape, x, y, block, radius, steep)):
+            for k, w in enumerate(weights(shape, x, y, block, radius, exact_exp)):
                 cotangent(k, w)
                 square = dr.square(w)
-                own = [dr.fma(square, f[k * images + n], s) for n, s in enumerate(own)]
-            return i + 1, color + own
-        gradient = weights_vjp(shape, x, y, block, radius, cotangent, steep)
+                products = [dr.fma(square, f[k * images + n], s) for n, s in enumerate(products)]
+            return i + 1, color + products
+        gradient = weights_vjp(shape, x, y, block, radius, cotangent, exact_exp)
         return i + 1, [s + g for s, g in zip(sums, gradient, strict=False)] + color
 
-    def run(steep: bool, begin: UInt, end: UInt, sums: list) -> list:
+    def run(exact_exp: bool, begin: UInt, end: UInt, sums: list) -> list:
         return dr.while_loop(
             (types.UInt(begin), sums),
             lambda i, sums: i < end,
-            lambda i, sums: add_tile(steep, end, i, sums),
+            lambda i, sums: add_tile(exact_exp, end, i, sums),
             label="pull back",
             max_iterations=-1,
         )[-1]
 
     number = channels + (images if color_only else NUM_SHAPE_PARAMS)
     sums = [types.Float(0) for _ in range(number)]
-    for steep, first, last in lists.runs(begin, end):
-        sums = run(steep, first, last, sums)
+    for exact_exp, first, last in lists.runs(begin, end):
+        sums = run(exact_exp, first, last, sums)
     stride = -(-number // 4) * 4
     parts = dr.empty(types.Float, stride * shares * dr.width(pieces.slot))
     values = [*sums, *[types.Float(0)] * (stride - number)]
@@ -141,7 +141,7 @@ def adjoint_pieces(
 def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt | None = None) -> list:
     """Add the results of the pieces of every Gaussian, in the order of the pieces.
 
-    On a GPU blocks of pieces are added first, see `Granularity.block`.
+    On a GPU, blocks of pieces are added first, see `Granularity.block`.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt | None = N
     number : int
         Number of derivatives of a Gaussian.
     splat : UInt32, optional
-        Gaussians, by default all. Those that the lists do not hold have the sum 0.
+        Indices of Gaussians, by default all. Gaussians that are not in the lists have the sum 0.
 
     Returns
     -------
@@ -167,28 +167,28 @@ def sum_pieces(parts: Float, pieces: Pieces, number: int, splat: UInt | None = N
     begin = dr.gather(types.UInt, pieces.first, splat, known)
     end = begin + dr.gather(types.UInt, pieces.number, splat, known)
     slots, stride = dr.width(pieces.slot), -(-number // 4) * 4
-    length = dr.width(parts) // slots  # of the shares of all lanes of a piece
+    length = dr.width(parts) // slots  # number of results of all lanes of a piece
 
     def add(source: Float, first: UInt, last: UInt, sums: list) -> list:
-        """Add the results `[first, last)` of pieces, or of blocks."""
+        """Add the results `[first, last)` of pieces or of blocks."""
 
         def add_one(i: UInt, sums: list) -> tuple:
             values = gather_run(types, source, i, length, i < last)
             return i + 1, [sum(values[k::stride], s) for k, s in enumerate(sums)]
 
-        found: list = dr.while_loop(
+        totals: list = dr.while_loop(
             (types.UInt(first), sums),
             lambda i, sums: i < last,
             add_one,
             label="sum pieces",
             max_iterations=-1,
         )[-1]
-        return found
+        return totals
 
     sums, block = [types.Float(0) for _ in range(number)], granularity_of(types).block
     if not block or slots < block:
         return add(parts, begin, end, sums)
-    # What comes before the blocks that a Gaussian fills alone, these blocks, and what comes after.
+    # The pieces before the blocks that a Gaussian fills alone, these blocks, and the pieces after.
     blocks = _sum_blocks(parts, slots // block, block, stride, length // stride)
     first, last = (begin + (block - 1)) // block, end // block
     fills = first < last
@@ -211,7 +211,7 @@ def _sum_blocks(parts: Float, number: int, block: int, stride: int, shares: int)
     stride : int
         Number of results of a lane.
     shares : int
-        Lanes of a piece.
+        Number of lanes of a piece.
     """
     types = types_of(parts)
     lane = dr.arange(types.UInt, number * shares)

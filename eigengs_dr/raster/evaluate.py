@@ -1,7 +1,7 @@
 """The weight of one Gaussian at a point, its derivatives, and its convolution with a footprint.
 
 A Gaussian with the mean mu and the factor ``F = [[a, b], [0, c]]`` of ``Sigma^-1 = F^T F`` has the
-weight ``exp(-1/2 |F (x - mu)|^2)`` at x, and the weight 0 if ``|F (x - mu)| > cutoff``.
+weight ``exp(-1/2 |F (x - mu)|^2)`` at x, or 0 if ``|F (x - mu)| > cutoff``.
 """
 
 from __future__ import annotations
@@ -16,17 +16,19 @@ from ..backend.types import Bool, Float, FloatLike
 
 LN2 = math.log(2)
 
-STEEP = 122.0
-"""Largest exponent of the products of `weights` before a Gaussian is steep, see `is_steep`."""
+MAX_PRODUCT_EXPONENT = 122.0
+"""Largest exponent, to the base 2, in the products of `weights`. A Gaussian with a larger one is
+steep, see `is_steep`."""
 
 
 def exp2_neg(q: Float) -> Float:
     """Return ``2^-q`` for ``-126 <= q <= 126``: relative error < 3e-7, on cuda < 5e-7.
 
-    On llvm, single precision costs half of `drjit.exp2`: split ``q = n - f`` into an integer n and
-    ``|f| <= 1/2``; a polynomial gives ``2^f``, and n is subtracted from its exponent bits. Outside
-    the range the result is arbitrary, and callers mask it. Double precision and GPUs, where it is
-    one instruction, use `drjit.exp2`. Not differentiable: see `falloff`.
+    On llvm in single precision this takes half the time of `drjit.exp2`: ``q = n - f`` is split
+    into an integer n and ``|f| <= 1/2``; a polynomial gives ``2^f``, and n is subtracted from its
+    exponent bits. Outside of the range the result is arbitrary, and callers mask it. Double
+    precision and GPUs, where it is one instruction, use `drjit.exp2`. Not differentiable: see
+    `falloff`.
     """
     types = types_of(q)
     if types.bits == 64 or types.backend != "llvm":
@@ -48,7 +50,7 @@ def exp2_neg(q: Float) -> Float:
 
 
 def falloff(q: Float, limit: float) -> Float:
-    """Return ``2^-q`` for ``q <= limit``, else 0; the derivative is ``-ln(2)`` times the value."""
+    """Return ``2^-q`` if ``q <= limit``, else 0; the derivative is ``-ln(2)`` times the value."""
     exact = dr.detach(q)
     value = dr.select(exact <= limit, exp2_neg(exact), 0)
     if not dr.grad_enabled(q):
@@ -57,12 +59,12 @@ def falloff(q: Float, limit: float) -> Float:
 
 
 def weights(
-    shape: list, x: Float, y: Float, tile: tuple[int, int], radius: float, steep: bool = True
+    shape: list, x: Float, y: Float, tile: tuple[int, int], radius: float, exact_exp: bool = True
 ) -> list:
     """Evaluate one Gaussian at a block of pixels: ``2^-|F (x - mu)|^2`` in the units of kernels.
 
     The renderer, its derivatives, the colour solve and the textures (with blocks of one point) all
-    evaluate Gaussians here.
+    use this function.
 
     Parameters
     ----------
@@ -74,33 +76,34 @@ def weights(
         Width and height of the block; points are 1 pixel apart.
     radius : float
         Cutoff, see `eigengs_dr.raster.parameters.kernel_radius`.
-    steep : bool, optional
+    exact_exp : bool, optional
         Whether to evaluate an exponential at every point. False is faster: products continue one
-        exponential of each row, with a relative error of about 2e-6, and 1e-5 for the narrowest
-        Gaussians. It needs a width of 4 and a Gaussian for which `is_steep` is false, and Dr.Jit
-        cannot differentiate it.
+        exponential per row, with a relative error of about 2e-6, and 1e-5 for the narrowest
+        Gaussians. This requires a width of 4 and a Gaussian for which `is_steep` is false, and
+        Dr.Jit cannot differentiate it.
 
     Returns
     -------
     list of Float
-        Weights in [0, 1], row after row; on cuda up to 5e-7 above 1, the error of its exponential.
+        Weights in [0, 1], row after row; on cuda at most 5e-7 above 1, the error of its
+        exponential.
     """
-    return [w for row in _rows(shape, x, y, tile, radius, steep) for w in row[0]]
+    return [w for row in _rows(shape, x, y, tile, radius, exact_exp) for w in row[0]]
 
 
 def _rows(
-    shape: list, x: Float, y: Float, tile: tuple[int, int], radius: float, steep: bool
+    shape: list, x: Float, y: Float, tile: tuple[int, int], radius: float, exact_exp: bool
 ) -> list[tuple[list, Float, Float]]:
-    """Return for each row of a block its weights, and (u, v) = F (x - mu) at its column `_column`.
+    """Return for each row of a block its weights, and (u, v) = F (x - mu) at column `_column`.
 
-    One step to the right changes u by a, and one step down changes (u, v) by (b, c).
+    A step to the right changes u by a, and a step down changes (u, v) by (b, c).
     """
     mean_x, mean_y, a, b, c = shape
     dx, dy = x + float(_column(tile)) - mean_x, y - mean_y
     u0, v0 = dr.fma(a, dx, b * dy), c * dy
     points = [(dr.fma(b, float(j), u0), dr.fma(c, float(j), v0)) for j in range(tile[1])]
     points[0] = (u0, v0)
-    if not steep:
+    if not exact_exp:
         return _chained(a, b, points, radius)
     limit, steps = radius * radius, [float(i - _column(tile)) for i in range(tile[0])]
     rows = []
@@ -111,16 +114,16 @@ def _rows(
 
 
 def _column(tile: tuple[int, int]) -> int:
-    """Return the column in which a row of a block starts: the second of 4 bounds the products."""
+    """Return the column at which a row of a block starts: the second of 4 bounds the products."""
     return min(1, tile[0] - 1)
 
 
 def _chained(a: Float, b: Float, points: list, radius: float) -> list[tuple[list, Float, Float]]:
-    """Return the rows of `_rows` of 4 pixels by products, from the weights w_1 of the second pixel.
+    """Return the rows of `_rows`, of 4 pixels, by products from the weight w_1 of the second pixel.
 
-    With (u, v) there, ``w_2 = w_1 M`` and ``w_3 = w_2 M K`` and ``w_0 = w_1 K / M``, where
-    ``M = 2^-(2 a u + a^2)`` and ``K = 2^-2a^2``. A row further down has ``M 2^-2ab``. `is_steep`
-    tells where all factors stay in the range of floats.
+    With (u, v) at that pixel, ``w_2 = w_1 M``, ``w_3 = w_2 M K`` and ``w_0 = w_1 K / M``, where
+    ``M = 2^-(2 a u + a^2)`` and ``K = 2^-2a^2``. The next row has ``M 2^-2ab``. Unless `is_steep`
+    is true, all factors stay in the range of floats.
     """
     largest, least = 126.0, 2.0 ** (-radius * radius)
     start = (len(points) - 1) // 2  # the ratios start here, where their exponents are smallest
@@ -146,7 +149,7 @@ def _chained(a: Float, b: Float, points: list, radius: float) -> list[tuple[list
 
 
 def _powers(value: Float, up: Float, down: Float, start: int, count: int) -> list:
-    """Return `count` values, `value` at `start`, times `up` before it and times `down` after it."""
+    """Return `count` values: `value` at `start`, multiplied by `up` before and `down` after it."""
     values = [value]
     for _ in range(start):
         values.insert(0, values[0] * up)
@@ -158,11 +161,12 @@ def _powers(value: Float, up: Float, down: Float, start: int, count: int) -> lis
 def is_steep(shape: list, radius: float) -> Bool:
     """Return for each Gaussian whether products could leave the range of floats in `weights`.
 
-    Beside a pixel inside the ellipse, ``|u| <= radius + 2 a`` at the second pixel of the row, and
+    Next to a pixel inside the ellipse, ``|u| <= radius + 2 a`` at the second pixel of the row, and
     ``|u| <= radius + 2 a + 2 |b|`` in the row where the ratios start. The exponents of the weight
-    there, ``u^2 + v^2``, and of the ratio, ``2 a u + a^2``, must stay below 126; `STEEP` leaves
-    room for Gaussians that shrink until the next test. Gaussians within their bounds, see
-    `eigengs_dr.gaussian.gaussians`, reach 121.2 at a cutoff of 3: a fit has no steep Gaussian.
+    there, ``u^2 + v^2``, and of the ratio, ``2 a u + a^2``, must stay below 126;
+    `MAX_PRODUCT_EXPONENT` leaves a margin for Gaussians that shrink until the next test. Gaussians
+    within their bounds, see `eigengs_dr.gaussian.gaussians`, reach 121.2 at a cutoff of 3: a fit
+    has no steep Gaussian.
 
     Parameters
     ----------
@@ -179,7 +183,7 @@ def is_steep(shape: list, radius: float) -> Bool:
     _, _, a, b, _ = shape
     reach = dr.fma(2.0, a, radius)
     ratio = dr.fma(2 * a, reach + 2 * dr.abs(b), a * a)
-    return ~((reach * reach <= STEEP) & (ratio <= STEEP))
+    return ~((reach * reach <= MAX_PRODUCT_EXPONENT) & (ratio <= MAX_PRODUCT_EXPONENT))
 
 
 def weights_vjp(
@@ -189,7 +193,7 @@ def weights_vjp(
     tile: tuple[int, int],
     radius: float,
     cotangent: Callable[[int, Float], FloatLike],
-    steep: bool = True,
+    exact_exp: bool = True,
 ) -> list:
     """Return the gradient of ``sum_k g_k w_k`` for ``g_k = cotangent(k, w_k)``.
 
@@ -200,7 +204,7 @@ def weights_vjp(
 
     Parameters
     ----------
-    shape, x, y, tile, radius, steep
+    shape, x, y, tile, radius, exact_exp
         As for `weights`.
     cotangent : callable
         ``cotangent(k, w)`` receives the weight of point k and returns the derivative of the loss
@@ -214,7 +218,7 @@ def weights_vjp(
     mean_x, mean_y, a, b, c = shape
     steps = [float(i - _column(tile)) for i in range(tile[0])]
     du = dui = duj = dv = dvj = type(mean_x)(0)
-    for j, (ws, u, v) in enumerate(_rows(shape, x, y, tile, radius, steep)):
+    for j, (ws, u, v) in enumerate(_rows(shape, x, y, tile, radius, exact_exp)):
         e = [w * cotangent(j * tile[0] + i, w) for i, w in enumerate(ws)]
         e0, e1, e2 = (
             _moment(e, [1.0] * len(e)),
@@ -240,7 +244,7 @@ def weights_vjp(
 
 
 def _moment(values: list, factors: list[float]) -> Float:
-    """Return the sum of values times literal factors; factors of 0 and 1 cost no product."""
+    """Return the sum of values times literal factors; factors 0 and 1 need no multiplication."""
     total = type(values[0])(0)
     for value, factor in zip(values, factors, strict=True):
         if factor == 1:
@@ -253,9 +257,9 @@ def _moment(values: list, factors: list[float]) -> Float:
 def widen(shape: list, footprint: list) -> tuple[list, Float]:
     """Convolve a Gaussian with a Gaussian footprint whose integral is 1.
 
-    The result has the covariance ``Sigma' = Sigma + Sigma_f``, and the amplitude
-    ``sqrt(det Sigma / det Sigma')`` keeps the integral (Heckbert, "Fundamentals of Texture Mapping
-    and Image Warping", 1989).
+    The result has the covariance ``Sigma' = Sigma + Sigma_f``, and the amplitude ``sqrt(det Sigma /
+    det Sigma')`` preserves the integral (Heckbert, "Fundamentals of Texture Mapping and Image
+    Warping", 1989).
 
     Parameters
     ----------
@@ -284,7 +288,7 @@ def inverted(shape: list) -> list:
 
 
 def widen_inverted(shape: list, footprint: list) -> tuple[list, Float]:
-    """Convolve as `widen`; the shape is from `inverted`, and the amplitude lacks a factor p r."""
+    """Convolve as `widen` does, a shape from `inverted`; the amplitude lacks a factor p r."""
     mean_x, mean_y, p, t, r = shape
     fxx, fxy, fyy = footprint
     xy = dr.fma(t, r, fxy)
@@ -292,9 +296,9 @@ def widen_inverted(shape: list, footprint: list) -> tuple[list, Float]:
     # det(S + F) = det S + tr(adj(S) F) + det F is a sum of squares. The plain formula xx yy - xy^2
     # loses all digits for very elongated Gaussians.
     across = dr.fma(r * r, fxx, t * dr.fma(t, fyy, -2 * r * fxy))
-    whole = p * r
+    root_det = p * r  # sqrt(det S)
     added = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0) + dr.maximum(across, 0)
-    scale = rsqrt(dr.fma(whole, whole, dr.fma(p * p, fyy, added)))
+    scale = rsqrt(dr.fma(root_det, root_det, dr.fma(p * p, fyy, added)))
     new_c = rsqrt(yy)
     scaled = new_c * scale
     return [mean_x, mean_y, yy * scaled, -xy * scaled, new_c], scale

@@ -1,4 +1,4 @@
-"""The sum over all Gaussians and its error, one lane per block of rows of a tile.
+"""The sum over all Gaussians, and its error: one lane per block of rows of a tile.
 
 ``I(x) = background + sum_n c_n w_n(x)`` with the weights of `eigengs_dr.raster.evaluate`.
 
@@ -27,11 +27,11 @@ class _Blocks(NamedTuple):
     Attributes
     ----------
     run : UInt32
-        Index of the block in tile layout: the block holds the run of pixels ``[run, run + 1)``
-        times `pixels`.
+        Index of the block in tile layout: the block holds the pixels
+        ``[run * pixels, (run + 1) * pixels)``.
     tile : UInt32
     x, y : Float
-        First pixel centre.
+        Centre of the first pixel.
     begin, end : UInt32
         Range of the list of the tile.
     size : (int, int)
@@ -56,7 +56,7 @@ def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
     width, _ = lists.grid.tile
     rows, parts = shares_of(types, lists.grid)
     tile, begin, end, part = lists.order, lists.begin, lists.end, types.UInt(0)
-    if parts > 1:  # neighbouring lanes share a tile, and write one contiguous run together
+    if parts > 1:  # neighbouring lanes share a tile, and together write a contiguous run
         lane = dr.arange(types.UInt, lists.grid.tiles * parts)
         part = lane % parts
         tile, begin, end = (dr.gather(types.UInt, v, lane // parts) for v in (tile, begin, end))
@@ -66,7 +66,7 @@ def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
 
 
 def shares_of(types: ArrayTypes, grid: Grid) -> tuple[int, int]:
-    """Return the rows of a block, and the number of blocks of a tile."""
+    """Return the number of rows of a block, and the number of blocks of a tile."""
     rows = math.gcd(granularity_of(types).rows, grid.tile[1])
     return rows, grid.tile[1] // rows
 
@@ -81,8 +81,8 @@ def _sum_blocks(
 ) -> list:
     """Sum the Gaussians of every block; return a list of Float, pixels times channels.
 
-    Cost per entry of the lists: one gather of parameters, and for a block of 4x4 pixels 7
-    exponentials, 60 operations for the weights and the cutoff, and an fma per pixel and channel.
+    Cost per entry of the lists: one gather of parameters; for a block of 4x4 pixels also 7
+    exponentials, 60 operations for the weights and the cutoff, and one fma per pixel and channel.
     """
     types = types_of(packed)
     number = NUM_SHAPE_PARAMS + len(start)
@@ -90,19 +90,19 @@ def _sum_blocks(
     if image is not None:
         start = [dr.gather(types.Float, b, image) for b in start]
 
-    def contributions(p: list, steep: bool) -> list:
+    def contributions(p: list, exact_exp: bool) -> list:
         shape, color = p[:NUM_SHAPE_PARAMS], p[NUM_SHAPE_PARAMS:]
-        spread = weights(shape, blocks.x, blocks.y, blocks.size, radius, steep)
-        return [(w, c) for w in spread for c in color]
+        pixel_weights = weights(shape, blocks.x, blocks.y, blocks.size, radius, exact_exp)
+        return [(w, c) for w in pixel_weights for c in color]
 
-    def run(steep: bool, begin: UInt, end: UInt, sums: list) -> list:
+    def run(exact_exp: bool, begin: UInt, end: UInt, sums: list) -> list:
         def gather(i: UInt, source: Float) -> list:
             active = i < end
             n = gather_index(types, lists.splat, i, active)
             return unpack_parameters(source, n, number, active)
 
         def add(i: UInt, sums: list) -> tuple:
-            terms = contributions(gather(i, packed), steep)
+            terms = contributions(gather(i, packed), exact_exp)
             return i + 1, [dr.fma(w, c, s) for (w, c), s in zip(terms, sums, strict=True)]
 
         def add_tangent(i: UInt, sums: list) -> tuple:
@@ -126,8 +126,8 @@ def _sum_blocks(
 
     sums = [types.Float(b) for _ in range(blocks.pixels) for b in start]
     runs = lists.runs(blocks.begin, blocks.end)
-    for steep, begin, end in runs if tangent is None else [(True, blocks.begin, blocks.end)]:
-        sums = run(steep, begin, end, sums)
+    for exact_exp, begin, end in runs if tangent is None else [(True, blocks.begin, blocks.end)]:
+        sums = run(exact_exp, begin, end, sums)
     return sums
 
 
@@ -174,9 +174,9 @@ def residual(
 ) -> tuple[Float, list]:
     """Sum the Gaussians of every tile, and compare them with an image, in one pass over memory.
 
-    With the error ``e = I - T`` of a pixel and its curvature h, the results are ``h e``, which is
-    the derivative of ``1/2 sum h e^2`` with respect to I, and the sums of ``h e^2``. Parts of tiles
-    outside the image have the error 0.
+    With the error ``e = I - T`` and the curvature h of a pixel, the results are ``h e``, the
+    derivative of ``1/2 sum h e^2`` with respect to I, and the sums of ``h e^2``. The error is 0 in
+    the parts of tiles outside the image.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def residual(
     target : Float or None
         Image T in tile layout; None for 0.
     curvature : Float, optional
-        Factors h in tile layout, one for each pixel or for each of its channels; by default 1.
+        Factors h in tile layout, one for each pixel or for each channel of it; by default 1.
 
     Returns
     -------
@@ -229,9 +229,9 @@ def _inside(blocks: _Blocks, sizes: GridArrays) -> list:
 
 
 def sum_lanes(values: list, lists: TileLists) -> list:
-    """Add values of the lanes of `residual` for each image; return Floats of shape (images,).
+    """Add the values of the lanes of `residual` for each image; return Floats of shape (images,).
 
-    The sums run in the order of tiles, not of lanes: a sum does not depend on other images.
+    Summation is in the order of tiles, not of lanes, so that a sum does not depend on other images.
     """
     run = _blocks(types_of(values[0]), lists).run
     rows = [dr.empty(type(v), dr.width(v)) for v in values]
@@ -241,7 +241,7 @@ def sum_lanes(values: list, lists: TileLists) -> list:
 
 
 def sum_by_image(values: Float, grid: Grid) -> Float:
-    """Add values of all images, image after image; return a Float of shape (images,)."""
+    """Add the values of each image; return a Float of shape (images,)."""
     if grid.images == 1:
         return dr.sum(values)
     return dr.block_sum(values, dr.width(values) // grid.images)
@@ -253,15 +253,15 @@ def channel_sums(image: Float, channels: int, grid: Grid) -> list:
 
 
 def channel_moments(image: Float, channels: int, grid: Grid) -> tuple[list, list]:
-    """Sum the values and the squares of each channel, as `channel_sums`, in one pass."""
+    """Sum the values and the squares of each channel in one pass; see `channel_sums`."""
     values = _pixels(image, channels, grid)
     squares = sum_channels([dr.square(v) for v in values], channels)
-    found = _totals([*sum_channels(values, channels), *squares], grid)
-    return found[:channels], found[channels:]
+    totals = _totals([*sum_channels(values, channels), *squares], grid)
+    return totals[:channels], totals[channels:]
 
 
 def _totals(values: list, grid: Grid) -> list:
-    """Add values of tiles in double precision: sums over large images keep their digits."""
+    """Add values of tiles in double precision, so that sums over large images are accurate."""
     Float, Double = type(values[0]), dr.float64_array_t(type(values[0]))
     values = [Double(v) for v in values]
     dr.eval(values)  # one kernel for all

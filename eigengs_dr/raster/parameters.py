@@ -1,9 +1,9 @@
 """Gaussians in the units of the kernels, and their layout in memory.
 
 Kernels evaluate ``exp(-1/2 |F (x - mu)|^2)`` as ``2^-|s F (x - mu)|^2`` with ``s = EXP2_SCALE``,
-which saves a product for every pixel. Factors, cutoffs and covariances of footprints are therefore
-scaled by powers of s before they reach the kernels. In memory the parameters of a Gaussian are
-neighbours.
+which saves a multiplication per pixel. Factors, cutoffs and covariances of footprints are therefore
+scaled by powers of s before they reach the kernels. In memory, the parameters of a Gaussian are
+adjacent.
 """
 
 from __future__ import annotations
@@ -76,22 +76,23 @@ def kernel_covariance(covariance: list) -> list:
 
 
 def pack_parameters(values: list, before: Sequence[float] = ()) -> Float:
-    """Store the parameters of N Gaussians one Gaussian after another.
+    """Store the parameters of N Gaussians, one Gaussian after another.
 
-    On the CPU, one gather of 4 neighbours is 8 times as fast as 4 gathers. It needs aligned memory,
-    which arrays that share NumPy's memory may lack, so the parameters are always copied.
+    On the CPU, one gather of 4 adjacent values is 8 times as fast as 4 gathers. It needs aligned
+    memory. Arrays that share NumPy's memory may not be aligned, so the parameters are always
+    copied.
 
     Parameters
     ----------
     values : list of Float, shape (N,)
         One array for each parameter.
     before : sequence of float, optional
-        Parameters of a Gaussian before the first.
+        Parameters of an additional Gaussian before the first.
 
     Returns
     -------
     Float, shape (N * stride,)
-        The stride is the number of parameters, padded to 2 or a multiple of 4.
+        The stride is the number of parameters, rounded up to 2 or to a multiple of 4.
     """
     types, stride = types_of(values[0]), _stride(len(values))
     count = max(dr.width(v) for v in values)
@@ -106,17 +107,17 @@ def pack_parameters(values: list, before: Sequence[float] = ()) -> Float:
 
 
 def _stride(number: int) -> int:
-    """Return the number of values from one Gaussian to the next, which gathers in packets allow."""
+    """Return the distance of two Gaussians in memory, such that packet gathers are possible."""
     return 2 if number <= 2 else -(-number // 4) * 4
 
 
 def unpack_parameters(packed: Float, index: UInt, number: int, active: Mask = True) -> list:
-    """Gather the first `number` parameters of the Gaussians `index`; undo `pack_parameters`."""
+    """Gather the first `number` parameters of the Gaussians `index`; inverts `pack_parameters`."""
     return gather_run(types_of(packed), packed, index, _stride(number), active)[:number]
 
 
 def gather_index(types: ArrayTypes, splat: UInt, i: UInt, active: Bool) -> UInt:
-    """Return ``splat[i]``, on the CPU by the gather of a pair: 8 times as fast as a single gather.
+    """Return ``splat[i]``; on the CPU by gathering a pair, 8 times as fast as a single gather.
 
     `splat` must have an even length.
     """

@@ -15,7 +15,7 @@ from .parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
 def render_plain(values: list, background: list, lists: TileLists, cutoff: float = 3.0) -> Float:
     """Render with one lane per pixel and Dr.Jit's own derivatives.
 
-    Cost per pixel: the whole list of its tile, with one gather per parameter, and in reverse mode
+    Cost per pixel: the list of its tile, with one gather per parameter, and in reverse mode
     one atomic addition per parameter.
 
     Parameters
@@ -78,7 +78,7 @@ def render_exact(
     height: int,
     cutoff: float = np.inf,
 ) -> np.ndarray:
-    """Sum all Gaussians at all pixels in float64, without tiles and by default without a cutoff.
+    """Sum all Gaussians at all pixels in float64, without tiles, by default without a cutoff.
 
     Cost: ``N * width * height`` exponentials.
 

@@ -15,12 +15,12 @@ import numpy as np
 from ..backend.arrays import ArrayTypes, make_divisor, settle, types_of
 from ..backend.doors import door
 from ..backend.types import Float, FloatLike, Tensor, UInt, Values
-from ..gaussian.channels import show_sums, slices
+from ..gaussian.channels import display_values, slices
 from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
 from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
-from .binning.lists import TileLists, build_lists, steep_now
+from .binning.lists import TileLists, build_lists, update_exact_exp
 from .binning.tiles import TILE, Grid
 from .kernels import channel_sums, forward
 from .parameters import (
@@ -45,9 +45,9 @@ def render(
     """Render a set of Gaussians at any size.
 
     The result is differentiable with respect to mean, factor, color and background, in forward and
-    reverse mode. A set in YCbCr renders as RGB. Sets in the spaces "linear", "radiance" and "log"
-    render as linear light (`picture_of` encodes it as sRGB), and data stays as it is. Values are
-    not clamped.
+    reverse mode. A set in YCbCr is rendered as RGB, and sets in the spaces "linear", "radiance" and
+    "log" as linear light (`picture_of` encodes it as sRGB); data is not converted. Values are not
+    clamped.
 
     Parameters
     ----------
@@ -58,9 +58,9 @@ def render(
     cutoff : float, optional
         Standard deviations at which a Gaussian ends, in (0, 12]; by default the cutoff of the set.
     lists : TileLists, optional
-        What `tile_lists` returned for this set, its size and its cutoff, or for a set that it was
-        a few steps ago. The Gaussians may have shrunk since, as far as they like. By default lists
-        are made anew, which `drjit.freeze` cannot record.
+        The result of `tile_lists` for this set, size and cutoff, possibly of a few steps ago. The
+        Gaussians may have shrunk since by any factor. By default new lists are built, which
+        `drjit.freeze` cannot record.
 
     Returns
     -------
@@ -70,17 +70,17 @@ def render(
     Raises
     ------
     ValueError
-        If a side is not positive, the image is too large to index by 32 bits, the cutoff is not
-        in (0, 12], the lists are of another size, cutoff or number of Gaussians, or `drjit.freeze`
-        records without lists.
+        If a side is not positive, the image is too large for 32-bit indices, the cutoff is not in
+        (0, 12], the lists are for another size, cutoff or number of Gaussians, or `drjit.freeze`
+        is recording and no lists are given.
 
     Notes
     -----
     The order of summation depends only on the input, so renderings on one machine and backend are
-    equal bit by bit. A Gaussian is not drawn if its mean or factor is not finite. If its colour is
-    not finite, pixels of the tiles that it touches may be wrong. `drjit.freeze` cannot record
-    the construction of tile lists, which reads sizes back: make them by `tile_lists`, and give them
-    to the frozen function as an argument.
+    bit-identical. A Gaussian is not drawn if its mean or factor is not finite. If its colour is not
+    finite, pixels of the tiles that it touches may be wrong. `drjit.freeze` cannot record the
+    construction of tile lists, which copies sizes to the host: build them with `tile_lists`, and
+    pass them to the frozen function as an argument.
 
     Examples
     --------
@@ -95,11 +95,11 @@ def render(
     parameters = decode_parameters(scaled)
     if lists is not None:
         _check_lists(lists, scaled)
-        lists = steep_now(lists, dr.detach(parameters.shape), kernel_radius(scaled.cutoff))
+        lists = update_exact_exp(lists, dr.detach(parameters.shape), kernel_radius(scaled.cutoff))
     elif dr.flag(dr.JitFlag.FreezingScope):
         raise ValueError(
-            "render: drjit.freeze cannot record how tile lists are made; make them by "
-            "eigengs_dr.tile_lists before, and give them to the frozen function as an argument"
+            "render: drjit.freeze cannot record how tile lists are built; build them with "
+            "eigengs_dr.tile_lists before, and pass them to the frozen function as an argument"
         )
     else:
         lists = bin_gaussians(scaled, adjoint=dr.grad_enabled(parameters))
@@ -118,28 +118,29 @@ def tile_lists(
 ) -> TileLists:
     """List the Gaussians that each tile of a rendering needs, for `render` inside `drjit.freeze`.
 
-    Lists carry no derivatives. Within the margin, a tile that a Gaussian newly reaches is listed
-    already. Beyond it the rendering misses that Gaussian there, and so do the derivatives: make the
-    lists anew every few steps. A Gaussian may shrink by any factor: whether one has become so
-    narrow that weights need exponentials at every pixel is found on the device in each rendering.
+    Lists have no derivatives. A Gaussian that moves or grows within the margin only reaches tiles
+    that list it already. Beyond the margin, the rendering and its derivatives miss the Gaussian in
+    new tiles: rebuild the lists every few steps. A Gaussian may shrink by any factor: each
+    rendering checks on the device whether one has become so narrow that its weights need an
+    exponential at every pixel.
 
     Parameters
     ----------
     gaussians : Gaussians or Fit
     width, height, cutoff : optional
-        As for `render`, which must get the same.
+        As for `render`, which must get the same values.
     margin : float, optional
         Pixels of the rendering by which Gaussians may move or grow before lists miss a tile.
 
     Returns
     -------
     TileLists
-        A PyTree of Dr.Jit arrays. A frozen function is recorded again when their sizes change.
+        A PyTree of Dr.Jit arrays. A frozen function is recorded again if their sizes change.
 
     Raises
     ------
     ValueError
-        As for `render`; or if the margin is not finite or below 0.
+        As for `render`, or if the margin is negative or not finite.
 
     Examples
     --------
@@ -165,7 +166,7 @@ def picture_of(
     height: int | None = None,
     cutoff: float | None = None,
 ) -> Any:
-    """Render a set for display and comparison: like `render`, but linear light becomes sRGB.
+    """Render a set for display and comparison: as `render`, but with linear light encoded as sRGB.
 
     Parameters
     ----------
@@ -178,19 +179,19 @@ def picture_of(
     Returns
     -------
     ndarray, shape (height, width, C); or dict of str to ndarray
-        1 is white. Negative linear light becomes 0; other values are not clamped. A set with maps
-        has a picture of each, by its name.
+        1 is white. Negative linear light becomes 0; other values are not clamped. For a set with
+        maps, a picture of each map by name.
     """
     gaussians = set_of(gaussians)
     image = render(dr.detach(gaussians), width, height, cutoff).numpy()
     if gaussians.maps:
-        cuts = zip(gaussians.maps, slices(gaussians.maps), strict=True)
-        return {m.name: show_sums(m.space, image[..., own]) for m, own in cuts}
+        pairs = zip(gaussians.maps, slices(gaussians.maps), strict=True)
+        return {m.name: display_values(m.space, image[..., part]) for m, part in pairs}
     return to_picture(gaussians.space, image)
 
 
 def _check_rows(gaussians: Gaussians) -> None:
-    """Raise ValueError for arrays of other shapes, of which Dr.Jit says nothing plain."""
+    """Raise ValueError for arrays of wrong shapes, with a clearer message than Dr.Jit's."""
     count = len(gaussians)
     for name, rows in (("mean", 2), ("factor", 3), ("color", gaussians.channels)):
         array = getattr(gaussians, name)
@@ -202,26 +203,26 @@ def _check_rows(gaussians: Gaussians) -> None:
 
 
 def _check_lists(lists: TileLists, gaussians: Gaussians) -> None:
-    """Raise ValueError for lists of another size, number of Gaussians or cutoff."""
+    """Raise ValueError if lists are for another size, number of Gaussians or cutoff."""
     assert lists.pieces is not None
-    found = lists.grid.width, lists.grid.height, dr.width(lists.pieces.number)
-    wanted = gaussians.width, gaussians.height, len(gaussians)
-    if found != wanted:
+    listed = lists.grid.width, lists.grid.height, dr.width(lists.pieces.number)
+    expected = gaussians.width, gaussians.height, len(gaussians)
+    if listed != expected:
         raise ValueError(
-            "render: the lists are of {}x{} pixels and {} Gaussians, ".format(*found)
-            + "the rendering has {}x{} and {}; make them anew by tile_lists".format(*wanted)
+            "render: the lists are for {}x{} pixels and {} Gaussians, ".format(*listed)
+            + "the rendering has {}x{} and {}; rebuild them with tile_lists".format(*expected)
         )
     if lists.radius != kernel_radius(gaussians.cutoff):
         raise ValueError(
-            f"render: the lists are of the cutoff {lists.radius / EXP2_SCALE:g}, the rendering has "
-            f"{gaussians.cutoff:g}; make them anew by tile_lists"
+            f"render: the lists are for the cutoff {lists.radius / EXP2_SCALE:g}, the rendering "
+            f"has {gaussians.cutoff:g}; rebuild them with tile_lists"
         )
 
 
 def _at_size(
     gaussians: Gaussians, width: int | None, height: int | None, cutoff: float | None
 ) -> Gaussians:
-    """Return the set at the size and with the cutoff of a rendering."""
+    """Return a set with the size and the cutoff of a rendering."""
     width, height = _size(gaussians, width, height)
     check_index_range(width, height, gaussians.channels, TILE)
     scaled = gaussians.scaled(width, height)
@@ -246,8 +247,8 @@ def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[
 def decode_parameters(gaussians: Gaussians) -> KernelParameters:
     """Return the parameters of a set with its colours decoded to RGB; differentiable.
 
-    Decoding is affine, so the conversion of N colours and the background replaces the conversion of
-    all pixels.
+    Decoding is affine, so it suffices to convert N colours and the background instead of all
+    pixels.
     """
     black = decode(gaussians.space, [0.0] * gaussians.channels)
     color = [
@@ -272,9 +273,9 @@ def bin_gaussians(
     pad : float or Float, shape (N,), optional
         Pixels by which ellipses are enlarged, so that the lists stay valid while Gaussians move.
     growth : float, optional
-        Factor by which ellipses are enlarged, for the same reason.
+        Factor by which ellipses are enlarged, so that the lists stay valid while Gaussians grow.
     adjoint : bool, optional
-        Whether the lists serve reverse-mode differentiation too.
+        Whether the lists are used for reverse-mode differentiation too.
     images : int, optional
         Number of images of a batch, see `Grid`.
 
@@ -296,21 +297,21 @@ def bin_gaussians(
 
 
 def rasterize(parameters: KernelParameters, lists: TileLists, cutoff: float) -> Float:
-    """Sum Gaussians to an image in tile layout; the differentiable operation behind `render`.
+    """Sum Gaussians to an image in tile layout: the differentiable operation behind `render`.
 
     Parameters
     ----------
     parameters : KernelParameters
     lists : TileLists
-        Lists of these Gaussians. Padded lists stay valid while the ellipses move and grow by less
-        than the padding.
+        Lists of these Gaussians. Padded lists stay valid as long as the ellipses move and grow by
+        less than the padding.
     cutoff : float
         Standard deviations.
 
     Returns
     -------
     Float, shape (tiles * pixels * channels,)
-        In the tile layout of `eigengs_dr.raster.kernels`; `to_tensor` makes an image of it.
+        In the tile layout of `eigengs_dr.raster.kernels`; `to_tensor` converts it to an image.
     """
     values = [*parameters.shape, *parameters.color]
     return dr.custom(_Rasterize, values, parameters.background, lists, kernel_radius(cutoff))
@@ -339,9 +340,8 @@ class _Rasterize(dr.CustomOp):
 def to_tiles(types: ArrayTypes, image: Values, grid: Grid) -> Float:
     """Upload an image (height, width, channels) in tile layout; pixels outside it are 0.
 
-    The images (M, height, width, channels) of a batch follow each other. A lane gathers one value;
-    the distances in memory of rows, columns and channels are those of pixels, or of planes that
-    `numpy.moveaxis` shows as pixels.
+    The images (M, height, width, channels) of a batch follow each other. Each lane gathers one
+    value; the source holds interleaved pixels, or planes that `numpy.moveaxis` presents as pixels.
     """
     height, width, channels = image.shape[-3:]
     planes = np.moveaxis(image, -1, -3)
@@ -349,7 +349,7 @@ def to_tiles(types: ArrayTypes, image: Values, grid: Grid) -> Float:
         source, strides = planes, (width, 1, height * width)
     else:
         source, strides = np.ascontiguousarray(image), (width * channels, channels, 1)
-    # Sizes are in arrays, so that one program serves all images with as many channels.
+    # Sizes are in arrays, so that one program serves all images with this number of channels.
     limits = (dr.opaque(types.UInt, side) for side in (width, height))
     steps = (dr.opaque(types.UInt, stride) for stride in strides)
     sizes, (tile_width, tile_height) = grid.in_arrays(types), grid.tile
@@ -366,12 +366,12 @@ def to_tiles(types: ArrayTypes, image: Values, grid: Grid) -> Float:
     flat = types.Float(source.reshape(-1))
     result = dr.gather(types.Float, flat, place, inside[0] & inside[1])
     dr.eval(result)
-    dr.sync_thread()  # the source may be the caller's memory
+    dr.sync_thread()  # the source may share the caller's memory
     return result
 
 
 def pixels_inside(types: ArrayTypes, grid: Grid) -> Float:
-    """Return 1 for the pixels of images, and 0 for those of tiles outside, in tile layout."""
+    """Return 1 for pixels inside the images and 0 for overhanging pixels, in tile layout."""
     sizes = grid.in_arrays(types)
     index = dr.arange(types.UInt, grid.tiles * grid.pixels)
     column, row = sizes.first_pixel(index // grid.pixels)
@@ -400,21 +400,21 @@ def to_tensor(image: Float, grid: Grid, channels: int) -> Tensor:
 
 
 def _crop(types: ArrayTypes, rows: Float, grid: Grid, channels: int) -> Float:
-    """Cut the image out of rows of whole tiles; differentiable.
+    """Crop rows of complete tiles to the image; differentiable.
 
     Numbers are in arrays, as in `_Rows`: slices of tensors compile a program for every size.
     """
     index = dr.arange(types.UInt, grid.height * grid.width * channels)
     length = dr.opaque(types.UInt, grid.width * channels)
     over = dr.opaque(types.UInt, (grid.nx * grid.tile[0] - grid.width) * channels)
-    # The quotient of indices up to 2^32, exact in double precision.
+    # The quotient of indices below 2^32 is exact in double precision.
     Double = dr.float64_array_t(types.Float)
     row = types.UInt((Double(index) + 0.5) / Double(length))
     return dr.gather(types.Float, rows, index + row * over, mode=dr.ReduceMode.NoConflicts)
 
 
 class _Rows(dr.CustomOp):
-    """Permutation from tile layout to rows of pixels; the transpose permutes back."""
+    """Permutation from tile layout to rows of pixels; its transpose is the inverse permutation."""
 
     def eval(self, image: Float, grid: Grid, channels: int) -> Float:
         types = types_of(image)

@@ -111,7 +111,7 @@ def convert_scene(
     scene: PathLike | Record,
     output: str | os.PathLike[str],
     target_psnr: float = 40.0,
-    iterations: int = 100,
+    iterations: int = 400,
     spp: int | None = None,
     parameters: Mapping[str, str] | None = None,
     replace_all: bool = False,

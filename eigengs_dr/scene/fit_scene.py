@@ -91,7 +91,7 @@ def fit_for_scene(
     target_psnr: float = 40.0,
     space: str = "linear",
     max_gaussians: int | None = None,
-    iterations: int = 100,
+    iterations: int = 400,
     wrap_mode: str | Sequence[str] = "repeat",
     encoding: str | None = None,
 ) -> SceneFit:

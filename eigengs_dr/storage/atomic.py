@@ -1,4 +1,4 @@
-"""Files and folders that appear in one step."""
+"""Files and folders that are created or replaced in one step."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from .locks import PREFIX, hold
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Replace a file in one step: write a temporary file, then rename it to the target.
 
-    Readers see the old file or the new file, never a part of it, even after a crash. Who may read
-    and write the old file may do so with the new one.
+    Readers see the old file or the new file, never a part of it, even after a crash. The new file
+    has the permissions of the old one.
 
     Parameters
     ----------
@@ -59,12 +59,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Make a folder in one step, as `atomic_write` replaces a file.
+    """Create a folder in one step, as `atomic_write` replaces a file.
 
     Parameters
     ----------
     path : str or os.PathLike
-        The target, which is missing or an empty folder. A symbolic link is followed.
+        The target, which does not exist or is an empty folder. A symbolic link is followed.
 
     Yields
     ------
@@ -74,7 +74,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     OSError
-        If the folder cannot be made. The message names the target.
+        If the folder cannot be created. The message names the target.
     """
     target = Path(os.path.realpath(path))
     with _names(path), _temporary(target, path) as temporary:
@@ -86,15 +86,15 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete a folder in one step, with all that it holds."""
+    """Delete a folder and its contents in one step."""
     with _temporary(path, path) as temporary:
         os.replace(path, temporary)
 
 
 def remove_stale(folder: Path) -> None:
-    """Delete what killed processes left in a folder: temporary files and folders, and locks.
+    """Delete the temporary files, temporary folders and locks that killed processes left behind.
 
-    What a process still works on is locked, and stays; so does what cannot be deleted.
+    Files that a process still works on are locked, and stay; so do files that cannot be deleted.
     """
     for path in folder.glob(f"{PREFIX}*"):
         name = path.name.removesuffix(".lock")
@@ -104,7 +104,7 @@ def remove_stale(folder: Path) -> None:
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
-    """Check that `atomic_write` can write a file, before long work depends on it.
+    """Check that `atomic_write` can write a file, before a long computation.
 
     Parameters
     ----------
@@ -124,15 +124,15 @@ def require_writable(path: str | os.PathLike[str]) -> None:
 def refuse_url(path: str | os.PathLike[str]) -> None:
     """Raise OSError if a file or a folder to write is a URL.
 
-    Stores of objects rename no file in one step, and lock no folder; a result would not be written
-    whole or not at all.
+    Object stores can neither rename a file in one step nor lock a folder, so that writes would not
+    be atomic.
     """
     if isinstance(path, str) and "://" in path:
-        raise OSError(f"{path}: results cannot be written to URLs; write to a folder, and copy it")
+        raise OSError(f"{path}: results cannot be written to URLs; write to a folder and copy it")
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
-    """Follow links to a target; refuse one that must not be replaced, such as /dev/null."""
+    """Follow links to a target; reject one that must not be replaced, such as /dev/null."""
     refuse_url(path)
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
@@ -143,9 +143,9 @@ def _target(path: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def _temporary(target: Path, output: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield an unused name beside a target, and delete what has this name after the block.
+    """Yield an unused path beside a target, and delete this path after the block.
 
-    The name is locked, so that `remove_stale` knows what nobody works on any more.
+    The name is locked during the block, so that `remove_stale` skips it.
     """
     path = target.with_name(f"{PREFIX}{secrets.token_hex(8)}{target.suffix}")
     with hold(path.with_name(f"{path.name}.lock"), output), undone_at_end(partial(_delete, path)):
@@ -156,7 +156,7 @@ def _temporary(target: Path, output: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _delete(path: Path) -> None:
-    """Delete a file or a folder, if there is one and it can be deleted."""
+    """Delete a file or a folder, if it exists and can be deleted."""
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -166,11 +166,11 @@ def _delete(path: Path) -> None:
 
 @contextmanager
 def _names(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the name of a target into errors that have none, or that of a temporary file."""
+    """Put the name of a target into errors without a name or with that of a temporary file."""
     try:
         yield
     except OSError as error:
-        # That of a full disk has no name.
+        # The error of a full disk has no file name.
         name = os.path.basename(str(error.filename or ""))
         if error.errno is None or (name and not name.startswith(PREFIX)):
             raise

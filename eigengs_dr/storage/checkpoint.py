@@ -1,4 +1,4 @@
-"""Checkpoint of a training: a folder beside the model, from which a stopped run continues."""
+"""Checkpoints: a folder beside the output of a run, from which a stopped run continues."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from .settings import Settings, difference, to_json
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
 
 MAX_ENTRIES = 1 << 31
-"""Largest number of elements of one array; the components of large images need so large a limit."""
+"""Largest number of elements of one array, as the components of large images need."""
 
 
 HEAD = "run.json"
-"""Name of the file of settings and images; it is there as soon as the folder is."""
+"""Name of the file with the settings and the images; it is created together with the folder."""
 
 
 @contextmanager
 def open_checkpoint(
     output: str | os.PathLike[str], settings: Settings, files: list[str]
 ) -> Iterator[Checkpoint]:
-    """Hold the lock of an output during a block, and the folder with the work of its run.
+    """Lock an output during a block, and open the folder with the state of its run.
 
-    The folder is deleted at the end of the block. If the block raises, it stays, unless it holds no
-    work. What a run left that was killed before it kept anything, or while it deleted the folder,
-    is begun anew.
+    The folder is deleted at the end of the block. If the block raises, the folder is kept unless
+    it is empty. A folder without saved state, left by a run that was killed before its first save
+    or during the deletion, is replaced.
 
     Parameters
     ----------
@@ -74,13 +74,13 @@ def open_checkpoint(
 
 
 def _resumed(folder: Path, settings: Settings) -> Checkpoint | None:
-    """Return the checkpoint that a folder holds; delete a folder that holds none."""
+    """Return the checkpoint in a folder; delete a folder that holds none."""
     if not folder.exists():
         return None
     remove_stale(folder)
     try:
         head = json.loads((folder / HEAD).read_text(encoding="utf-8"))
-        known, files = dict(head["settings"]), [str(name) for name in head["files"]]
+        stored, files = dict(head["settings"]), [str(name) for name in head["files"]]
     except (OSError, ValueError, KeyError, TypeError):
         is_ours = folder.is_dir() and all(
             path.suffix == ".npz" or path.name == HEAD for path in folder.iterdir()
@@ -89,9 +89,9 @@ def _resumed(folder: Path, settings: Settings) -> Checkpoint | None:
             raise ValueError(f"{folder}: not a readable checkpoint; move it away") from None
         remove_folder(folder)
         return None
-    if different := difference(known, settings):
+    if changes := difference(stored, settings):
         raise ValueError(
-            f"{folder}: holds an interrupted run with {different}; use its settings, or delete "
+            f"{folder}: holds an interrupted run with {changes}; use its settings, or delete "
             "the folder"
         )
     return Checkpoint(folder, files, resumed=True)
@@ -99,7 +99,7 @@ def _resumed(folder: Path, settings: Settings) -> Checkpoint | None:
 
 @dataclass
 class Checkpoint:
-    """A folder with the named sets of arrays of one run, see `open_checkpoint`.
+    """A folder with named sets of arrays of one run, see `open_checkpoint`.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class Checkpoint:
     files : list of str
         Images of the run, in the order of its first start.
     resumed : bool
-        Whether the folder existed, so that the run continues an earlier run.
+        Whether the folder existed, so that this run continues an earlier one.
     """
 
     folder: Path
@@ -115,7 +115,7 @@ class Checkpoint:
     resumed: bool
 
     def close(self) -> None:
-        """Delete the folder if it holds no work."""
+        """Delete the folder if it holds no arrays."""
         if not self.holds_work:
             with suppress(OSError):
                 remove_folder(self.folder)

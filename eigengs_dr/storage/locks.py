@@ -1,4 +1,4 @@
-"""One writer for a file or a folder: locks that the operating system frees with the process."""
+"""Locks that give a file or a folder one writer; the operating system releases them."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from pathlib import Path
 from ..backend.ending import undone_at_end
 
 PREFIX = ".eigengs_dr-"
-"""First characters of the names of temporary files and of locks beside outputs."""
+"""Prefix of the names of temporary files and of lock files beside outputs."""
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 """Errors of file systems without locks."""
 
 WAIT, POLL = 0.3, 0.02
-"""Seconds to wait for a lock, since another run may be about to end, and between two looks."""
+"""Seconds to wait for a lock, because another run may be about to end, and between attempts."""
 
 
 @contextmanager
 def hold(path: Path, output: str | os.PathLike[str], wait: float = WAIT) -> Iterator[bool]:
-    """Hold the lock of an output during a block, by a file that is made and deleted.
+    """Hold the lock of an output during a block, by a lock file that exists during the block.
 
-    The operating system frees the lock when the process ends, however it ends. Network file systems
-    (NFS from version 4 on, Lustre with ``flock``) lock between machines too.
+    The operating system releases the lock when the process ends, however it ends. Network file
+    systems (NFS from version 4 on, Lustre with ``flock``) lock between machines too.
 
     Parameters
     ----------
     path : Path
         The lock file, in an existing folder.
     output : path-like
-        The file or the folder that the lock is of, for the error.
+        The locked file or folder, for the error message.
     wait : float, optional
-        Seconds until another holder is an error.
+        Seconds to wait while another run holds the lock.
 
     Yields
     ------
@@ -65,8 +65,8 @@ def hold(path: Path, output: str | os.PathLike[str], wait: float = WAIT) -> Iter
 
 
 def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tuple[int, bool]:
-    """Open and lock a file; write into it who holds it."""
-    from filelock import lock_descriptor  # takes 0.1 s, and the help of commands writes nothing
+    """Open and lock a file, and write the holder into it."""
+    from filelock import lock_descriptor  # takes 0.1 s, which `--help` does not need
 
     deadline = time.monotonic() + wait
     while True:
@@ -77,7 +77,7 @@ def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tup
             raise OSError(f"{os.fspath(output)}: {reason}; choose another path") from error
         try:
             locked = lock_descriptor(descriptor, blocking=False)
-            # The run before may have deleted the file between the two calls.
+            # The previous run may have deleted the file between the two calls.
             if locked and _is_file(path, descriptor):
                 os.ftruncate(descriptor, 0)
                 # Windows locks the first byte against readers.
@@ -110,7 +110,7 @@ def _is_file(path: Path, descriptor: int) -> bool:
 
 
 def lock_output(output: str | os.PathLike[str]) -> AbstractContextManager[bool]:
-    """Let one run write a file or a folder, by a hidden file beside it, during a block; see `hold`.
+    """Lock a file or a folder for one run, by a hidden file beside it; see `hold`.
 
     The output need not exist; links are followed.
     """
@@ -120,5 +120,5 @@ def lock_output(output: str | os.PathLike[str]) -> AbstractContextManager[bool]:
 
 
 def lock_folder(folder: Path) -> AbstractContextManager[bool]:
-    """Let one run write into an existing folder, by a file in it, during a block; see `hold`."""
+    """Lock an existing folder for one run, by a file in it; see `hold`."""
     return hold(folder / ".lock", folder)

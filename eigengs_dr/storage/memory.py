@@ -1,4 +1,4 @@
-"""How much memory this process may use, and how much of it one file may take."""
+"""The memory that this process may use, and the limit for the content of one file."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ from contextlib import suppress
 from pathlib import Path
 
 SETTING = "EIGENGS_DR_MAX_FILE_MB"
-"""Environment variable: megabytes that the content of one file may take in memory."""
+"""Environment variable: megabytes of memory that the content of one file may take."""
 
 ALWAYS, TIMES_FILE = 512 << 20, 100
-"""Bytes that any file may take, and how many times its own size a larger one may. A photo of 8 bits
-takes 8 times its PNG, and up to 60 times its JPEG, as floats; a TIFF of 2 MB can claim 8 GB."""
+"""Bytes of memory that any file may take, and the multiple of its size that a larger file may take.
+As floats, an 8-bit photo takes 8 times the size of its PNG and up to 60 times that of its JPEG; a
+TIFF of 2 MB can claim 8 GB."""
 
 
 MAX_DOWNLOAD = 1 << 30
-"""Bytes of a file behind a URL or of a pipe; they are copied to the disk."""
+"""Largest number of bytes of a download or of a pipe, which are copied to disk."""
 
 
 def usable_memory(root: Path = Path("/")) -> int | None:
-    """Return the bytes of memory that this process may use, or None if the system does not say.
+    """Return the bytes of memory that this process may use, or None if they are unknown.
 
-    They are those of the machine, or fewer in a container, or in a job of a batch system: Linux
-    limits the memory of a control group and of the groups that it lies in, by version 1 or 2.
+    This is the memory of the machine, or less in a container or in a job of a batch system: Linux
+    limits the memory of a control group (version 1 or 2) and of its parents.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ def usable_memory(root: Path = Path("/")) -> int | None:
 
 
 def _group_limits(root: Path) -> Iterator[int]:
-    """Yield the limits of the control groups of this process that are visible from here."""
+    """Yield the visible memory limits of the control groups of this process."""
     try:
         lines = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:
@@ -52,7 +53,7 @@ def _group_limits(root: Path) -> Iterator[int]:
         else:
             continue
         group = mount / path.lstrip("/")
-        # A container may see its own group alone, at the mount, and not the path to it.
+        # A container may only see its own group, at the mount point.
         for folder in [group, *group.parents]:
             with suppress(OSError, ValueError):  # no such file, or "max"
                 yield int((folder / name).read_text())
@@ -61,20 +62,20 @@ def _group_limits(root: Path) -> Iterator[int]:
 
 
 def check_content(path: str | os.PathLike[str], needed: int) -> None:
-    """Check that the content of a file may be read, before any of it is allocated.
+    """Check that the content of a file fits into memory, before any of it is allocated.
 
     Parameters
     ----------
     path : path-like
         The file.
     needed : int
-        Bytes that its content takes in memory; of an image, those of its pixels as floats.
+        Bytes that its content takes in memory; for an image, those of its pixels as floats.
 
     Raises
     ------
     ValueError
-        If that is more than `ALWAYS` and `TIMES_FILE` times the size of the file, or more than half
-        of `usable_memory`. One line names the variable that raises the limit.
+        If that is more than `ALWAYS` and more than `TIMES_FILE` times the size of the file, or
+        more than half of `usable_memory`. One line names the variable that raises the limit.
     """
     limit = _setting()
     if limit is None:
@@ -88,11 +89,11 @@ def check_content(path: str | os.PathLike[str], needed: int) -> None:
 
 
 def download_limit() -> int:
-    """Return the bytes that a download or a pipe may have: as `SETTING` says, or `MAX_DOWNLOAD`."""
+    """Return the largest size of a download or a pipe in bytes: `SETTING`, or `MAX_DOWNLOAD`."""
     return _setting() or MAX_DOWNLOAD
 
 
 def _setting() -> int | None:
-    """Return the bytes that the environment variable says."""
+    """Return the value of the environment variable in bytes, or None."""
     text = os.environ.get(SETTING, "")
     return int(text) << 20 if text.isdecimal() else None

@@ -1,4 +1,4 @@
-"""Files of arrays: ``.npz`` without pickle; headers are checked before arrays are read."""
+"""Array files, ``.npz`` without pickle; headers are checked before arrays are read."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_ENTRIES = 1 << 26
 
 
 class BadValue(ValueError):
-    """A value in a file is wrong; callers put the name of the file before the message."""
+    """A value in a file is invalid; callers put the name of the file before the message."""
 
 
 class Field(NamedTuple):
@@ -34,13 +34,13 @@ class Field(NamedTuple):
         NumPy type, such as "f4", "i8" or "U" for text.
     ndim : int
         Number of dimensions.
-    most : int
+    max_count : int
         Largest number of elements.
     """
 
     kind: str
     ndim: int
-    most: int = MAX_ENTRIES
+    max_count: int = MAX_ENTRIES
 
 
 def write(
@@ -60,7 +60,7 @@ def write(
     version : int
     arrays : dict of str to ndarray
     compressed : bool, optional
-        Large arrays of single-precision numbers hardly shrink and take long to compress.
+        Whether to compress. Large single-precision arrays shrink little and take long.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def write(
 
 
 def read(path: str | os.PathLike[str], name: str, version: int, layout: dict[str, Field]) -> Arrays:
-    """Read the arrays of `layout` from a file that `write` wrote; the file may be hostile.
+    """Read the arrays of `layout` from a file that `write` wrote; the file need not be trusted.
 
     Parameters
     ----------
@@ -92,9 +92,9 @@ def read(path: str | os.PathLike[str], name: str, version: int, layout: dict[str
     Raises
     ------
     ValueError
-        If the file is no such archive, is truncated, or has another format or a newer version; if
-        an array is missing, has another type or is too large. One line names the file, the key and
-        the expected value.
+        If the file is not such an archive, is truncated, or has another format or a newer version;
+        if an array is missing, has another type or is too large. One line names the file, the key
+        and the expected value.
     OSError
         If the file cannot be opened.
     """
@@ -119,29 +119,29 @@ def format_of(path: str | os.PathLike[str]) -> str:
 def read_shapes(
     path: str | os.PathLike[str], name: str, version: int, layout: dict[str, Field]
 ) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the arrays of `layout` by their headers alone.
+    """Return the shapes of the arrays of `layout` from their headers alone.
 
-    For parameters and errors see `read`. A damaged array is not noticed.
+    For parameters and errors see `read`. Damaged array data goes unnoticed.
     """
     with _opened(path, name, version) as archive:
         return {key: _checked_shape(archive, key, field) for key, field in layout.items()}
 
 
 def sizes_of(path: str | os.PathLike[str]) -> dict[str, int]:
-    """Return the bytes that each array takes in a file, by its name; errors as for `read`."""
+    """Return the size of each array in a file in bytes, by name; errors as for `read`."""
     with _opened(path) as archive:
         return {e.filename.removesuffix(".npy"): e.compress_size for e in archive.infolist()}
 
 
 COPIES = 2
-"""Copies of what a file holds, in memory: NumPy's and Dr.Jit's."""
+"""Number of copies of the content of a file in memory: NumPy's and Dr.Jit's."""
 
 
 @contextmanager
 def _opened(
     path: str | os.PathLike[str], name: str = "eigengs_dr", version: int | None = None
 ) -> Iterator[zipfile.ZipFile]:
-    """Open a file, of a format up to a version; turn every error in the block into one line."""
+    """Open a file of a format, up to a version; turn every error in the block into one line."""
     with open(path, "rb") as file:
         try:
             with zipfile.ZipFile(file) as archive:
@@ -152,7 +152,7 @@ def _opened(
             raise ValueError(f"{path}: {error}") from None
         except MemoryError:
             raise ValueError(
-                f"{path}: needs more memory than there is; if it is not so large, it is damaged"
+                f"{path}: needs more memory than there is; if it should be small, it is damaged"
             ) from None
         except Exception as error:  # zlib, lzma, zipfile and NumPy raise many types
             raise ValueError(
@@ -163,9 +163,9 @@ def _opened(
 
 def _check_format(archive: zipfile.ZipFile, name: str, version: int) -> None:
     """Raise `BadValue` for another format or a newer version."""
-    found = str(_read_array(archive, "format", Field("U", 0)))
-    if found != name:
-        raise BadValue(f"format is {found[:40]!r}, expected {name!r}")
+    stored = str(_read_array(archive, "format", Field("U", 0)))
+    if stored != name:
+        raise BadValue(f"format is {stored[:40]!r}, expected {name!r}")
     number = int(_read_array(archive, "version", Field("i8", 0)))
     if not 1 <= number <= version:
         raise BadValue(
@@ -180,11 +180,11 @@ def _read_array(archive: zipfile.ZipFile, key: str, field: Field) -> Values:
         try:
             return np.asarray(npy.read_array(file, allow_pickle=False))
         except ValueError:
-            raise BadValue(f"key '{key}' is cut off") from None
+            raise BadValue(f"key '{key}' is truncated") from None
 
 
 def _checked_shape(archive: zipfile.ZipFile, key: str, field: Field) -> tuple[int, ...]:
-    """Return the shape of one array; check it and the type by the header."""
+    """Return the shape of one array, after checking shape and type in its header."""
     try:
         entry = archive.getinfo(f"{key}.npy")
     except KeyError:
@@ -204,8 +204,8 @@ def _checked_shape(archive: zipfile.ZipFile, key: str, field: Field) -> tuple[in
     if min(shape, default=0) < 0:
         raise BadValue(f"key '{key}' has the negative shape {shape}")
     if dtype.kind == "U" and dtype.itemsize > 4 * 64:
-        raise BadValue(f"key '{key}' is a text of over 64 characters")
+        raise BadValue(f"key '{key}' is longer than 64 characters")
     count = math.prod(shape)
-    if count > field.most or count * dtype.itemsize > entry.file_size:
+    if count > field.max_count or count * dtype.itemsize > entry.file_size:
         raise BadValue(f"key '{key}' claims shape {shape}, more than the file holds")
     return shape

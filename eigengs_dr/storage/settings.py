@@ -1,4 +1,4 @@
-"""The options on which a result depends, as files keep them for runs that go on."""
+"""The options on which a result depends, as files store them for runs that are continued."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ Settings = Record
 
 
 def to_json(settings: Settings) -> Settings:
-    """Return settings as JSON holds them: it has no tuples, and no numbers of NumPy."""
+    """Return settings as JSON stores them: without tuples and NumPy numbers."""
     plain: Settings = json.loads(json.dumps(settings, default=lambda number: number.item()))
     return plain
 
 
-def difference(known: Settings, settings: Settings) -> str:
-    """Say which settings differ, as in "gaussians 500 instead of 900"; nothing if none does.
+def difference(stored: Settings, settings: Settings) -> str:
+    """Describe settings that differ, as in "gaussians 500 instead of 900"; empty if none does.
 
-    Settings that one of both lacks, since another version wrote the file, do not differ.
+    Settings that only one of the two has, because another version wrote the file, are ignored.
     """
-    both = [key for key in settings if key in known and known[key] != settings[key]]
-    return ", ".join(f"{key} {known[key]} instead of {settings[key]}" for key in both)
+    changed = [key for key in settings if key in stored and stored[key] != settings[key]]
+    return ", ".join(f"{key} {stored[key]} instead of {settings[key]}" for key in changed)

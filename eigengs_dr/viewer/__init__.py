@@ -1,6 +1,6 @@
-"""What people look at: pages for the browser, pictures, and what a notebook shows.
+"""Display: pages for the browser, pictures, and HTML for notebooks.
 
-- ``view``: a page of a set, a fit or a model; the folder ``web/`` has its template and programs
+- ``view``: the page of a set, a fit or a model; the folder ``web/`` has its template and scripts
 - ``pictures``: outlines of Gaussians, components of a model or a basis, and the photo in a page
-- ``notebook``: what Jupyter shows of sets, fits, bases and models
+- ``notebook``: HTML of sets, fits, bases and models for Jupyter
 """

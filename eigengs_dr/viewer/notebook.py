@@ -1,4 +1,4 @@
-"""What Jupyter shows of sets, fits, bases and models: pictures and a line of figures."""
+"""HTML of sets, fits, bases and models for Jupyter: pictures and a line of figures."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from ..raster.render import picture_of
 from .pictures import first_components, photo_uri, within
 from .view import MAX_GAUSSIANS
 
-MAX_SHOWN_SIDE = 480
-"""Longest side of the picture of a set, in pixels. Smaller sets are shown at their size."""
+MAX_PICTURE_SIDE = 480
+"""Largest side of the picture of a set, in pixels. Smaller sets are shown at their native size."""
 
-THUMBNAIL = 120
+THUMBNAIL_WIDTH = 120
 """Width of a component, in pixels."""
 
 
@@ -32,16 +32,16 @@ def to_html(value: object) -> str:
 
 @to_html.register
 def _show_set(gaussians: Gaussians) -> str:
-    if len(gaussians) > MAX_GAUSSIANS:  # drawing them takes seconds
+    if len(gaussians) > MAX_GAUSSIANS:  # rendering would take seconds
         return _block(repr(gaussians))
     size = gaussians.width, gaussians.height
-    shown = picture_of(gaussians, *within(min(MAX_SHOWN_SIDE, max(size)), *size))
-    return _block(repr(gaussians), *_images(shown))
+    picture = picture_of(gaussians, *within(min(MAX_PICTURE_SIDE, max(size)), *size))
+    return _block(repr(gaussians), *_images(picture))
 
 
 @to_html.register
 def _show_fit(fit: Fit) -> str:
-    step = -(-max(fit.gaussians.width, fit.gaussians.height) // MAX_SHOWN_SIDE)
+    step = -(-max(fit.gaussians.width, fit.gaussians.height) // MAX_PICTURE_SIDE)
     if isinstance(fit.image, Mapping):
         small = {name: image[::step, ::step] for name, image in fit.image.items()}
         return _block(repr(fit), *_images(small))
@@ -51,25 +51,22 @@ def _show_fit(fit: Fit) -> str:
 @to_html.register(Eigenbasis)
 @to_html.register(EigenGS)
 def _show_components(source: EigenGS | Eigenbasis) -> str:
-    return _block(repr(source), *_images(dict(first_components(source)), THUMBNAIL))
+    return _block(repr(source), *_images(dict(first_components(source)), THUMBNAIL_WIDTH))
 
 
 def _images(
-    pictures: NDArray[np.float32] | Mapping[str, NDArray[np.float32]], most: int = MAX_SHOWN_SIDE
+    pictures: NDArray[np.float32] | Mapping[str, NDArray[np.float32]],
+    max_width: int = MAX_PICTURE_SIDE,
 ) -> list[str]:
-    """Return a picture, or pictures with their names, as HTML.
-
-    Of data with 2 or more than 3 channels, the first is shown.
-    """
+    """Return a picture, or pictures with their names, as HTML."""
     if isinstance(pictures, Mapping):
         return [
-            f'<figure style="margin: 0; text-align: center">{_images(picture, most)[0]}'
+            f'<figure style="margin: 0; text-align: center">{_images(picture, max_width)[0]}'
             f"<figcaption>{escape(name)}</figcaption></figure>"
             for name, picture in pictures.items()
         ]
-    shown = pictures if pictures.shape[2] in (1, 3) else pictures[..., :1]
-    style = f"max-width: min(100%, {most}px)"
-    return [f'<img src="{photo_uri(np.asarray(shown, np.float32))}" style="{style}" alt="">']
+    style = f"max-width: min(100%, {max_width}px)"
+    return [f'<img src="{photo_uri(np.asarray(pictures, np.float32))}" style="{style}" alt="">']
 
 
 def _block(text: str, *parts: str) -> str:

@@ -19,21 +19,21 @@ from ..image.resize import resample
 from ..image.sheet import join_pictures, text_line
 from ..raster.render import render
 
-OUTLINES = 800
+ELLIPSES_SIDE = 800
 """Longer side of a picture of ellipses, in pixels."""
 
 MAX_OUTLINES = 2000
-"""Most outlines over a picture; more of them hide each other."""
+"""Largest number of outlines over a picture; more would hide each other."""
 
 MIN_SIDE = 512
-"""Shortest longer side of a picture under outlines, in pixels; smaller pictures are enlarged."""
+"""Smallest longer side of a picture under outlines, in pixels; smaller pictures are enlarged."""
 
-LIGHTER = 0.6
-"""Share of white that lightens a picture under outlines."""
+WHITE_SHARE = 0.6
+"""Share of white that is blended into a picture under outlines."""
 
 MAX_REACH = 100
-"""Farthest reach of an outline to draw, in longer sides of the picture. A longer outline would
-look straight, and Pillow takes no larger coordinates."""
+"""Largest extent of a drawn outline, in longer sides of the picture. A longer outline would look
+straight, and Pillow does not accept larger coordinates."""
 
 LOW_COLOR, HIGH_COLOR = (214, 96, 20), (30, 90, 160)
 """Colours of outlines: orange for the Gaussians of low frequencies, blue for all others."""
@@ -49,15 +49,15 @@ def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
     ----------
     gaussians : Gaussians
     low : int, optional
-        Number of Gaussians of low frequencies. These first Gaussians are orange and on top, all
-        others are blue.
+        Number of Gaussians of low frequencies. These first Gaussians are orange and drawn on top;
+        all others are blue.
 
     Returns
     -------
     ndarray of float, shape (H, W, 3)
         RGB on white; the longer side has 800 pixels.
     """
-    width, height = within(OUTLINES, gaussians.width, gaussians.height)
+    width, height = within(ELLIPSES_SIDE, gaussians.width, gaussians.height)
     colors = [LOW_COLOR] * low + [HIGH_COLOR] * (len(gaussians) - low)
     return _outlined(np.ones((height, width, 3)), gaussians, colors)
 
@@ -65,7 +65,7 @@ def ellipses(gaussians: Gaussians, low: int = 0) -> Picture:
 def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     """Draw the outlines of Gaussians at one standard deviation over a lightened picture.
 
-    The function draws at most 2,000 Gaussians. It picks them at random, with a fixed seed.
+    At most 2,000 Gaussians are drawn, which are selected at random with a fixed seed.
 
     Parameters
     ----------
@@ -79,22 +79,22 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     ndarray of float, shape (H, W, 3)
         RGB.
     """
-    # Regular picks would draw stripes if the Gaussians lie on a grid.
-    picks = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
-    under = LIGHTER + (1 - LIGHTER) * np.clip(picture, 0, 1)
-    subset = gaussians[picks]
-    return _outlined(under, subset, [HIGH_COLOR] * len(subset))
+    # A regular selection would show stripes if the Gaussians lie on a grid.
+    selection = np.random.default_rng(0).permutation(len(gaussians))[:MAX_OUTLINES]
+    light = WHITE_SHARE + (1 - WHITE_SHARE) * np.clip(picture, 0, 1)
+    subset = gaussians[selection]
+    return _outlined(light, subset, [HIGH_COLOR] * len(subset))
 
 
 def displayed(image: ArrayLike, space: str, encoding: str | None = None) -> NDArray[np.float32]:
-    """Return an image as people look at it, for sets of a space: sRGB, or data."""
+    """Return an image as display values, for sets of a space: sRGB, or data."""
     if rendered_as(space) is None:
         return check_data(image, copy=False)
     return check_image(image, copy=False, encoding=encoding)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
-    """Put an image, its fit, and the fit under outlines of its Gaussians side by side.
+    """Put an image, its fit, and the outlines of the Gaussians over the fit side by side.
 
     Parameters
     ----------
@@ -106,8 +106,8 @@ def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Pictur
     Returns
     -------
     ndarray of float, shape (k * H, 3 * k * W, 3)
-        RGB. Every pixel is repeated k times along both axes; k is the smallest number that gives
-        each part a longer side of at least 512 pixels.
+        RGB. Every pixel is repeated k times along both axes; k is the smallest number for which the
+        longer side of each part has at least 512 pixels.
     """
     times = -(-MIN_SIDE // max(image.shape[:2]))
     shape = (*image.shape[:2], 3)
@@ -121,19 +121,19 @@ def _outlined(picture: Picture, gaussians: Gaussians, colors: list[Color]) -> Pi
     from PIL import Image, ImageDraw
 
     height, width = picture.shape[:2]
-    # Lines of Pillow have jagged edges; at twice the size, averaging smooths them.
-    under = np.broadcast_to(to_8bit(picture), (height, width, 3)).astype(np.uint8)
-    image = Image.fromarray(under.repeat(2, axis=0).repeat(2, axis=1))
+    # Pillow's lines are not antialiased; drawing at twice the size and averaging smooths them.
+    pixels = np.broadcast_to(to_8bit(picture), (height, width, 3)).astype(np.uint8)
+    image = Image.fromarray(pixels.repeat(2, axis=0).repeat(2, axis=1))
     draw = ImageDraw.Draw(image)
     arrays = gaussians.scaled(2 * width, 2 * height).to_arrays()
     points = outline(arrays["factor"]) + arrays["mean"].astype(np.float64)[:, None]
-    for n in reversed(np.flatnonzero(_in_sight(points, image.size))):
+    for n in reversed(np.flatnonzero(_is_visible(points, image.size))):
         draw.line(points[n].ravel().tolist(), fill=colors[n], width=2)
     return np.asarray(image.resize((width, height), Image.Resampling.BOX), np.float32) / 255
 
 
-def _in_sight(points: Picture, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Tell which outlines may cross a picture and are small enough for Pillow."""
+def _is_visible(points: Picture, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return which outlines may cross a picture and are small enough for Pillow."""
     low, high = points.min(axis=1), points.max(axis=1)
     longest = MAX_REACH * max(size)
     near = (low > -longest) & (high < longest)
@@ -146,17 +146,17 @@ def within(longest: int, width: int, height: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-FIRST = (1, 2, 3, 5, 10, 20, 50, 100, 200)
-"""Numbers of the components to show of the first channel, counted from 1."""
+FIRST_CHANNEL_COMPONENTS = (1, 2, 3, 5, 10, 20, 50, 100, 200)
+"""Components of the first channel that are shown, counted from 1."""
 
-OTHERS = (1, 2)
-"""Numbers of the components to show of the other channels."""
+OTHER_CHANNEL_COMPONENTS = (1, 2)
+"""Components of the other channels that are shown, counted from 1."""
 
-CELL = 240
+CELL_SIDE = 240
 """Longer side of a component in a sheet, in pixels."""
 
-COLUMNS = 7
-"""Pictures side by side in a sheet."""
+SHEET_COLUMNS = 7
+"""Number of pictures side by side in a sheet."""
 
 
 def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
@@ -166,24 +166,24 @@ def component_sheet(model: EigenGS, basis: Eigenbasis | None = None) -> Picture:
     ----------
     model : EigenGS
     basis : Eigenbasis, optional
-        The basis that the model was fitted to. The sheet shows its components above the rendered
-        ones.
+        The basis to which the model was fitted. Its components are shown above the rendered ones.
 
     Returns
     -------
     ndarray of float, shape (H, W, 3)
-        RGB, not clamped, under 2,000 pixels wide.
+        RGB, not clamped, less than 2,000 pixels wide.
     """
     sources: list[EigenGS | Eigenbasis] = [model] if basis is None else [basis, model]
     columns = zip(*(first_components(source) for source in sources), strict=True)
     cells = [_captioned(column[0][0], *(picture for _, picture in column)) for column in columns]
-    tables = [join_pictures(cells[k : k + COLUMNS], 1) for k in range(0, len(cells), COLUMNS)]
+    starts = range(0, len(cells), SHEET_COLUMNS)
+    rows = [join_pictures(cells[k : k + SHEET_COLUMNS], 1) for k in starts]
     outlines = _captioned("standard deviations", ellipses(model.gaussians, model.low))
-    return join_pictures([*tables, outlines], 0)
+    return join_pictures([*rows, outlines], 0)
 
 
 def first_components(source: EigenGS | Eigenbasis) -> list[tuple[str, Picture]]:
-    """Draw the mean image and some components of a basis, or as the Gaussians of a model show them.
+    """Return pictures of the mean image and some components of a basis, or as rendered by a model.
 
     Components are signed, so mid-grey is zero. A component of a colour difference has the two
     colours of that difference.
@@ -195,35 +195,35 @@ def first_components(source: EigenGS | Eigenbasis) -> list[tuple[str, Picture]]:
     Returns
     -------
     list of (str, ndarray of float, shape (H, W, 3))
-        Names and pictures in RGB, not clamped; the longer side has `CELL` pixels.
+        Names and pictures in RGB, not clamped; the longer side has `CELL_SIDE` pixels.
     """
     if isinstance(source, EigenGS):
         space, counts = source.gaussians.space, source.components
-        mean, picks = render(source.gaussians).numpy(), _picks(counts)
+        mean, selection = render(source.gaussians).numpy(), _selected(counts)
         planes: Picture = np.zeros(0)
-        if picks:  # there are at most 13, so one program renders all
-            weights = np.stack([source.weights[channel][j] for channel, j in picks], axis=1)
+        if selection:  # there are at most 13, so one program renders all
+            weights = np.stack([source.weights[channel][j] for channel, j in selection], axis=1)
             rendered = render(with_colors(source.gaussians, weights, "data")).numpy()
             planes = np.moveaxis(rendered, 2, 0)
     else:
         space, counts = source.space, tuple(map(len, source.components))
-        mean, picks = np.stack(decode(space, list(source.mean)), axis=2), _picks(counts)
-        planes = np.array([source.components[channel][j] for channel, j in picks])
-    shown = [("mean", _cell(mean))]
-    for (channel, j), plane in zip(picks, planes, strict=True):
-        # A quantile, because one bright pixel must not make everything else grey.
+        mean, selection = np.stack(decode(space, list(source.mean)), axis=2), _selected(counts)
+        planes = np.array([source.components[channel][j] for channel, j in selection])
+    named = [("mean", _cell(mean))]
+    for (channel, j), plane in zip(selection, planes, strict=True):
+        # A quantile, so that one bright pixel does not make everything else grey.
         scale = 0.5 / (np.quantile(np.abs(plane), 0.999) or 1)
         picture = _cell(0.5 + scale * plane[..., None] * _hue(space, channel))
-        shown.append((f"{CHANNELS[space][channel]} {j + 1}", picture))
-    return shown
+        named.append((f"{CHANNELS[space][channel]} {j + 1}", picture))
+    return named
 
 
-def _picks(components: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Return the channels and indices of the components to show."""
+def _selected(components: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Return the channels and indices of the components that are shown."""
     return [
         (channel, number - 1)
         for channel, count in enumerate(components)
-        for number in (OTHERS if channel else FIRST)
+        for number in (OTHER_CHANNEL_COMPONENTS if channel else FIRST_CHANNEL_COMPONENTS)
         if number <= count
     ]
 
@@ -235,8 +235,8 @@ def _hue(space: str, channel: int) -> NDArray[np.float32]:
 
 
 def _cell(picture: Picture) -> Picture:
-    """Resize a picture for a sheet."""
-    width, height = within(CELL, picture.shape[1], picture.shape[0])
+    """Resize a picture to the size of a cell of a sheet."""
+    width, height = within(CELL_SIDE, picture.shape[1], picture.shape[0])
     return resample(picture.astype(np.float32), width, height)
 
 
@@ -246,38 +246,39 @@ def _captioned(text: str, *pictures: Picture) -> Picture:
 
 
 MAX_PHOTO_SIDE = 2048
-"""Longest side of a photo in a page, in pixels; larger photos are scaled down."""
+"""Largest side of a photo in a page, in pixels; larger photos are scaled down."""
 
-QUALITY = 92
-"""Quality of JPEG."""
+JPEG_QUALITY = 92
+"""Quality of photos in JPEG, from 0 to 100."""
 
 
 def check_aspect(pixels: Picture, size: tuple[int, int]) -> None:
-    """Raise ValueError unless a photo has the width and height of a set as its aspect ratio."""
+    """Raise ValueError unless a photo has the aspect ratio of a set, (width, height)."""
     height, width = pixels.shape[:2]
     if abs(width * size[1] - height * size[0]) > max(*size, width, height):
         raise ValueError(
             f"the photo has {width}x{height} pixels, the set {size[0]}x{size[1]}; "
-            "give the photo that it was fitted to"
+            "give the photo to which the set was fitted"
         )
 
 
 def photo_uri(pixels: NDArray[np.float32]) -> str:
-    """Return a link that holds a photo, as JPEG, or as PNG if that is smaller.
+    """Return a data URI of a photo, as JPEG, or as PNG if that is smaller.
 
     Parameters
     ----------
-    pixels : ndarray of float32, shape (H, W, 3) or (H, W, 1)
-        sRGB or data; clamped.
+    pixels : ndarray of float32, shape (H, W, C)
+        sRGB or data; clamped. Of data with 2 or more than 3 channels, the first is shown.
     """
     from PIL import Image
 
-    height, width = pixels.shape[:2]
+    height, width, channels = pixels.shape
+    pixels = pixels if channels == 3 else pixels[..., :1]
     small = resample(pixels, *within(min(MAX_PHOTO_SIDE, max(width, height)), width, height))
     codes = to_8bit(small).astype(np.uint8)
     picture = Image.fromarray(codes[..., 0] if codes.shape[2] == 1 else codes)
     jpeg, png = BytesIO(), BytesIO()
-    picture.save(jpeg, "jpeg", quality=QUALITY, subsampling=0)
+    picture.save(jpeg, "jpeg", quality=JPEG_QUALITY, subsampling=0)
     picture.save(png, "png", optimize=True)
-    kind, file = min(("jpeg", jpeg), ("png", png), key=lambda found: found[1].tell())
+    kind, file = min(("jpeg", jpeg), ("png", png), key=lambda candidate: candidate[1].tell())
     return f"data:image/{kind};base64,{b64encode(file.getvalue()).decode()}"

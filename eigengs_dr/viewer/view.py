@@ -1,6 +1,6 @@
 """The function `view`, which makes a page of a set, a fit or a model.
 
-A page is one HTML file that needs no other file and no network.
+A page is one HTML file that needs neither other files nor a network.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from .pictures import check_aspect, displayed, photo_uri
 class Page:
     """A page for the browser that shows a set or a model.
 
-    Jupyter shows it as the value of a cell. It needs WebGL 2, which browsers have since 2021, and
-    no network.
+    Jupyter shows it as the value of a cell. It needs WebGL 2, which browsers have supported since
+    2021, but no network.
 
     Attributes
     ----------
     html : str
-        The whole page.
+        The complete page.
     """
 
     html: str
@@ -46,7 +46,7 @@ class Page:
         return f"Page({len(self.html):,} bytes)"
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the page as an ``.html`` file, completely or not at all.
+        """Write the page atomically as an ``.html`` file.
 
         Raises
         ------
@@ -61,14 +61,14 @@ class Page:
             temporary.write_text(self.html, encoding="utf-8")
 
     def _repr_html_(self) -> str:
-        """Show the page in a frame of its own, so that neither page styles the other."""
+        """Return the page in a frame, so that styles do not mix."""
         style = "width: 100%; height: 560px; border: 1px solid #8886"
         return f'<iframe srcdoc="{escape(self.html)}" style="{style}"></iframe>'
 
 
 @cache  # compiled once
 def _template() -> jinja2.Template:
-    """Return the template of a page; an unknown value is an error, and text is escaped."""
+    """Return the template of a page; undefined values are errors, and text is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("eigengs_dr.viewer", "web"),
         autoescape=True,
@@ -86,36 +86,36 @@ def view(
     title: str = "Gaussians",
     encoding: str | None = None,
 ) -> Page:
-    """Make a page for the browser that draws a set or a model as `render` does.
+    """Make a page for the browser that renders a set or a model as `render` does.
 
-    The page pans and zooms without end, and shows outlines, the first Gaussians alone, and the
-    parameters of the one under the pointer. For a model it has sliders for the first components of
-    each channel, and draws random images.
+    The page pans and zooms without limits, and can show outlines, only the first Gaussians, and the
+    parameters of the Gaussian under the pointer. For a model it has sliders for the first
+    components of each channel, and draws random images.
 
     Parameters
     ----------
     source : Gaussians, Fit or EigenGS
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
-        The photo, to compare with. A model encodes it, so that the sliders move it.
+        A photo to compare with. A model encodes it, so that the sliders start from it.
     levels : sequence of int, optional
-        Numbers of first Gaussians that make a whole image each, as from `level_counts`.
+        Number of Gaussians up to each level, as from `level_counts`.
     title : str, optional
         Title of the page.
     encoding : {"srgb", "linear"}, optional
-        What the pixels of the image are, see `fit`.
+        The encoding of the pixels of the image, see `fit`.
 
     Returns
     -------
     Page
-        Save it by ``page.save("page.html")``; a notebook shows it.
+        Save it with ``page.save("page.html")``; a notebook displays it.
 
     Raises
     ------
     ValueError
-        If the set has more than a million Gaussians, a value is not finite, the image has another
-        aspect ratio than the set, or a fit has a mean image of pixels.
+        If the set has more than a million Gaussians, a value is not finite, the aspect ratios of
+        the image and the set differ, or a fit has a mean image of pixels.
     TypeError
-        If the source is something else.
+        If the source has another type.
 
     Examples
     --------
@@ -129,27 +129,27 @@ def view(
         raise TypeError(
             f"{type(source).__name__} cannot be shown; expected Gaussians, Fit or EigenGS"
         )
-    whole = source if isinstance(source, EigenGS) else None
-    gaussians = one_image(set_of(source)) if whole is None else whole.gaussians
+    model = source if isinstance(source, EigenGS) else None
+    gaussians = one_image(set_of(source)) if model is None else model.gaussians
     pixels = None if image is None else displayed(image, gaussians.space, encoding)
-    model = None if whole is None else describe_model(whole, pixels)
-    if pixels is not None and whole is not None:
+    model_facts = None if model is None else describe_model(model, pixels)
+    if pixels is not None and model is not None:
         gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
     elif pixels is not None:
         check_aspect(pixels, (gaussians.width, gaussians.height))
     views = channel_views(gaussians.channels)
     facts = {
         "set": describe_set(gaussians, levels),
-        "light": LIGHTS.get(gaussians.space, 0),
+        "light": SUM_KINDS.get(gaussians.space, 0),
         "channels": views[0][1],
         "photo": None if pixels is None else photo_uri(pixels),
-        "model": model,
+        "model": model_facts,
     }
     html = _template().render(
         title=title,
         summary=f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels",
         facts=facts,
-        model_note="" if whole is None else describe_share(whole),
+        model_note="" if model is None else describe_share(model),
         views=views,
         bright=gaussians.space in UNBOUNDED,
         color_name="Colour" if rendered_as(gaussians.space) else "Values",
@@ -157,17 +157,17 @@ def view(
     return Page(html)
 
 
-# --- What a page knows of a set and of a model: arrays in base64, with colours decoded to RGB -----
+# --- The data of a page: arrays in base64, with colours decoded to RGB ----------------------------
 
 MAX_GAUSSIANS = 1 << 20
-"""Most Gaussians of a page; those of a photo take 43 bytes each."""
+"""Largest number of Gaussians of a page; those of a photo take 43 bytes each."""
 
 
 def check_count(count: int) -> None:
-    """Raise ValueError if a page cannot show so many Gaussians."""
+    """Raise ValueError if there are too many Gaussians for a page."""
     if count > MAX_GAUSSIANS:
         raise ValueError(
-            f"{count:,} Gaussians are too many for a page; the most is {MAX_GAUSSIANS:,}"
+            f"{count:,} Gaussians are too many for a page; the limit is {MAX_GAUSSIANS:,}"
         )
 
 
@@ -178,12 +178,12 @@ def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> Record:
     ----------
     gaussians : Gaussians
     levels : sequence of int, optional
-        Numbers of first Gaussians that make a whole image each, ascending.
+        Number of Gaussians up to each level, ascending.
 
     Raises
     ------
     ValueError
-        If the set has too many Gaussians or values that are not valid, or a level is out of range.
+        If the set has too many Gaussians or invalid values, or a level is out of range.
     """
     check_count(len(gaussians))
     data = gaussians.data()
@@ -218,12 +218,13 @@ def to_text(array: NDArray[np.floating], kind: str = "<f4") -> str:
     return b64encode(np.ascontiguousarray(array, kind).tobytes()).decode()
 
 
-LIGHTS = {"linear": 1, "radiance": 1, "log": 2, "normal": 3}
-"""What sums are, by space: 1 linear light, 2 logarithms of light, 3 normals; 0 codes and data."""
+SUM_KINDS = {"linear": 1, "radiance": 1, "log": 2, "normal": 3}
+"""Kind of the sums of Gaussians by space: 1 is linear light, 2 logarithms of light, 3 normals;
+other spaces have 0, codes or data."""
 
 
 def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:
-    """Return names and triples of channels to look at.
+    """Return the names and the triples of channels that a page can show.
 
     Examples
     --------
@@ -236,17 +237,17 @@ def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:
     return [*([("1, 2, 3 as red, green, blue", (0, 1, 2))] if channels > 3 else []), *single]
 
 
-MAX_BYTES = 1 << 20
-"""Most bytes of weights in a page, before base64; each takes 2."""
+MAX_WEIGHT_BYTES = 1 << 20
+"""Largest size of the weights in a page in bytes, before base64; a weight takes 2."""
 
-FEWEST = 8
-"""Components of each channel that a page has in any case: those with a slider."""
+MIN_COMPONENTS = 8
+"""Number of components of each channel that a page always has: those with a slider."""
 
 NAMES = {
     "ycbcr": ("Brightness (Y)", "Yellow to blue (Cb)", "Green to red (Cr)"),
     "rgb": ("Red", "Green", "Blue"),
 }
-"""What the channels of a model are called, by its space."""
+"""Names of the channels of a model, by its space."""
 
 
 def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> Record:
@@ -256,7 +257,7 @@ def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> 
     ----------
     model : EigenGS
     image : ndarray of float32, shape (H, W, 3), optional
-        A photo in sRGB, to encode and to move along the components.
+        A photo in sRGB, which is encoded as the start of the sliders.
     """
     space, counts = model.gaussians.space, kept_counts(model)
     deviations = [np.sqrt(v[:n]) for v, n in zip(model.eigenvalues, counts, strict=True)]
@@ -271,8 +272,8 @@ def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> 
     if image is not None:
         color, background = decoded(model.encode(image))
         scores = [  # coefficients in standard deviations
-            (found[: len(d)] / np.maximum(d, np.finfo(float).tiny ** 0.5)).tolist()
-            for found, d in zip(model.project(image), deviations, strict=True)
+            (values[: len(d)] / np.maximum(d, np.finfo(float).tiny ** 0.5)).tolist()
+            for values, d in zip(model.project(image), deviations, strict=True)
         ]
         photo = {"color": to_text(color), "background": background.tolist(), "scores": scores}
     matrix = YCBCR_TO_RGB if space == "ycbcr" else np.eye(3)
@@ -280,21 +281,21 @@ def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> 
 
 
 def kept_counts(model: EigenGS) -> list[int]:
-    """Return how many components of each channel a page has: those with the largest variances."""
-    fitting = MAX_BYTES // (2 * (len(model.gaussians) + 1))
+    """Return the number of components of each channel in a page: those of the largest variance."""
+    max_count = MAX_WEIGHT_BYTES // (2 * (len(model.gaussians) + 1))
     variances = [np.inf, *np.sort(np.concatenate(model.eigenvalues))[::-1]]
-    least = variances[min(fitting, len(variances) - 1)]
-    return [max(min(FEWEST, len(v)), int((v >= least).sum())) for v in model.eigenvalues]
+    least = variances[min(max_count, len(variances) - 1)]
+    return [max(min(MIN_COMPONENTS, len(v)), int((v >= least).sum())) for v in model.eigenvalues]
 
 
 def describe_share(model: EigenGS) -> str:
-    """Return a sentence on what the page leaves out of a model; empty if it has everything."""
-    counts, whole = kept_counts(model), sum(model.components)
-    if sum(counts) == whole:
+    """Return a sentence about the components that a page leaves out; empty if there are none."""
+    counts, components = kept_counts(model), sum(model.components)
+    if sum(counts) == components:
         return ""
     kept = sum(v[:n].sum() for v, n in zip(model.eigenvalues, counts, strict=True))
     total = sum(v.sum() for v in model.eigenvalues)
     return (
-        f"A random image uses the first {sum(counts)} of {whole} components, "
+        f"A random image uses the first {sum(counts)} of {components} components, "
         f"with {kept / total:.0%} of their variance."
     )

@@ -48,7 +48,7 @@ def test_missing_llvm_is_refused(tmp_path):
 
 def test_other_library_is_refused(tmp_path):
     (tmp_path / "libLLVM.so").write_bytes(b"INPUT(libLLVM-19.so)")
-    assert "is no libLLVM" in refusal(tmp_path / "libLLVM.so")
+    assert "is not a libLLVM" in refusal(tmp_path / "libLLVM.so")
 
 
 @needs_llvm

@@ -427,18 +427,27 @@ def test_kernels(tiny, backend, tmp_path):
 
 
 @pytest.mark.mitsuba
-def test_texture(monkeypatch):
+def test_texture(monkeypatch, tmp_path):
     pytest.importorskip("mitsuba")
-    from eigengs_bench import texture
+    from eigengs_bench import poster, texture
 
     small = {"SIDE": 16, "TEXELS": 16, "SPP": 1, "COUNTS": (20,), "SETTLED": 20, "CHANGED": (20,)}
     for name, value in (small | {"STEPS": 2, "ROUNDS": 1, "HELD": (20,)}).items():
         monkeypatch.setattr(texture, name, value)
-    found = texture.measure("llvm_ad_rgb")
-    assert found["bytes_filtered_20"] > found["bytes_20"] > 0 and found["first_20_ms"] > 0
-    held = next(t for t in texture.summarize([found]).tables if t.name == "memory")
-    assert len(held.frame) == 1
-    assert found["ratio_20"] > 0 and found["ratio_step"] > 0 and found["maps_3_ms"] > 0
+    small = {"TEXELS": 64, "PIXELS": 32, "GOAL": 25.0, "PHOTOS": ("coffee",), "MAPS": ("gravel",)}
+    for name, value in small.items():
+        monkeypatch.setattr(poster, name, value)
+    text = said("bench", "texture", "-o", tmp_path)  # it times the ball anew each time
+    photo, material, letters, ball = read(tmp_path / FILE, "texture")
+    for found, goal in ((photo, 25), (material, 25), (letters, poster.TEXT_GOAL)):
+        assert found["psnr"] >= goal and found["psnr_bitmap"] >= goal and found["side"] <= 64
+        assert found["filtered_bytes"] > found["bytes"] > 0
+    # Texels of a colour take four bytes, those of a map one.
+    assert photo["bitmap_bytes"] == pytest.approx(4 * photo["side"] ** 2, rel=0.1)
+    assert material["bitmap_bytes"] == pytest.approx(material["side"] ** 2, rel=0.1)
+    assert ball["bytes_filtered_20"] > ball["bytes_20"] > 0 and ball["first_20_ms"] > 0
+    assert ball["ratio_20"] > 0 and ball["ratio_step"] > 0 and ball["maps_3_ms"] > 0
+    assert "memory, sharp text" in text and "coffee" in text
 
 
 @pytest.mark.mitsuba
@@ -452,11 +461,11 @@ def test_inverse(monkeypatch, tmp_path):
     for name, value in (small | {"PHOTOS": photos}).items():
         monkeypatch.setattr(inverse, name, value)
     rows, text = answered(tmp_path / "out", "inverse", "--backend", "llvm")
-    ball, material = rows[:10], rows[10:]
-    for first, then in zip(ball[:5], ball[5:], strict=True):
+    ball, material = rows[:12], rows[12:]
+    for first, then in zip(ball[:6], ball[6:], strict=True):
         assert first["job"]["method"] == then["job"]["method"] in inverse.METHODS
         assert first["seconds"] > 0 and 5 < first["psnr_rgb"] < then["psnr_rgb"]
-    assert [row["job"]["method"] for row in material] == ["texels", "pyramid", "fit"] * 2
+    assert [row["job"]["method"] for row in material] == ["texels", "pyramid", "frozen", "fit"] * 2
     assert all(row["albedo"] > 5 and row["roughness_constant"] > 5 for row in material)
     assert "ball, 2 cameras" in text and "at equal seconds" in text
 

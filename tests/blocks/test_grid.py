@@ -1,4 +1,4 @@
-"""Blocks, the Gaussians dealt to them, and the rounds of a fit by blocks."""
+"""Blocks, the Gaussians counts to them, and the rounds of a fit by blocks."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from eigengs_dr.blocks.block import rounds
-from eigengs_dr.blocks.grid import BlockSets, deal, divide
+from eigengs_dr.blocks.grid import BlockSets, allocate, divide
 from eigengs_dr.fitting.control import Relocate
 from eigengs_dr.fitting.descent import next_build
 from eigengs_dr.fitting.method import DEFAULT
@@ -41,16 +41,20 @@ def test_cores_tile_the_image_inside_their_windows(width, height, side, halo):
 def test_dealt_gaussians_are_all_and_fit(mass, seed, share):
     pixels = np.random.default_rng(seed).integers(1, 50, len(mass))
     count = len(mass) + round(share * (pixels.sum() - len(mass)))
-    dealt = deal(np.array(mass), pixels, count)
-    assert dealt.sum() == count
-    assert (dealt >= 1).all() and (dealt <= pixels).all()
+    counts = allocate(np.array(mass), pixels, count)
+    assert counts.sum() == count
+    assert (counts >= 1).all() and (counts <= pixels).all()
 
 
 def test_gaussians_follow_the_picture():
-    dealt = deal(np.array([1.0, 2.0, 5.0]), np.array([1000, 1000, 1000]), 800)
-    assert dealt.tolist() == [100, 200, 500]
+    counts = allocate(np.array([1.0, 2.0, 5.0]), np.array([1000, 1000, 1000]), 800)
+    assert counts.tolist() == [100, 200, 500]
     # A full block leaves the rest to the others.
-    assert deal(np.array([1.0, 8.0, 1.0]), np.array([100, 100, 100]), 200).tolist() == [50, 100, 50]
+    assert allocate(np.array([1.0, 8.0, 1.0]), np.array([100, 100, 100]), 200).tolist() == [
+        50,
+        100,
+        50,
+    ]
 
 
 @pytest.mark.parametrize("iterations", [0, 1, 2, 10, 100, 179, 180, 980, 5000])

@@ -107,7 +107,7 @@ def test_larger_than_pillow_allows(tmp_path, pixels, monkeypatch):
 
 def test_a_header_that_claims_too_much_is_refused_before_anything_is_decoded(tmp_path):
     (tmp_path / "a.png").write_bytes(png(1 << 20, 1 << 20, 8, 2, []))  # 1 TB of pixels
-    with pytest.raises(ImageError, match="1048576x1048576 pixels; sides go from 1 to 65,536"):
+    with pytest.raises(ImageError, match="1048576x1048576 pixels; sides must be from 1 to 65,536"):
         open_source(tmp_path / "a.png")
     with pytest.raises(ImageError, match="MB in memory, the limit is"):
         load_image(tmp_path / "a.png")
@@ -129,7 +129,7 @@ def test_arrays(tmp_path, pixels):
         (np.zeros((4, 4, 4), np.uint8), r"shape \(4, 4, 4\)"),
         (np.zeros(4, np.uint8), r"shape \(4,\)"),
         (np.zeros((0, 4), np.uint8), "4x0 pixels"),
-        (np.broadcast_to(np.uint8(0), (2, 70000)), "sides go from 1 to 65,536"),
+        (np.broadcast_to(np.uint8(0), (2, 70000)), "sides must be from 1 to 65,536"),
         ([[1, 2], [3, 4]], "is a list"),
     ],
 )
@@ -139,7 +139,7 @@ def test_what_is_no_image(source, reason):
 
 
 def test_bad_files(tmp_path):
-    with pytest.raises(ImageError, match="is a folder; name an image file in it"):
+    with pytest.raises(ImageError, match="is a folder; give an image file in it"):
         open_source(tmp_path)
     with pytest.raises(ImageError, match=r"a\.tif: No such file"):
         open_source(tmp_path / "a.tif")

@@ -170,7 +170,7 @@ def test_command_finds_few_or_says_that_it_cannot(tmp_path):
     assert told["gaussians"] == len(eg.Gaussians.load(out))
     result = run(*base, "--target-psnr", 60, "--max-gaussians", 50)
     assert result.exit_code == 1
-    assert "60 dB psnr_rgb are out of reach: 50 Gaussians have" in result.stderr
+    assert "psnr_rgb of 60 dB is out of reach: 50 Gaussians reach" in result.stderr
     assert len(eg.Gaussians.load(out)) == 50
     assert run(*base, "--target-psnr", 26, "--target-space", "ycbcr").exit_code == 0
     assert json.loads(report.read_text())["psnr_ycbcr"] >= 26
@@ -181,7 +181,7 @@ def test_a_model_is_never_replaced(trained, photo, tmp_path, monkeypatch, option
     monkeypatch.chdir(tmp_path)
     shutil.copy(trained[0] / "m.npz", tmp_path / "photo.npz")
     before = (tmp_path / "photo.npz").read_bytes()
-    reason = "photo.npz: exists and is no set of Gaussians; choose another name with -o"
+    reason = "photo.npz: exists and is not a set of Gaussians; choose another name with -o"
     assert_refused(run("fit", photo, *options, *QUICK), reason)
     assert_refused(run("fit", photo, "--basis", "photo.npz"), "photo.npz: is read too")
     assert (tmp_path / "photo.npz").read_bytes() == before

@@ -66,7 +66,7 @@ def test_a_bad_image_does_not_end_a_folder(photos, trained, tmp_path):
     (photos / "01.png").write_text("no image")
     result = run("fit", photos, "-o", fits, "--report", report, *QUICK)
     assert result.exit_code == 2 and model.read_bytes() == before
-    assert "01.png" in result.stderr and "no set of Gaussians" in result.stderr
+    assert "01.png" in result.stderr and "is not a set of Gaussians" in result.stderr
     assert result.stderr.count("\n") == 2
     images = json.loads(report.read_text())["images"]
     assert [image["stopped"] for image in images] == ["failed", "failed", "iterations"]
@@ -79,7 +79,7 @@ MISTAKES = {
     "twice": (["photos", "photos/00.png", "-o", "x"], "00.npz: two images have this name"),
     "one name": (["photos/00.png", "other/00.png", "-o", "x"], "00.npz: two images have this name"),
     "blocks": (["photos", "-o", "x", "--blocks", 64], "--blocks fits one image"),
-    "pattern": (["photos/*.jpg", "-o", "x"], "no file has such"),
+    "pattern": (["photos/*.jpg", "-o", "x"], "no file matches"),
     "empty": (["other/none", "-o", "x"], "other/none"),
     "a URL": (["photos", "-o", "memory://fits"], "results cannot be written to URLs"),
     "cluster": (["photos", "-o", "x", "--preview", "p", "--cluster", "local"], "no --preview"),
@@ -139,7 +139,7 @@ def test_sigterm_ends_the_run_and_its_workers(tmp_path, starts):
         process.terminate()
         _, said = process.communicate(timeout=60)
     assert process.returncode == 130 and "\n" not in said.strip()
-    assert "fits the others" in said if starts else said.strip() == "eigengs-dr: interrupted"
+    assert "to fit the others" in said if starts else said.strip() == "eigengs-dr: interrupted"
     assert not psutil.wait_procs(workers, timeout=10)[1]
     if starts:
         partial = files_of(output)  # reads each: all are whole

@@ -77,7 +77,7 @@ def test_what_is_no_material_is_never_replaced(fitted, folder, tmp_path):
     set_file = tmp_path / "set.npz"
     eg.Gaussians.load(fitted)["albedo"].save(set_file)
     before = set_file.read_bytes()
-    reason = "set.npz: exists and is no material; choose another name with -o"
+    reason = "set.npz: exists and is not a material; choose another name with -o"
     assert_refused(run("fit", *maps(folder), "-o", set_file, "--overwrite"), reason)
     assert set_file.read_bytes() == before
 
@@ -86,7 +86,7 @@ def test_out_of_reach(folder, tmp_path):
     settings = ("--target-psnr", 90, "--max-gaussians", 20, "--iterations", 5)
     result = run("fit", *maps(folder, "albedo"), "-o", tmp_path / "m.npz", *settings)
     assert result.exit_code == 1
-    assert "90 dB psnr_rgb are out of reach: 20 Gaussians have" in result.output
+    assert "psnr_rgb of 90 dB is out of reach: 20 Gaussians reach" in result.output
     assert (tmp_path / "m.npz").exists()
 
 
@@ -97,18 +97,18 @@ MISTAKES = {
     "no file": ([*FIT, "--map", "ao={0}/ao.png"], "no such file"),
     "space": ([*FIT, "--map", "ao:hsv={0}/other.png"], "space 'hsv' is not in"),
     "twice": ([*FIT, "--map", "albedo={0}/other.png"], "--map albedo is given twice"),
-    "an image": ([*FIT, "{0}/other.png"], "an image without a name"),
+    "an image": ([*FIT, "{0}/other.png"], "the image has no name"),
     "colour": ([*FIT, "--space", "rgb"], "--space and --map exclude each other"),
     "basis": ([*FIT, "--basis", "natural"], "--basis and --map exclude each other"),
     "suffix": ([*FIT, "-o", "x.egs"], "the name must end in .npz"),
     "channels": (
         [*FIT, *(w for k in range(5) for w in ("--map", f"n{k}:normal={{0}}/normal.png"))],
-        "the maps have 18 channels, at most 16 share shapes",
+        "the maps have 18 channels, the limit is 16",
     ),
     "no output": (FIT[:3], "--map needs -o"),
     "nothing": (["fit"], "no image is given"),
     "no map": (["render", "{1}", "-o", "x.png"], "holds the maps albedo, roughness, normal"),
-    "unknown": (["render", "{1}", "-o", "x.png", "--map", "ao"], "map 'ao' is not in it; it"),
+    "unknown": (["render", "{1}", "-o", "x.png", "--map", "ao"], "no map is named 'ao'; it"),
     "image": (["pack", "{1}", "-o", "x.egs", "--image", "{0}/albedo.png"], "--map"),
     "one of three": (
         ["pack", "{1}", "-o", "x.egs", "--map", "albedo={0}/albedo.png"],

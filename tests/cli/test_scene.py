@@ -119,7 +119,7 @@ def test_another_integrator(scene, tmp_path):
         depth = ("--integrator", f"aov,aovs={aovs}")
         said("scene", path, "-o", tmp_path / "x.exr", *depth)
         assert channels_of(tmp_path / "x.exr") == names
-        words = f"it shows no colours but {', '.join(names)}; write .exr"
+        words = f"it has no colours, only {', '.join(names)}; write an .exr file"
         assert_refused(run("scene", path, "-o", tmp_path / "x.png", *depth), path, words)
     seen = []
     for depth in (1, 2):
@@ -261,7 +261,7 @@ def test_convert(tmp_path, monkeypatch):
     assert report["better"] == [] and len(report["left"]) == 5
     assert (tmp_path / "new" / "scene.xml").exists()
     told = said("convert", scene, "-o", tmp_path / "other", *settings)
-    assert "stays, the bitmap is better: photo.png (diffuse.reflectance)" in told
+    assert "kept, the bitmap is better: photo.png (diffuse.reflectance)" in told
     [better] = json.loads((tmp_path / "r").read_text())["better"]
     assert better["gaussian_bytes"] == texture["gaussian_bytes"] and better["file"] == ""
     assert_refused(run("convert", scene, "-o", tmp_path / "new"), "exists and is not empty")

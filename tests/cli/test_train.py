@@ -91,7 +91,7 @@ def test_train_interrupted_goes_on(trained, tmp_path, monkeypatch):
         patched.setattr(cli_train, "bar", presses)
         result = run(*command)
     assert result.exit_code == 130
-    assert result.stderr == "eigengs-dr: interrupted; the same command goes on from here\n"
+    assert result.stderr == "eigengs-dr: interrupted; repeat the command to continue\n"
     assert result.stdout == ""
     assert [path.name for path in tmp_path.iterdir()] == ["m.npz.checkpoint"]
     assert_refused(run(*command, "--seed", 1), "m.npz.checkpoint", "seed 0", "delete")

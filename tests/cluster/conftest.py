@@ -7,7 +7,7 @@ pytest.importorskip("distributed")
 import dask
 from distributed import Client
 
-from eigengs_dr.cluster.executor import PATIENCE
+from eigengs_dr.cluster.executor import LOST_WORKER_SETTING
 from eigengs_dr.cluster.local import local_cluster
 
 RESTART_SECONDS = 120.0
@@ -18,7 +18,7 @@ RESTART_SECONDS = 120.0
 def shared_client():
     """A client of two workers; a task that ends its worker twice is given up."""
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 1} | PATIENCE),
+        dask.config.set({"distributed.scheduler.allowed-failures": 1} | LOST_WORKER_SETTING),
         local_cluster(2) as cluster,
         Client(cluster) as client,
     ):

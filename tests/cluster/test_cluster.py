@@ -297,7 +297,7 @@ def test_few_tasks_are_drawn_ahead(executor):
 
     for ended, _ in enumerate(executor.map(clusters.add, tasks(), 0)):
         most.append(len(drawn) - ended)
-    assert max(most) <= module.AHEAD * 2
+    assert max(most) <= module.TASKS_PER_WORKER * 2
 
 
 def test_errors_are_raised(executor):
@@ -343,7 +343,7 @@ def test_other_versions_are_refused(client):
 @pytest.mark.parametrize(
     ("package", "line"),
     [
-        (None, "a worker has no eigengs_dr; install there what this process has"),
+        (None, "a worker lacks eigengs_dr; install the packages of this process there"),
         (SimpleNamespace(__version__="9.9"), "has eigengs_dr 9.9, but this process has"),
     ],
 )

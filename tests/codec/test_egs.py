@@ -19,7 +19,7 @@ from _helpers.packed import STEPS, peak
 from _helpers.sets import COUNT, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec.quantization import Steps, Symbols, quantize
-from eigengs_dr.codec.weights import SMALL
+from eigengs_dr.codec.weights import MIN_RICH_COUNT
 
 FILES = Path(__file__).parent / "files"
 
@@ -31,7 +31,7 @@ def test_stored_files_keep_their_numbers(version, digest):
     """All probabilities are the same to the last bit, in every version and on every machine."""
     content = packed.read(FILES / f"version{version}.egs")
     assert len(content.sections) == (1 if content.maps else 2)
-    integers = np.column_stack(content.whole()).astype("<i8")
+    integers = np.column_stack(content.all_symbols()).astype("<i8")
     assert sha256(integers.tobytes()).hexdigest().startswith(digest)
 
 
@@ -78,7 +78,7 @@ def test_equal_splats_take_few_bits():
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
-@pytest.mark.parametrize("count", [1, 2, 9, 16, 17, 100, SMALL + 100])
+@pytest.mark.parametrize("count", [1, 2, 9, 16, 17, 100, MIN_RICH_COUNT + 100])
 def test_files_of_many_and_of_few_gaussians_come_back(path, count, channels):
     """They differ in what the model of the probabilities may use."""
     before = content(random_scene(0, count, (200, 200), channels), sections=(count,))
@@ -95,7 +95,7 @@ def test_reading_stops_after_the_sections_that_are_asked_for(path):
     path.write_bytes(whole[: first + 40])
     assert len(eg.Gaussians.load(path, sections=1)) == 5
     for wanted in (0, 4, 2, None):
-        with pytest.raises(ValueError, match=r"x\.egs: .*(section|cut off)"):
+        with pytest.raises(ValueError, match=r"x\.egs: .*(section|truncated)"):
             eg.Gaussians.load(path, sections=wanted)
     other = path.with_suffix(".npz")
     random_scene().on("llvm").save(other)
@@ -172,7 +172,7 @@ HOSTILE = {
     "version 0": (header(version=0) + body(), "version is 0"),
     "another space": (header(space=9) + body(), "unknown values"),
     "no channels": (header(channels=0) + body(), "claims 0 channels"),
-    "more channels": (header(channels=64) + hostile(), "weights are cut off"),
+    "more channels": (header(channels=64) + hostile(), "weights are truncated"),
     "65 channels": (header(channels=65, space=3) + body(), "65 channels"),
     "YCbCr of four": (
         header(channels=4, space=0) + hostile(model=PLAIN + bytes(99)),
@@ -181,7 +181,7 @@ HOSTILE = {
     "a large square": (header(levels=25) + body(), "unknown values"),
     "no sections": (header(sections=0), "claims 0 sections"),
     "many sections": (header(sections=65535) + body(), "claims 65535 sections"),
-    "one section more": (header(sections=2) + body(), "cut off"),
+    "one section more": (header(sections=2) + body(), "truncated"),
     "a size of 0": (header(width=0) + body(), "size is"),
     "a huge size": (header(height=1 << 31) + body(), "size is"),
     "no step": (header(cell=0.0) + body(), "the steps are"),
@@ -192,7 +192,7 @@ HOSTILE = {
     "steps that overflow": (header(cell=3e38, color=3e38) + body(), "x.egs: "),
     "many splats": (header() + body(0xFFFFFFFF), "claims 4294967295 Gaussians"),
     "no splats": (header() + body(0), "claims 0 Gaussians"),
-    "a long section": (header() + body(length=0xFFFFFFFF), "section 1 is cut off"),
+    "a long section": (header() + body(length=0xFFFFFFFF), "section 1 is truncated"),
     "an unknown first byte": (header() + hostile(first=0x7F), "first byte is unknown"),
     "an unknown distribution": (header() + hostile(model=b"\xff"), "an unknown distribution"),
 }

@@ -169,7 +169,7 @@ def test_without_noise_it_ends_at_the_limit(crossing):
     attempt, tried = noisy_attempts(crossing, 0, 0)
     octaves, best = largest_within(attempt)
     assert crossing - 0.2 < octaves <= crossing + 1e-9
-    assert best.excess == tried[octaves] >= rounding.FAIR
+    assert best.excess == tried[octaves] >= rounding.ACCEPTED_SHARE
     assert len(tried) <= 7 + abs(crossing)
 
 

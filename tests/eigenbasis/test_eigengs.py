@@ -158,7 +158,7 @@ def test_wrong_arguments(backend):
 
 
 @pytest.mark.parametrize("kind", ["one", "identical", "grey", "two"])
-@pytest.mark.filterwarnings("ignore:.* at most .* components a channel:UserWarning")
+@pytest.mark.filterwarnings("ignore:.* at most .* components per channel:UserWarning")
 @splits
 def test_few_or_equal_images(backend, kind, split):
     images = {

@@ -107,7 +107,7 @@ def test_blocks_fit_what_is_left(backend):
 
 def test_a_matrix_too_large_is_refused(backend):
     scene = random_scene(size=(4096, 4096))._replace(factor=np.tile([1e-5, 0, 1e-5], (COUNT, 1)))
-    with pytest.raises(ValueError, match="cover 402,653,184 pixels in all, over 268,435,456; use"):
+    with pytest.raises(ValueError, match="cover 402,653,184 pixels in total, the limit is"):
         NormalEquations(scene.on(backend))
 
 

@@ -65,7 +65,7 @@ def test_wrong_or_unmet_targets(backend, others):
     for target in (0, -1, np.nan, np.inf):
         with pytest.raises(ValueError, match="target_psnr is"):
             model.project(others[0], target)
-    with pytest.warns(UserWarning, match=r"out of reach: all 12\+6\+6 components have 2\d\."):
+    with pytest.warns(UserWarning, match=r"out of reach: all 12\+6\+6 components reach 2\d\."):
         found = model.project(others[0], 60)
     np.testing.assert_allclose(
         np.concatenate(found), np.concatenate(model.project(others[0])), atol=1e-5

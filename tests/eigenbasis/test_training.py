@@ -90,7 +90,7 @@ def test_unreadable_images_are_skipped(folder, output):
         figures = train(folder, output, settings()).figures
     told = [str(note.message) for note in notes]
     assert "1 of 22 images were skipped: 003.png" in told[0]
-    assert "1 of 2 images held out were skipped, as" in told[1]
+    assert "1 of 2 held-out images were skipped" in told[1]
     assert figures["images"] == 21
     assert figures["psnr_solved"] > 20
 
@@ -151,7 +151,7 @@ def test_train_to_a_target(trained, tmp_path):
 
 def test_train_without_images_for_a_target(tmp_path):
     photos = random_fields(tmp_path / "few", 5)
-    with pytest.raises(ValueError, match="images that are held out"), warnings.catch_warnings():
+    with pytest.raises(ValueError, match="needs held-out images"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20))
     assert [path.name for path in tmp_path.iterdir()] == ["few"]
@@ -259,7 +259,8 @@ def test_ctrl_c(folder, output, in_pieces, stage, call, kept):
         if found == stage and seen.count(stage) == call:
             os.kill(os.getpid(), signal.SIGINT)
 
-    with pytest.raises(Interrupted, match="goes on from here" if kept else "nothing is saved"):
+    advice = "repeat the command to continue" if kept else "nothing is saved"
+    with pytest.raises(Interrupted, match=advice):
         train(folder, output, settings(iterations=26), progress=press)
     assert checkpoint_of(output).exists() == kept
     assert not output.exists()
@@ -288,7 +289,7 @@ def test_a_folder_that_grew_meanwhile(folder, output, tmp_path, in_pieces):
     train(folder, tmp_path / "whole.npz", settings())
     kill(folder, output, "components", 8)
     (folder / "000a.png").write_bytes((folder / "003.png").read_bytes())
-    with pytest.warns(UserWarning, match="goes on with the 24 that were there"):
+    with pytest.warns(UserWarning, match="the original 24"):
         train(folder, output, settings())
     assert_same_models(tmp_path / "whole.npz", output)
 

@@ -113,7 +113,7 @@ def test_light_becomes_srgb_in_other_spaces(light, color):
 
 
 def test_light_without_a_word_is_refused_above_1(light):
-    with pytest.raises(ValueError, match="say encoding='linear' for light") as error:
+    with pytest.raises(ValueError, match="pass encoding='linear' for light") as error:
         eg.fit(light, space="linear", **SMALL)
     one_line(error)
     with pytest.raises(ValueError, match="encoding 'raw' is unknown"):

@@ -42,7 +42,9 @@ def test_the_set_of_a_map_renders_its_channels(backend):
 def test_names():
     m = material()
     assert repr(m) == "Gaussians(24, 22x17 pixels, maps albedo, roughness, normal, cutoff=3)"
-    with pytest.raises(KeyError, match="'height' is not in it; it has albedo, roughness, normal"):
+    with pytest.raises(
+        KeyError, match="no map is named 'height'; it has albedo, roughness, normal"
+    ):
         m["height"]
     assert [usual_space(n) for n in ("Base_Color", "NORMAL", "ao")] == ["linear", "normal", "data"]
     assert (len(m[:7]), len(m[:7]["normal"]), m[:7].maps) == (7, 7, MAPS)
@@ -76,7 +78,7 @@ def test_a_file_holds_it_all(tmp_path):
 
 def test_an_image_has_no_map_to_read(tmp_path):
     material()["albedo"].save(tmp_path / "g.npz")
-    with pytest.raises(ValueError, match="holds one image and no maps; leave map out"):
+    with pytest.raises(ValueError, match="holds one image and no maps; leave out map"):
         read_map(tmp_path / "g.npz", "albedo")
 
 
@@ -84,7 +86,7 @@ HOSTILE = {
     "a name": ({"names": np.array(["albedo", "../x", "normal"])}, "a name starts with a letter"),
     "lengths": ({"weights": np.ones(2)}, "differ in length"),
     "too many": ({"names": np.array(["a"] * 99)}, "claims shape"),
-    "long": ({"names": np.array(["a" * 70, "b", "c"])}, "over 64 characters"),
+    "long": ({"names": np.array(["a" * 70, "b", "c"])}, "longer than 64 characters"),
     "missing": ({"names": None}, "key 'names' is missing"),
     "values": ({"color": np.full((24, 7), np.nan, np.float32)}, "color holds values that are not"),
 }

@@ -86,5 +86,5 @@ def test_tensors_of_another_precision_are_converted(backend):
 
 def test_arrays_that_are_no_tensors_are_refused():
     g = random_scene().on("llvm")
-    with pytest.raises(TypeError, match=r"color is a numpy\.ndarray, expected a tensor of Dr\.Jit"):
+    with pytest.raises(TypeError, match=r"color is a numpy\.ndarray, expected a Dr\.Jit"):
         eg.from_tensors({"color": np.ones((24, 3))}, like=g)

@@ -161,9 +161,9 @@ def test_folders_that_hold_no_images(tmp_path):
 @pytest.mark.parametrize(
     ("source", "complaint"),
     [
-        (np.zeros((5, 6)), r"found shape \(5, 6\), expected \(n, H, W, 3\)"),
-        ([None], "found NoneType"),
-        ([[1, 2]], "found list"),
+        (np.zeros((5, 6)), r"got shape \(5, 6\), expected \(n, H, W, 3\)"),
+        ([None], "got NoneType"),
+        ([[1, 2]], "got list"),
         ([pictures(2), np.zeros((2, 5, 6, 4))], "image 2 of the source: .* drop alpha"),
         (np.full((1, 5, 6, 3), 255.0), "image 0 of the source: .* divide by 255"),
         (np.full((1, 5, 6, 3), np.nan), "image 0 of the source: 30 of 30 pixels are not finite"),

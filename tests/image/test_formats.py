@@ -246,7 +246,7 @@ def test_check_image_codes_light():
     np.testing.assert_allclose(
         check_image(np.full((1, 1, 3), 0.214041), encoding="linear"), 0.5, rtol=1e-6
     )
-    with refused(ImageError, "say encoding='linear' for light"):
+    with refused(ImageError, "pass encoding='linear' for light"):
         check_image(LIGHT)
     with pytest.raises(ImageError, match="scale it first"):
         check_image(np.full((2, 2), 1e10), encoding="linear")

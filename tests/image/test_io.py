@@ -212,7 +212,7 @@ def test_check_image_keeps_rows_columns_and_channels():
         ([[1, 2], [3]], "not an array"),
         (
             np.full((2, 2), 255.0),
-            "from 255 to 255, not 0 to 1; divide by 255 first, or say encoding=",
+            "from 255 to 255, not 0 to 1; divide by 255 first, or pass encoding=",
         ),
         (np.full((2, 2), 1e300), "scale it first"),
         (np.array([[-1.0, 1.0]]), "from -1 to 1, not 0 to 1; scale it"),
@@ -318,6 +318,6 @@ def test_bad_pixels_touch_no_file(tmp_path):
         with pytest.raises(ImageError, match=words):
             save_image(tmp_path / "a.png", image)
     one = eg.Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1, 1, 1]], size=(8, 8))
-    with pytest.raises(ValueError, match="a set is no image"):
+    with pytest.raises(ValueError, match="a set is not an image"):
         one.save(tmp_path / "a.png")
     assert not list(tmp_path.iterdir())

@@ -56,7 +56,7 @@ def test_a_texture_is_recovered():
 
     scene, photos = wall(GREY), photos_of(wall(true_texture()))
     loss = photo_loss(scene, NAME, photos)
-    found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=120, space="linear")
+    found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=120)
     inner = np.s_[4:-4, 4:-4]
     error = np.mean((found.image[inner] - eg.image.color.to_coded(true_texture())[inner]) ** 2)
     assert error < 1e-3
@@ -80,7 +80,7 @@ def test_the_derivative_is_a_forward_difference():
     from eigengs_dr.plugins import photo_loss
 
     scene, photos = wall(GREY), photos_of(wall(true_texture()))
-    loss = photo_loss(scene, NAME, photos, spp=256)
+    loss = photo_loss(scene, NAME, [mi.TensorXf(photo) for photo in photos], spp=256)
     random = np.random.default_rng(1)
     texture, along = random.uniform(0.3, 0.7, (2, 32, 32, 3)).astype(np.float32)
     picture = mi.TensorXf(texture)
@@ -90,6 +90,37 @@ def test_the_derivative_is_a_forward_difference():
     ends = [loss.function(mi.TensorXf(texture + h * along), 1) for h in (0, 1e-2)]
     low, high = (float(np.ravel(end.numpy())[0]) for end in ends)
     assert slope == pytest.approx((high - low) / 1e-2, rel=0.1)
+
+
+@pytest.mark.parametrize("integrator", ["prb", "path", "direct_projective"])
+def test_frozen_steps_have_the_derivatives_of_plain_ones(integrator):
+    """Though other programs run between them, and the memory of the recording is gone."""
+    import drjit as dr
+
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), photos_of(wall(true_texture()), spp=4)
+    tool = mi.load_dict({"type": integrator})
+    loss = photo_loss(scene, NAME, photos, integrator=tool, spp=16)
+    values = mi.traverse(scene)
+    for step in range(9):
+        texels = np.random.default_rng(step).random((32, 32, 3), np.float32)
+        picture, plain = mi.TensorXf(texels), mi.TensorXf(texels)
+        dr.enable_grad(picture, plain)
+        number = loss.function(picture, step)
+        dr.backward(number)
+        values.update({f"{NAME}.data": plain})
+        shown = mi.render(scene, values, step % 3, tool, step, spp=16)
+        expected = dr.mean(dr.square(shown - mi.TensorXf(photos[step % 3])), axis=None)
+        dr.backward(expected)
+        np.testing.assert_allclose(number.numpy(), expected.numpy(), rtol=1e-5)
+        np.testing.assert_allclose(
+            dr.grad(picture).numpy(), dr.grad(plain).numpy(), rtol=1e-3, atol=1e-8
+        )
+        if step == 5:  # all recordings are made
+            eg.fit(true_texture(), 20, 10, space="linear")
+            dr.sync_thread()
+            dr.flush_malloc_cache()
 
 
 def test_a_light_is_found_along():

@@ -50,7 +50,7 @@ def test_without_lists_a_recording_says_what_to_do(backend):
     g = on(backend)
     with pytest.raises(RuntimeError) as error:
         dr.freeze(eg.render)(g)
-    assert "make them by eigengs_dr.tile_lists" in str(error.value.__cause__)
+    assert "build them with eigengs_dr.tile_lists" in str(error.value.__cause__)
     assert eg.render(g).numpy().any()  # Dr.Jit goes on
 
 
@@ -66,9 +66,9 @@ def test_lists_serve_sets_that_move_within_the_margin(backend):
 def test_lists_of_another_size_or_number_are_refused(backend):
     g = on(backend)
     lists = eg.tile_lists(g)
-    with pytest.raises(ValueError, match="make them anew by tile_lists"):
+    with pytest.raises(ValueError, match="rebuild them with tile_lists"):
         eg.render(g, width=99, lists=lists)
-    with pytest.raises(ValueError, match=r"the lists are of .* 30 Gaussians"):
+    with pytest.raises(ValueError, match=r"the lists are for .* 30 Gaussians"):
         eg.render(g[:20], lists=lists)
 
 
@@ -104,7 +104,7 @@ def test_a_gaussian_that_shrinks_to_an_eighth_of_a_pixel_is_drawn(backend, froze
     scene.factor[0] = 8, 0, 8
     narrow, exact, sure = scene.on(backend), scene.exact(3.0), scene.off_edge(3.0)
     lists = eg.tile_lists(wide)
-    assert lists.steep == (backend != "llvm")
+    assert lists.exact_exp == (backend != "llvm")
     assert not sure.all() and sure[8, 7] and np.abs(exact[8, 7] - scene.background).max() > 0.1
 
     def program(g, lists):
@@ -126,5 +126,5 @@ def test_lists_of_another_cutoff_are_refused(backend):
     g = on(backend)
     lists = eg.tile_lists(g, cutoff=2)
     eg.render(g, cutoff=2, lists=lists)
-    with pytest.raises(ValueError, match=r"the lists are of the cutoff 2, the rendering has 3; "):
+    with pytest.raises(ValueError, match=r"the lists are for the cutoff 2, the rendering has 3; "):
         eg.render(g, cutoff=3, lists=lists)

@@ -9,9 +9,9 @@ from eigengs_dr.image.resize import resample
 from eigengs_dr.image.sheet import GAP
 from eigengs_dr.raster.render import render
 from eigengs_dr.viewer.pictures import (
-    CELL,
-    LIGHTER,
+    CELL_SIDE,
     MAX_OUTLINES,
+    WHITE_SHARE,
     comparison,
     component_sheet,
     ellipses,
@@ -25,19 +25,19 @@ def test_a_sheet_has_components_above_their_renderings():
     for found in (sheet, alone):
         assert found.shape[2] == 3 and max(found.shape) < 2000
         assert np.isfinite(found).all()
-    step, top = CELL + GAP, 12 + GAP  # below a line of text
+    step, top = CELL_SIDE + GAP, 12 + GAP  # below a line of text
     cells = [
-        [sheet[top + row * step :, column * step :][:CELL, :CELL] for row in range(2)]
+        [sheet[top + row * step :, column * step :][:CELL_SIDE, :CELL_SIDE] for row in range(2)]
         for column in range(3)
     ]
-    np.testing.assert_array_equal(cells[0][1], alone[top : top + CELL, :CELL])
+    np.testing.assert_array_equal(cells[0][1], alone[top : top + CELL_SIDE, :CELL_SIDE])
     mean = basis.reconstruct([np.zeros(k) for k in model.components])
     rendered = render(model.gaussians).numpy()
     for shown, expected in zip(cells[0], (mean, rendered), strict=True):
-        np.testing.assert_allclose(shown, resample(expected, CELL, CELL), atol=1e-5)
+        np.testing.assert_allclose(shown, resample(expected, CELL_SIDE, CELL_SIDE), atol=1e-5)
     for column, j in ((1, 0), (2, 1)):
         shown = cells[column][0] - 0.5
-        component = resample(basis.components[0][j][..., None], CELL, CELL)
+        component = resample(basis.components[0][j][..., None], CELL_SIDE, CELL_SIDE)
         factor = shown[..., :1].ravel() @ component.ravel() / np.square(component).sum()
         np.testing.assert_allclose(shown, np.repeat(factor * component, 3, 2), atol=1e-4)
         assert 0.4 < np.abs(shown).max() < 0.8
@@ -82,7 +82,7 @@ def test_an_overlay_is_the_picture_lightened_below_the_outlines():
     assert drawn.shape == picture.shape
     y, x = np.mgrid[:40, :60] + 0.5
     away = np.abs(np.hypot(x - 20, y - 20) - 4)
-    expected = LIGHTER + (1 - LIGHTER) * picture
+    expected = WHITE_SHARE + (1 - WHITE_SHARE) * picture
     np.testing.assert_allclose(drawn[away > 2], expected[away > 2], atol=0.003)
     assert (drawn[away < 0.3][:, 0] < 0.6).all()
 

@@ -1,4 +1,4 @@
-"""Which Gaussians serve which components: all of them all, or the two bands of the split."""
+"""Division of Gaussians and components: a single band, or two bands with a frequency split."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from ..pca.basis import Eigenbasis
 Planes = NDArray[np.float32]
 
 State = dict[str, NDArray]
-"""What a training keeps of a band: plain arrays, for a checkpoint."""
+"""The state of the training of a band as plain arrays, for a checkpoint."""
 
 LOW_SHARE = 0.1
-"""Share of the Gaussians that serve the low frequencies in a split (the paper)."""
+"""Share of the Gaussians that represent the low frequencies in a split (from the paper)."""
 
 LOW_COMPONENTS = 50
-"""Number of components of each channel that are low frequencies (the authors' code); with fewer
-than 100 components, it is half of them."""
+"""Number of components of each channel that count as low frequencies (from the authors' code); with
+fewer than 100 components, half of them."""
 
-SPLIT_FROM = 512
-"""Smallest longer side, in pixels, at which "auto" splits. In the paper, the split costs 0.4 to
-0.8 dB at 256 pixels and gains 1 dB at 512. Here it cost 0.1 dB at the start on cats of 512 pixels,
-with 1,000 to 5,000 Gaussians, and gained 0.2 to 0.8 dB after 300 steps."""
+MIN_SPLIT_SIDE = 512
+"""Smallest longer side in pixels for which "auto" splits. In the paper, the split costs 0.4 to 0.8
+dB at 256 pixels and gains 1 dB at 512. Here, on cats of 512 pixels with 1,000 to 5,000 Gaussians,
+it cost 0.1 dB initially, and gained 0.2 to 0.8 dB after 300 steps."""
 
 
 class FrequencyBand(NamedTuple):
-    """A number of Gaussians and the components that they serve: all, or one side of the split.
+    """A number of Gaussians and the components that they represent.
 
     Attributes
     ----------
@@ -57,11 +57,11 @@ def frequency_bands(
 ) -> list[FrequencyBand]:
     """Divide the Gaussians and components into bands, low frequencies first.
 
-    There is one band if `frequency_aware` is False, if it is "auto" and the longer side has less
-    than `SPLIT_FROM` pixels, or if there are too few Gaussians or components for two.
+    There is one band if `frequency_aware` is False, if it is "auto" and the longer side has fewer
+    than `MIN_SPLIT_SIDE` pixels, or if there are too few Gaussians or components for two.
     """
     if frequency_aware == "auto":
-        frequency_aware = max(basis.width, basis.height) >= SPLIT_FROM
+        frequency_aware = max(basis.width, basis.height) >= MIN_SPLIT_SIDE
     first = low_component_count(basis)
     if not frequency_aware or count < 2 or first < 1:
         return [FrequencyBand(count, basis.components, basis.eigenvalues)]
@@ -75,12 +75,12 @@ def frequency_bands(
 
 
 def low_component_count(basis: Eigenbasis) -> int:
-    """Return the number of components of each channel that are low frequencies."""
+    """Return the number of components of each channel that count as low frequencies."""
     return min(LOW_COMPONENTS, max(map(len, basis.components)) // 2)
 
 
 def on_grid(band: FrequencyBand) -> State:
-    """Return the state of a band before training: its Gaussians on a grid."""
+    """Return the initial state of a band: Gaussians on a grid."""
     mean, factor = grid_of(band.size, band.number)
     return {"step": np.array(0), "mean": mean, "factor": factor}
 

@@ -1,10 +1,10 @@
-"""Training of the shapes for all components, on random combinations of the components.
+"""Training of the shapes on random combinations of all components.
 
 With ``r_j ~ N(0, 1)``, ``sum_j r_j sqrt(lambda_j) Psi_j`` is a sample of the PCA model. The r_j are
 independent, so the expected squared error of the rendered sample is ``sum_j lambda_j |Psi~_j -
-Psi_j|^2``. One rendering is therefore an unbiased estimate of the error of the whole basis. Each
-step solves for the colours first; at their optimum, the total derivative by the shapes equals the
-partial derivative (variable projection).
+Psi_j|^2``. One rendering therefore gives an unbiased estimate of the error of the full basis. Each
+step first solves for the colours; at their optimum, the total derivative with respect to the shapes
+equals the partial derivative (variable projection).
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from ...gaussian.gaussians import Gaussians
 from ...raster.render import bin_gaussians
 from .bands import FrequencyBand, Planes, State, on_grid, shapes_of
 
-ROUND = 25
-"""Steps between two restarts of the optimiser; a checkpoint after a round needs the shapes alone.
-"""
+RESTART_STEPS = 25
+"""Number of steps between two restarts of the optimiser; a checkpoint at a restart only needs the
+shapes."""
 
 SOLVE_STEPS = 30
-"""Steps of conjugate gradients for the colours of a sample. With 8 steps, the derivative has an
-error of a third."""
+"""Number of conjugate gradient steps for the colours of a sample. With 8 steps, the derivative has
+an error of a third."""
 
 SHAPES = Method(
     place=Grid(),
@@ -43,8 +43,8 @@ SHAPES = Method(
     rates={"mean": 0.02, "factor": 0.02},
     coordinates=Relative(),
 )
-"""The method of the descent. The learning rates are a sixth of those for one image, because each
-step has another sample."""
+"""The method of the descent. The learning rates are a sixth of those for one image, because every
+step uses a new sample."""
 
 
 def train_shapes(
@@ -54,7 +54,7 @@ def train_shapes(
     backend: str | None = None,
     state: State | None = None,
 ) -> Iterator[State]:
-    """Train the means and factors of Gaussians, from a grid, to render all components.
+    """Train the means and factors of Gaussians, initialized on a grid, to render all components.
 
     Parameters
     ----------
@@ -65,12 +65,12 @@ def train_shapes(
         Total number of steps; 0 keeps the grid.
     backend : {"llvm", "cuda"}, optional
     state : dict, optional
-        Resume from this earlier result, as if the training had not stopped.
+        Resume from this earlier state, as if the training had not been interrupted.
 
     Yields
     ------
     dict of str to ndarray
-        "step", "mean" and "factor", at the start, after every `ROUND` steps and at the end.
+        "step", "mean" and "factor", at the start, after every `RESTART_STEPS` steps and at the end.
     """
     if state is None:
         state = on_grid(band)
@@ -78,8 +78,8 @@ def train_shapes(
     if not any(map(len, band.components)):
         return
     gaussians = shapes_of(state, band, backend)
-    for first in range(int(state["step"]), steps, ROUND):
-        last = min(first + ROUND, steps)
+    for first in range(int(state["step"]), steps, RESTART_STEPS):
+        last = min(first + RESTART_STEPS, steps)
         gaussians = _round(gaussians, band, seed, (first, last, steps))
         arrays = gaussians.to_arrays()
         yield {"step": np.array(last), "mean": arrays["mean"], "factor": arrays["factor"]}
@@ -88,7 +88,7 @@ def train_shapes(
 def _round(
     gaussians: Gaussians, band: FrequencyBand, seed: int, span: tuple[int, int, int]
 ) -> Gaussians:
-    """Take the steps from `first` to before `last` of a span, with a new optimiser."""
+    """Take the steps ``[first, last)`` of a span, with a new optimiser."""
     first, last, steps = span
     state, types = started(begin(gaussians), SHAPES, first), types_of(gaussians.mean)
     rates = rate_table(types, SHAPES, SHAPES.rate_factors(steps))
@@ -118,13 +118,13 @@ def samples(band: FrequencyBand, seed: int, first: int, last: int) -> Planes:
     Returns
     -------
     ndarray of float32, shape (last - first, H, W, C)
-        Combination i depends on `seed` and ``first + i`` alone.
+        Combination i depends only on `seed` and ``first + i``.
     """
     channels = []
     for c, (planes, values) in enumerate(zip(band.components, band.eigenvalues, strict=True)):
         r = [
             np.random.default_rng([seed, i, c]).normal(size=len(planes)) for i in range(first, last)
         ]
-        spread = (np.stack(r) * np.sqrt(values)).astype(np.float32)
-        channels.append(np.tensordot(spread, planes, axes=1))
+        coefficients = (np.stack(r) * np.sqrt(values)).astype(np.float32)
+        channels.append(np.tensordot(coefficients, planes, axes=1))
     return np.stack(channels, axis=3)

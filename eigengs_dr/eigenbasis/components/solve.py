@@ -1,4 +1,4 @@
-"""The fit of shared Gaussians to an eigenbasis: shapes, and a weight for each component."""
+"""The fit of shared Gaussians to an eigenbasis: shapes, then weights for each component."""
 
 from __future__ import annotations
 
@@ -35,27 +35,27 @@ def fit_model(
     states: list[State] | None = None,
     save: Callable[[list[State]], None] = lambda states: None,
 ) -> dict[str, Any]:
-    """Fit one set of Gaussians, and its weights, to all components of a basis.
+    """Fit one set of Gaussians and its weights to all components of a basis.
 
     Parameters
     ----------
     basis : Eigenbasis
     options : TrainOptions
-        Of which those that `eigengs_dr.EigenGS.fit` takes count.
+        Only the options of `eigengs_dr.EigenGS.fit` are used.
     backend : {"llvm", "cuda"}, optional
     progress : callable, optional
-        ``progress(step, steps, {})`` after every round of training.
+        ``progress(step, steps, {})`` is called after every round of training.
     states : list of dict, optional
         Resume from the last argument of `save`: the state of each band.
     save : callable, optional
-        ``save(states)`` after `progress`; an error that it raises ends the work.
+        ``save(states)`` is called after `progress`; an error that it raises ends the training.
 
     Returns
     -------
     dict of str to object
-        Arguments of `eigengs_dr.EigenGS`. The figures are ``psnr_components``: PSNR of the
-        components, weighted by their variances, in dB; ``shape_seconds``, ``weight_seconds``: time
-        of the training, and of the rest.
+        Arguments of `eigengs_dr.EigenGS`. The figures are ``psnr_components``, the PSNR of the
+        components in dB, weighted by their variances; ``shape_seconds`` and ``weight_seconds``, the
+        times of the training and of the rest.
 
     Raises
     ------
@@ -78,14 +78,14 @@ def fit_model(
             save(states)
     trained = time.perf_counter()
     shapes: list[Gaussians] = []
-    weights: list[list[Planes]] = []  # of each band in its own components
+    weights: list[list[Planes]] = []  # of each band, in the components of the band
     for state, band in zip(states, bands, strict=True):
         shapes.append((joint_shapes if joint else shapes_of)(state, band, backend))
         if joint:
             weights.append(joint_weights(state, band))
         elif split:
-            alone = NormalEquations(shapes[-1])
-            weights.append([find_weights(alone, planes)[0] for planes in band.components])
+            band_equations = NormalEquations(shapes[-1])
+            weights.append([find_weights(band_equations, planes)[0] for planes in band.components])
     known: Sequence[Planes | None] = weights[0] if weights else [None] * len(basis.components)
     if split:
         known = [_join_weights(low, high) for low, high in zip(*weights, strict=True)]
@@ -114,21 +114,21 @@ def fit_model(
 def find_weights(
     equations: NormalEquations, planes: Planes, known: Planes | None = None
 ) -> tuple[Planes, NDArray[np.float64]]:
-    """Find the best weights of Gaussians in the components of a channel.
+    """Compute the best weights of Gaussians in the components of a channel.
 
     Parameters
     ----------
     equations : NormalEquations
     planes : ndarray of float32, shape (k, H, W)
     known : ndarray of float32, shape (k, N + 1), optional
-        The weights, if only the errors are wanted.
+        The weights, if only the errors are needed.
 
     Returns
     -------
     weights : ndarray of float32, shape (k, N + 1)
         See `eigengs_dr.EigenGS`.
     errors : ndarray of float64, shape (k,)
-        Squared distance of each component to its rendering, summed over pixels.
+        Squared distance between each component and its rendering, summed over pixels.
     """
     weights = np.empty((len(planes), equations.count + 1), np.float32)
     errors = np.empty(len(planes))
@@ -142,7 +142,7 @@ def find_weights(
 
 
 def _join_weights(low: Planes, high: Planes) -> Planes:
-    """Join the weights of both bands in a channel; weights between the bands are 0."""
+    """Combine the weights of both bands in a channel; cross weights are 0."""
     count, number = len(low), low.shape[1] - 1
     joined = np.zeros((count + len(high), number + high.shape[1]), np.float32)
     joined[:count, :number], joined[:count, -1] = low[:, :-1], low[:, -1]

@@ -37,20 +37,21 @@ from .truncation import (
 class Eigenbasis:
     """The mean image and the principal components of a family of images.
 
-    Each channel of an image I is about ``Psi_0 + sum_j w_j Psi_j`` with w_j = <Psi_j, I - Psi_0>.
+    Each channel of an image I is approximated by ``Psi_0 + sum_j w_j Psi_j`` with
+    ``w_j = <Psi_j, I - Psi_0>``.
 
     Attributes
     ----------
     mean : ndarray of float32, shape (C, H, W)
         Mean image, in [0, 1], in the space of the basis.
     components : tuple of C ndarrays of float32, shape (k_c, H, W)
-        Orthonormal components; the numbers k_c may differ and be 0. The entry of largest size of
-        a component is positive.
+        Orthonormal components; the numbers k_c may differ and be 0. The entry of a component with
+        the largest absolute value is positive.
     eigenvalues : tuple of C ndarrays of float64, shape (k_c,)
         Variance along each component, descending; the covariance is ``1/m sum v v^T`` over the m
         training images (eq. 1 of the paper).
     variance : ndarray of float64, shape (C,)
-        Total variance: the sum of all eigenvalues, with those of dropped components.
+        Total variance: the sum of all eigenvalues, including those of dropped components.
     count : int
         Number of training images, m.
     space : {"ycbcr", "rgb"}
@@ -78,38 +79,38 @@ class Eigenbasis:
         client: object = None,
         checkpoint: str | os.PathLike[str] | None = None,
     ) -> Eigenbasis:
-        """Find the eigenbasis of a family of images in one pass.
+        """Compute the eigenbasis of a family of images in one pass.
 
-        The number of workers does not change a bit of the result. Blocks of up to 1,024 images are
-        merged, so memory does not grow with their number: it is a block (805 MB), and ``5 k d``
-        numbers for k components of d pixels in 3 channels. The result is exact for one block; with
-        more, the last components lose some variance: of 4,096 crops of 256x256 and 300 components,
-        0.09 dB on the crops and 0.01 dB on 200 others.
+        The result is bit-identical for any number of workers. Blocks of up to 1,024 images are
+        merged, so that memory does not grow with the number of images: it is that of a block
+        (805 MB), plus ``5 k d`` numbers for k components of d pixels in 3 channels. The result is
+        exact for one block; with more blocks, the last components lose some variance: with 4,096
+        crops of 256x256 and 300 components, 0.09 dB on the crops and 0.01 dB on 200 others.
 
         Parameters
         ----------
         images : path, array or iterable
-            See `eigengs_dr.image.folder.read_blocks`. Of an array that is computed part by part,
+            See `eigengs_dr.image.folder.read_blocks`. For an array that is computed part by part,
             pass the parts: ``(block.compute() for block in array.blocks)`` for a dask.array.
         size : (int, int)
             Width and height of the basis.
         components : int or sequence of 3 ints
-            Most components of each channel.
+            Largest number of components of each channel.
         energy : float, optional
             Keep the fewest components with this share of a channel's variance, in (0, 1].
         space : {"ycbcr", "rgb"}
             Space of the channels.
         progress : bool or callable, optional
-            By default a bar, in a terminal or a notebook, after two seconds; False shows none.
-            ``progress(done, total, {})`` after every image, on a cluster after every shard; `total`
-            may be None.
+            By default a bar, in a terminal or a notebook, after two seconds; False shows none. A
+            function is called as ``progress(done, total, {})`` after every image, on a cluster
+            after every shard; `total` may be None.
         client : distributed.Client, optional
-            Work on the workers of this Dask cluster; None is this process. Workers read the files,
-            so they need the same file system.
+            Dask cluster whose workers do the work; None is this process. Workers read the files, so
+            they need the same file system.
         checkpoint : path-like, optional
-            An existing folder that all workers see, for this call alone. It keeps what tasks have
-            found, so that the same call continues after a break; the caller deletes it. Without
-            it, states travel through this process: 295 MB a shard, for 300 components of 256x256.
+            An existing folder for this call only, which stores results of tasks, so that the same
+            call can be continued after an interruption; the caller deletes it. By default a
+            temporary folder.
 
         Raises
         ------
@@ -124,14 +125,14 @@ class Eigenbasis:
         UserWarning
             If images are skipped, cropped or too few, or `components` is too low for the energy.
         """
-        size, most = check_size(size), check_components(components, energy)
-        ranks = [rank_for(k) for k in most]
+        size, limits = check_size(size), check_components(components, energy)
+        ranks = [rank_for(k) for k in limits]
         states = find_states(images, size, space, ranks, progress, client, checkpoint)
         count, shape = states[0].count, (size[1], size[0])
-        if energy is None and count <= max(most):
-            have = "1 image gives" if count == 1 else f"{count} images give"
-            warn(f"{have} at most {count - 1} components a channel")
-        pairs = list(zip(states, most, strict=True))
+        if energy is None and count <= max(limits):
+            images_give = "1 image gives" if count == 1 else f"{count} images give"
+            warn(f"{images_give} at most {count - 1} components per channel")
+        pairs = list(zip(states, limits, strict=True))
         basis = cls(
             mean=np.stack([state.mean for state in states]).astype(np.float32).reshape(-1, *shape),
             components=tuple(orient(state.rows[:k]).reshape(-1, *shape) for state, k in pairs),
@@ -140,7 +141,9 @@ class Eigenbasis:
             count=count,
             space=space,
         )
-        return basis if energy is None else basis.truncated(_ranks_for_energy(basis, most, energy))
+        if energy is None:
+            return basis
+        return basis.truncated(_ranks_for_energy(basis, limits, energy))
 
     def __repr__(self) -> str:
         components = name_components(self.space, map(len, self.components))
@@ -161,16 +164,16 @@ class Eigenbasis:
     def project(self, image: ArrayLike) -> tuple[NDArray[np.float32], ...]:
         """Return the coefficients w_j of an image, a tuple of C float32 arrays of shape (k_c,).
 
-        The image, (H, W, 3), (H, W, 1) or (H, W), has any size and is resampled to the basis. The
-        method raises `ImageError` if `eigengs_dr.image.io.check_image` refuses the array.
+        The image, (H, W, 3), (H, W, 1) or (H, W), may have any size and is resampled to the basis.
+        The method raises `ImageError` if `eigengs_dr.image.io.check_image` rejects the array.
         """
         return self._coefficients(self._centred(image))
 
     def reconstruct(self, coefficients: Sequence[ArrayLike]) -> NDArray[np.float32]:
-        """Return the image of C arrays of coefficients, shape (k_c,), as `project` returns them.
+        """Return the image for C arrays of coefficients, shape (k_c,), as `project` returns them.
 
-        The image is RGB, not clamped, float32, shape (H, W, 3). The method raises ValueError if
-        there is not one coefficient for each component.
+        The image is RGB, not clamped, float32, shape (H, W, 3). The method raises ValueError unless
+        there is one coefficient for each component.
         """
         weights = [np.asarray(w, np.float32) for w in coefficients]
         actual, expected = [w.shape for w in weights], [(len(c),) for c in self.components]
@@ -180,7 +183,7 @@ class Eigenbasis:
         return _rgb(self.mean + np.stack([np.tensordot(w, c, 1) for w, c in pairs]), self.space)
 
     def energy(self) -> tuple[NDArray[np.float64], ...]:
-        """Return the share of the variance that the first 1, 2, ..., k_c components hold.
+        """Return the share of the variance of the first 1, 2, ..., k_c components.
 
         The result is a tuple of C float64 arrays of shape (k_c,), ascending, at most 1.
         """
@@ -188,19 +191,19 @@ class Eigenbasis:
         return tuple(np.minimum(np.cumsum(v) / (total or 1), 1) for v, total in pairs)
 
     def truncation_curve(self, images: Iterable[ArrayLike] | None = None) -> TruncationCurve:
-        """Return the mean PSNR of images over the number of components.
+        """Return the mean PSNR of images as a function of the number of components.
 
         ``basis.truncated(basis.truncation_curve(images).rank_for_psnr(30))`` reaches 30 dB.
 
         Parameters
         ----------
         images : iterable of array_like, optional
-            At least one image as for `project` (else ValueError), best not from the training. By
-            default, the eigenvalues give the curve of the training images.
+            At least one image as for `project` (otherwise ValueError), preferably not from the
+            training. By default, the curve of the training images follows from the eigenvalues.
         """
         if images is None:
             return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean.size)
-        rows = [self._left(image) for image in images]
+        rows = [self._residuals(image) for image in images]
         if not rows:
             raise ValueError("there are no images to measure the basis on; pass at least one")
         residuals = [np.stack(channel) for channel in zip(*rows, strict=True)]
@@ -209,17 +212,17 @@ class Eigenbasis:
     def truncated(self, components: int | Sequence[int]) -> Eigenbasis:
         """Return the basis of the first components; `components` is one number, or one per channel.
 
-        The method raises ValueError for a negative number, or not C numbers.
+        The method raises ValueError for a negative number, or if there are not C numbers.
         """
-        most = check_components(components)
+        counts = check_components(components)
         return replace(
             self,
-            components=tuple(c[:k] for c, k in zip(self.components, most, strict=True)),
-            eigenvalues=tuple(e[:k] for e, k in zip(self.eigenvalues, most, strict=True)),
+            components=tuple(c[:k] for c, k in zip(self.components, counts, strict=True)),
+            eigenvalues=tuple(e[:k] for e, k in zip(self.eigenvalues, counts, strict=True)),
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an ``.npz`` file, all or nothing; after OSError, an old file is unchanged."""
+        """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
         write_basis(path, self)
 
     @classmethod
@@ -229,14 +232,15 @@ class Eigenbasis:
         Raises
         ------
         ValueError
-            If the file is no basis, damaged, too new or inconsistent; names the file and the key.
+            If the file is not a basis, damaged, too new or inconsistent; names the file and the
+            key.
         OSError
             If the file cannot be opened.
         """
         return cls(**read_basis(path))
 
     def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
-        """Resample and convert an image and subtract the mean; shape (C, H, W)."""
+        """Resample and convert an image, and subtract the mean; shape (C, H, W)."""
         pixels = resample(check_image(image), self.width, self.height)
         planes = to_planes(pixels, self.space) - self.mean.reshape(len(self.mean), -1)
         return planes.reshape(self.mean.shape)
@@ -245,7 +249,7 @@ class Eigenbasis:
         pairs = zip(self.components, planes, strict=True)
         return tuple(np.tensordot(components, plane) for components, plane in pairs)
 
-    def _left(self, image: ArrayLike) -> list[NDArray[np.float64]]:
+    def _residuals(self, image: ArrayLike) -> list[NDArray[np.float64]]:
         """Return the squared error of each channel after 0, 1, ..., k_c components."""
         planes = self._centred(image)
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
@@ -262,12 +266,12 @@ def _rgb(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
 def check_components(
     components: int | Sequence[int], energy: float | None = None
 ) -> tuple[int, int, int]:
-    """Return the most components of each channel; raise ValueError for bad numbers or energy."""
+    """Return the limit of components of each channel; raise ValueError for invalid arguments."""
     if energy is not None and not 0 < energy <= 1:
         raise ValueError(f"energy is {energy}; expected a share of the variance in (0, 1]")
     try:
-        each = components if isinstance(components, Iterable) else (components,) * 3
-        y, cb, cr = map(index, each)
+        numbers = components if isinstance(components, Iterable) else (components,) * 3
+        y, cb, cr = map(index, numbers)
     except (TypeError, ValueError):
         raise ValueError(f"components is {components!r}; expected a number, or three") from None
     if min(y, cb, cr) < 0:
@@ -275,11 +279,11 @@ def check_components(
     return y, cb, cr
 
 
-def _ranks_for_energy(basis: Eigenbasis, most: Sequence[int], energy: float) -> list[int]:
-    """Return the fewest components that hold a share of a channel; warn if `most` are too few."""
+def _ranks_for_energy(basis: Eigenbasis, limits: Sequence[int], energy: float) -> list[int]:
+    """Return the fewest components with a share of the variance; warn if the limits are too low."""
     ranks = []
     names, shares = CHANNELS[basis.space], basis.energy()
-    for name, held, cap, total in zip(names, shares, most, basis.variance, strict=True):
+    for name, held, cap, total in zip(names, shares, limits, basis.variance, strict=True):
         ranks.append(int(np.searchsorted(held, energy)) + 1)
         share = held[-1] if len(held) else 0.0
         if total > 0 and len(held) == cap and share < energy - ENERGY_TOLERANCE:

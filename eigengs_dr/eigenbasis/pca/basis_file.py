@@ -24,7 +24,7 @@ ENERGY_TOLERANCE = 1e-5
 """Relative tolerance between the sum of the eigenvalues and the variance."""
 
 MAX_ENTRIES = 1 << 28
-"""Most elements of the mean image."""
+"""Largest number of elements of the mean image."""
 
 LAYOUT: dict[str, npz.Field] = {
     "mean": npz.Field("f4", 3, MAX_ENTRIES),
@@ -33,12 +33,12 @@ LAYOUT: dict[str, npz.Field] = {
     "space": npz.Field("U", 0),
     **{f"eigenvalues{c}": npz.Field("f8", 1) for c in range(3)},
 }
-"""Arrays of a file, except the components, whose shapes follow from these. Files of version 1 have
-training images too, which are not read."""
+"""Arrays of a file, except the components, whose shapes follow from these. Files of version 1 also
+hold training images, which are not read."""
 
 
 def write_basis(path: str | os.PathLike[str], basis: Eigenbasis) -> None:
-    """Write an `eigengs_dr.Eigenbasis`, all or nothing; see its `save`."""
+    """Write an `eigengs_dr.Eigenbasis` atomically; see its `save`."""
     fields = ("mean", "variance", "count", "space")
     arrays = {name: np.asarray(getattr(basis, name)) for name in fields}
     for c, pair in enumerate(zip(basis.components, basis.eigenvalues, strict=True)):
@@ -70,7 +70,7 @@ def read_basis(path: str | os.PathLike[str]) -> Record:
 def check_arrays(arrays: Mapping[str, NDArray], shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise `npz.BadValue` unless arrays of a basis or a model are valid.
 
-    They must be finite and have these shapes. Eigenvalues must descend, and fit the variance.
+    They must be finite and have these shapes. Eigenvalues must descend, and match the variance.
     """
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():

@@ -1,7 +1,7 @@
-"""Incremental PCA: the mean and the principal components of images that come in blocks.
+"""Incremental PCA: the mean and the principal components of images that arrive in blocks.
 
-A state belongs to one channel. Its rows stay orthonormal in single precision, and their Gram matrix
-is summed in double.
+A state belongs to one channel. Its rows remain orthonormal in single precision; their Gram matrix
+is summed in double precision.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from scipy.linalg import eigh
 from ...backend.types import Doubles, Singles
 
 BLOCK_BYTES = 768 << 20
-"""Bytes of a block of images."""
+"""Size of a block of images in bytes."""
 
 MAX_BLOCK = 1024
-"""Most images in a block: its Gram matrix has as many rows."""
+"""Largest number of images in a block, and so of rows of its Gram matrix."""
 
 EXTRA_SHARE = 0.25
-"""Additional components from block to block, as a share of the components to keep."""
+"""Additional components that are kept between blocks, as a share of the final components."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,9 @@ class EigenState:
     mean : ndarray of float64, shape (d,)
         Mean of the images; d is the number of pixels.
     rows : ndarray of float32, shape (r, d)
-        Orthonormal directions of largest scatter, descending.
+        Orthonormal directions of the largest scatter, descending.
     scatter : ndarray of float64, shape (r,)
-        Sum over the images of the squared length along each row: m times the variance.
+        Sum over the images of the squared coefficient of each row: m times the variance.
     squares : float
         Sum over the images of the squared distance to the mean.
     """
@@ -54,7 +54,7 @@ class EigenState:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray]) -> EigenState:
-        """Rebuild a state from the result of `arrays`; the next blocks then give equal bits."""
+        """Rebuild a state from the result of `arrays`; later results are bit-identical."""
         numbers = {name: arrays[name].item() for name in ("count", "squares")}
         return cls(**{**arrays, **numbers})
 
@@ -73,29 +73,29 @@ def block_length(size: tuple[int, int]) -> int:
 
 
 def rank_for(components: int) -> int:
-    """Return how many rows a state needs for `components` accurate components at the end."""
+    """Return the number of rows that a state needs for `components` accurate components."""
     return components + int(np.ceil(EXTRA_SHARE * components))
 
 
 def merge(state: EigenState, block: Singles, rank: int) -> EigenState:
     """Add a block of images to a state, by one step of incremental PCA.
 
-    With n images of mean m1 before and b new images of mean m2, the scatter matrix of all is ::
+    With n earlier images of mean m1 and b new images of mean m2, the scatter matrix of all is ::
 
         S = S1 + S2 + n b / (n + b) (m1 - m2) (m1 - m2)^T
 
     (Ross et al. 2008, "Incremental learning for robust visual tracking", IJCV 77, eq. 3). Its
-    eigenvectors follow from the Gram matrix of all rows, which is small. The result is exact but
-    for rounding if there are at most `rank` directions.
+    eigenvectors follow from the Gram matrix of all rows, which is small. If there are at most
+    `rank` directions, the result is exact except for rounding.
 
     Parameters
     ----------
     state : EigenState
-        The state before; it does not change.
+        The earlier state; it is not changed.
     block : ndarray of float32, shape (b, d)
-        The new images; the function overwrites them.
+        The new images, which are overwritten.
     rank : int
-        Most rows to keep; see `rank_for`.
+        Largest number of rows to keep; see `rank_for`.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def merge(state: EigenState, block: Singles, rank: int) -> EigenState:
     if b == 0:
         return state
     mean = block.mean(axis=0, dtype=np.float64)
-    # This shift towards the old mean gives the new images the scatter of both last terms.
+    # With this shift towards the old mean, the scatter of the new images includes the last term.
     block -= (mean + np.sqrt(n / (n + b)) * (state.mean - mean)).astype(np.float32)
     rows, scatter, added = _add_rows(state, block, rank, n + b)
     mean = state.mean + b / (n + b) * (mean - state.mean)
@@ -113,7 +113,7 @@ def merge(state: EigenState, block: Singles, rank: int) -> EigenState:
 
 
 def merge_states(first: EigenState, second: EigenState, rank: int) -> EigenState:
-    """Return the state of the images of two states, by the equation of `merge`."""
+    """Return the state for the images of two states, by the equation of `merge`."""
     if not second.count or not first.count:
         return second if second.count else first
     n, m = first.count, second.count
@@ -129,15 +129,15 @@ def merge_states(first: EigenState, second: EigenState, rank: int) -> EigenState
 def _add_rows(
     state: EigenState, block: Singles, rank: int, count: int
 ) -> tuple[Singles, Doubles, float]:
-    """Add the rows of a block to the scatter matrix of a state; return the trace they add too."""
+    """Add the rows of a block to the scatter matrix of a state; also return the added trace."""
     old = len(state.rows)
     roots = np.sqrt(state.scatter)
-    gram = np.zeros((old + len(block),) * 2)  # of [roots rows; block]; the upper right stays 0
+    gram = np.zeros((old + len(block),) * 2)  # of [roots rows; block]; the upper right is unused
     gram[np.arange(old), np.arange(old)] = state.scatter
     gram[old:, :old] = product(block, state.rows) * roots
     gram[old:, old:] = product(block, block)
     added = float(np.trace(gram[old:, old:]))
-    values, weights = largest_eigenpairs(gram, rank, FLOOR * count * block.shape[1])
+    values, weights = largest_eigenpairs(gram, rank, MIN_VARIANCE * count * block.shape[1])
     weights[:old] *= roots[:, None]
     combine = weights.T.astype(np.float32)
     directions = combine[:, old:] @ block
@@ -145,40 +145,41 @@ def _add_rows(
     return *orthonormalize(directions, values), added
 
 
-FLOOR = 1e-10
-"""Smallest variance of a component, per pixel (1 is white); below, it is rounding."""
+MIN_VARIANCE = 1e-10
+"""Smallest variance of a component per pixel, with 1 as white; smaller ones are rounding."""
 
-NOISE = 1e-8
-"""Smallest eigenvalue, as a share of all variance; below, it is rounding of the Gram matrix."""
+MIN_EIGENVALUE_SHARE = 1e-8
+"""Smallest eigenvalue relative to the total variance; smaller ones are rounding of the Gram
+matrix."""
 
-DRIFT = 1e-6
-"""Largest entry of ``V V^T - 1`` without a correction of the rows V."""
+MAX_DRIFT = 1e-6
+"""Largest entry of ``V V^T - 1`` for which the rows V are not orthonormalized again."""
 
-COLUMNS = 4096
-"""Number of pixels to sum in single precision, before the sums are added in double."""
+SUM_PIXELS = 4096
+"""Number of pixels that are summed in single precision before the sums are added in double."""
 
-FEW = 0.25
-"""Share of the eigenvalues below which LAPACK's ``syevr`` finds only these: of 2,048, 300 take
-0.8 s instead of 1.2, and the memory of one matrix instead of three. Of 631, 375 take 0.11 s instead
-of 0.05."""
+SUBSET_SHARE = 0.25
+"""Share of the eigenvalues below which LAPACK's ``syevr`` computes only these: 300 of 2,048 take
+0.8 s instead of 1.2 s, and the memory of one matrix instead of three. 375 of 631 would take 0.11 s
+instead of 0.05 s."""
 
 
 def product(a: Singles, b: Singles) -> Doubles:
-    """Return ``a b^T`` of long rows; pure single precision would lose small variances."""
+    """Return ``a b^T`` for long rows; single precision alone would lose small variances."""
     result = np.zeros((len(a), len(b)))
-    for first in range(0, a.shape[1], COLUMNS):
-        result += a[:, first : first + COLUMNS] @ b[:, first : first + COLUMNS].T
+    for first in range(0, a.shape[1], SUM_PIXELS):
+        result += a[:, first : first + SUM_PIXELS] @ b[:, first : first + SUM_PIXELS].T
     return result
 
 
-def largest_eigenpairs(gram: Doubles, most: int, floor: float) -> tuple[Doubles, Doubles]:
+def largest_eigenpairs(gram: Doubles, limit: int, floor: float) -> tuple[Doubles, Doubles]:
     """Return the largest eigenvalues of a Gram matrix, and the weights of its rows.
 
     Parameters
     ----------
     gram : ndarray of float64, shape (n, n)
-        Only the lower left is read; the function may overwrite the matrix.
-    most : int
+        Only the lower left is read; the matrix may be overwritten.
+    limit : int
         Largest number of eigenvalues.
     floor : float
         Smallest eigenvalue to return.
@@ -188,24 +189,24 @@ def largest_eigenpairs(gram: Doubles, most: int, floor: float) -> tuple[Doubles,
     values : ndarray of float64, shape (k,)
         Descending.
     weights : ndarray of float64, shape (n, k)
-        The weights that make unit vectors of the rows: eigenvectors by roots of eigenvalues.
+        Weights that combine the rows to unit vectors: eigenvectors divided by roots of eigenvalues.
     """
     n, trace = len(gram), np.trace(gram)
-    if most < FEW * n:
-        wanted = [n - most - 1, n - 1]
-        # The transpose is in Fortran's order, which LAPACK takes without a copy.
+    if limit < SUBSET_SHARE * n:
+        subset = [n - limit - 1, n - 1]
+        # The transpose is in Fortran order, which LAPACK accepts without a copy.
         values, vectors = eigh(
-            gram.T, lower=False, overwrite_a=True, subset_by_index=wanted, check_finite=False
+            gram.T, lower=False, overwrite_a=True, subset_by_index=subset, check_finite=False
         )
     else:
         values, vectors = np.linalg.eigh(gram, UPLO="L")
     values, vectors = values[::-1], vectors[:, ::-1]
-    kept = min(most, int((values > max(floor, NOISE * trace)).sum()))
+    kept = min(limit, int((values > max(floor, MIN_EIGENVALUE_SHARE * trace)).sum()))
     return values[:kept], vectors[:, :kept] / np.sqrt(values[:kept])
 
 
 def orthonormalize(rows: Singles, scatter: Doubles) -> tuple[Singles, Doubles]:
-    """Drop spurious rows and make the others orthonormal again after rounding.
+    """Drop spurious rows, and make the others orthonormal again after rounding.
 
     Parameters
     ----------
@@ -220,22 +221,22 @@ def orthonormalize(rows: Singles, scatter: Doubles) -> tuple[Singles, Doubles]:
     scatter : ndarray of float64, shape (l,)
     """
     overlap = product(rows, rows)
-    # If the length of a row is far from 1, its eigenvalue is rounding and the row means nothing.
-    real = np.abs(np.diag(overlap) - 1) < 0.5
-    if not real.all():
-        rows, scatter, overlap = rows[real], scatter[real], overlap[real][:, real]
-    if np.abs(overlap - np.eye(len(rows))).max(initial=0) > DRIFT:
-        # Gram-Schmidt, largest scatter first, so that errors leave the rows of small scatter.
+    # If the length of a row is far from 1, its eigenvalue is rounding, and the row is meaningless.
+    valid = np.abs(np.diag(overlap) - 1) < 0.5
+    if not valid.all():
+        rows, scatter, overlap = rows[valid], scatter[valid], overlap[valid][:, valid]
+    if np.abs(overlap - np.eye(len(rows))).max(initial=0) > MAX_DRIFT:
+        # Gram-Schmidt from the largest scatter, so that errors are removed from small scatter.
         inverse = np.linalg.inv(np.linalg.cholesky(overlap))
         rows = inverse.astype(np.float32) @ rows
     return rows, scatter
 
 
 def orient(rows: Singles) -> Singles:
-    """Give each row the sign that makes its entry of largest size positive, as scikit-learn does.
+    """Choose the sign of each row so that its largest absolute entry is positive.
 
-    The eigenvectors of a matrix have no sign of their own: without this rule, rounding would choose
-    it.
+    This is the rule of scikit-learn. The signs of eigenvectors are arbitrary: without a rule, they
+    would depend on rounding.
     """
     positive = [row.max() >= -row.min() for row in rows]
     signs = np.where(positive, 1, -1).astype(np.float32)

@@ -1,9 +1,9 @@
-"""The components of all images of a source: shards that workers stream, merged one after the other.
+"""The components of all images of a source: shards that workers process, merged in order.
 
-A shard is a part of the images, cut by their number alone. Its state is found block by block, in
-this process or on a worker. This process then merges the states of shards in their order, so the
-result has the same bits for any number of workers. The channels are states of their own, and their
-sums lie in files, so a large family fits into 1 GB.
+A shard is a part of the images, determined only by their number. Its state is computed block by
+block, in this process or on a worker. This process then merges the states of the shards in order,
+so that the result is bit-identical for any number of workers. Each channel has its own state, and
+merged states are stored in files, so that a large family fits into 1 GB of memory.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from ...storage.checkpoint import read_arrays, write_arrays
 from .incremental import EigenState, block_length, empty_state, merge, merge_states
 
 SHARD = 2048
-"""Images of a shard. Merging two states of 375 rows takes 0.2 of the time of a shard of so many
+"""Number of images of a shard. Merging two states of 375 rows takes 0.2 of the time of a shard of
 images of 256x256."""
 
-BLOCKS_OF_SHARD = 4
-"""If there are several shards, a block has this fraction of the images of `block_length`: 256 of
-256x256. A process then needs less than 1 GB."""
+BLOCK_DIVISOR = 4
+"""With several shards, the number of images of a block from `block_length` is divided by this: 256
+of 256x256. A process then needs less than 1 GB."""
 
 Images = Sequence | Values
 """Files or single images, or one array of images."""
 
 
 class Stream(NamedTuple):
-    """What decides the states of images, beside the images.
+    """The parameters that determine the states of images.
 
     Attributes
     ----------
     size : (int, int)
     space : {"ycbcr", "rgb"}
     ranks : sequence of 3 ints
-        Most rows of the state of each channel.
+        Largest number of rows of the state of each channel.
     length : int
-        Images of a block.
+        Number of images of a block.
     progress : callable or None
-        For this process alone.
+        Used in this process only.
     """
 
     size: tuple[int, int]
@@ -71,19 +71,19 @@ def find_states(
     client: object = None,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> list[EigenState]:
-    """Find the state of each channel after all images of a source.
+    """Compute the state of each channel for all images of a source.
 
     Parameters
     ----------
     ranks : sequence of 3 ints
-        Most rows of the state of each channel.
+        Largest number of rows of the state of each channel.
     source, size, space, progress, client, checkpoint
         See `eigengs_dr.Eigenbasis.from_images`, also for errors.
     """
     images: Any = list_images(source) if isinstance(source, (str, os.PathLike)) else source
     countable = is_countable(images)
     if client is not None and not countable:
-        raise ValueError("the source is no list of files or images; a cluster needs a list")
+        raise ValueError("the source is not a list of files or images; a cluster needs a list")
     stream = Stream(size, space, ranks, block_length(size), progress)
     if client is None and not (countable and len(images) > SHARD):
         return _find_states_of_part(images, stream)
@@ -92,7 +92,7 @@ def find_states(
 
 
 def is_countable(source: object) -> bool:
-    """Whether a source is a sequence of files or of single images, which can be cut in shards."""
+    """Return whether a source is a sequence of files or single images, which can be sharded."""
     if isinstance(source, np.ndarray):
         return source.ndim == 4 or (source.ndim == 3 and source.shape[2] not in (1, 3))
     return isinstance(source, Sequence) and all(
@@ -102,9 +102,9 @@ def is_countable(source: object) -> bool:
 
 
 def _merge_shards(images: Images, stream: Stream, client: object, folder: Path) -> list[EigenState]:
-    """Merge the states of shards in their order.
+    """Merge the states of shards in order.
 
-    In the folder, ``pca-C.npz`` is the state of channel C after the first shards, and their number.
+    In the folder, ``pca-C.npz`` holds the state of channel C after some shards, and their number.
     """
     total, report = len(images), stream.progress or (lambda done, total, row: None)
     files = [folder / f"pca-{c}.npz" for c in range(len(stream.ranks))]
@@ -113,9 +113,9 @@ def _merge_shards(images: Images, stream: Stream, client: object, folder: Path) 
     done = min(begun * SHARD, total)
 
     if total > SHARD:
-        stream = stream._replace(length=max(1, stream.length // BLOCKS_OF_SHARD))
-    within = None if client is not None else lambda n, of, row: report(done + n, total, row)
-    stream = stream._replace(progress=within)
+        stream = stream._replace(length=max(1, stream.length // BLOCK_DIVISOR))
+    in_shard = None if client is not None else lambda n, of, row: report(done + n, total, row)
+    stream = stream._replace(progress=in_shard)
     tasks = (
         (k, _absolute(images[k * SHARD : (k + 1) * SHARD]))
         for k in range(begun, -(-total // SHARD))
@@ -145,9 +145,9 @@ def _merge_shards(images: Images, stream: Stream, client: object, folder: Path) 
 
 
 def make_shard(task: tuple[int, Images], stream: Stream) -> tuple[list[EigenState], list[str]]:
-    """Find the states of a shard of images, and what was said; this runs on a worker.
+    """Compute the states of a shard of images, and return its warnings; this runs on a worker.
 
-    A shard of which no file can be read has empty states; a wrong array is an error.
+    If no file of a shard can be read, its states are empty; an invalid array is an error.
     """
     _, images = task
     notes = []
@@ -164,19 +164,19 @@ def make_shard(task: tuple[int, Images], stream: Stream) -> tuple[list[EigenStat
 
 
 def _find_states_of_part(images: Images, stream: Stream) -> list[EigenState]:
-    """Find the state of each channel, block by block."""
+    """Compute the state of each channel, block by block."""
     size, space, ranks, length, progress = stream
     states = [empty_state(size) for _ in ranks]
     with closing(read_blocks(images, size, space, length, progress)) as blocks:
         for block in blocks:
             for c, rank in enumerate(ranks):
                 states[c] = merge(states[c], block[:, c], rank)
-            del block  # before the next is read
+            del block  # before the next one is read
     return states
 
 
 def _absolute(images: Images) -> Images:
-    """Name files from the root: a worker runs in another folder."""
+    """Make file names absolute, because a worker runs in another folder."""
     if not isinstance(images, Sequence):
         return images
     is_file = (str, os.PathLike)

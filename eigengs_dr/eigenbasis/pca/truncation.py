@@ -1,15 +1,15 @@
-"""Truncation curves: the error over the number of components, and the rank for a PSNR.
+"""Truncation curves: the error by the number of components, and the rank for a PSNR.
 
-Let x be a channel of an image less the mean image, and w_j its coefficients on orthonormal
-components. The first k components leave the error ::
+Let x be a channel of an image minus the mean image, and w_j its coefficients on orthonormal
+components. The residual of the first k components is ::
 
-    left(k) = |x|^2 - sum_(j <= k) w_j^2
+    residual(k) = |x|^2 - sum_(j <= k) w_j^2
 
 so one cumulative sum gives the error for every k. On average over a family of images, w_j^2 is the
 eigenvalue lambda_j, and |x|^2 is the sum of all eigenvalues.
 
-For a family, the curve adds the components of all channels in the order of falling eigenvalues.
-For one image, each channel has its own rank, and the sum of the ranks is minimal.
+For a family, the curve adds the components of all channels in the order of descending eigenvalues.
+For a single image, each channel has its own rank, and the sum of the ranks is minimal.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ...backend.messages import warn
 from ...backend.types import Doubles
 
 MIN_MSE = 1e-12
-"""Smallest mean squared error, 120 dB; smaller errors are rounding of single precision."""
+"""Lower bound of mean squared errors, 120 dB; smaller errors are rounding of single precision."""
 
 
 class TruncationCurve(NamedTuple):
@@ -36,15 +36,15 @@ class TruncationCurve(NamedTuple):
     counts : ndarray of int64, shape (n + 1, C)
         Number of components of each channel.
     psnr : ndarray of float64, shape (n + 1,)
-        PSNR in dB, ascending, at most 120, of all channels, neither clamped nor rounded, with peak
-        1. For the channels Y, Cb and Cr, it is psnr_ycbcr.
+        PSNR of all channels in dB, ascending, at most 120. Values are neither clamped nor rounded,
+        and the peak is 1: for the channels Y, Cb and Cr, it is psnr_ycbcr.
     """
 
     counts: NDArray[np.int64]
     psnr: Doubles
 
     def rank_for_psnr(self, target_psnr: float) -> tuple[int, ...]:
-        """Find the fewest components of each channel that reach a PSNR.
+        """Return the fewest components of each channel that reach a PSNR.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class TruncationCurve(NamedTuple):
 
 
 def curve_from_residuals(
-    eigenvalues: Sequence[Doubles], left: Sequence[Doubles], entries: int
+    eigenvalues: Sequence[Doubles], residuals: Sequence[Doubles], entries: int
 ) -> TruncationCurve:
     """Build the curve of all channels from the residuals of each.
 
@@ -92,11 +92,11 @@ def curve_from_residuals(
     ----------
     eigenvalues : sequence of C ndarrays, shape (k_c,)
         Variances along the components, descending.
-    left : sequence of C ndarrays of float64, shape (k_c + 1,) or (M, k_c + 1)
+    residuals : sequence of C ndarrays of float64, shape (k_c + 1,) or (M, k_c + 1)
         Squared error of a channel, summed over its pixels, after 0, 1, ..., k_c components, for
         one image or for M images.
     entries : int
-        Number of pixels times channels, H W C.
+        Number of pixels times number of channels, H W C.
 
     Returns
     -------
@@ -108,21 +108,21 @@ def curve_from_residuals(
     channel = np.repeat(channels, [len(values) for values in eigenvalues])[order]
     one_hot = channel[:, None] == np.array(channels)
     counts = np.vstack([np.zeros(len(channels), np.int64), np.cumsum(one_hot, axis=0)])
-    error = sum(rows[..., n] for rows, n in zip(left, counts.T, strict=True)) / entries
+    error = sum(rows[..., n] for rows, n in zip(residuals, counts.T, strict=True)) / entries
     return TruncationCurve(counts, np.atleast_2d(_decibels(error)).mean(axis=0))
 
 
 def curve_from_eigenvalues(
     eigenvalues: Sequence[Doubles], variance: Doubles, entries: int
 ) -> TruncationCurve:
-    """Build the curve of the training images from the eigenvalues alone.
+    """Build the curve of the training images from the eigenvalues.
 
     Parameters
     ----------
     eigenvalues, entries
         See `curve_from_residuals`.
     variance : ndarray of float64, shape (C,)
-        Sum of all eigenvalues of each channel, with those of dropped components.
+        Sum of all eigenvalues of each channel, including those of dropped components.
 
     Returns
     -------
@@ -136,33 +136,33 @@ def curve_from_eigenvalues(
 
 
 def min_ranks_per_channel(
-    left: Sequence[Doubles], entries: int, target_psnr: float
+    residuals: Sequence[Doubles], entries: int, target_psnr: float
 ) -> tuple[int, ...]:
-    """Find the rank of each channel with the smallest sum that reaches a PSNR for one image.
+    """Return the ranks of the channels with the smallest sum that reach a PSNR for one image.
 
     Parameters
     ----------
-    left : sequence of 3 ndarrays, shape (k_c + 1,)
+    residuals : sequence of 3 ndarrays, shape (k_c + 1,)
         See `curve_from_residuals`; descending.
     entries : int
-        Number of pixels times channels.
+        Number of pixels times number of channels.
     target_psnr : float
         In dB.
 
     Returns
     -------
     tuple of 3 ints
-        Errors and warnings are those of `TruncationCurve.rank_for_psnr`.
+        Errors and warnings as for `TruncationCurve.rank_for_psnr`.
     """
     check_target(target_psnr)
-    first, second, third = left
+    first, second, third = residuals
     allowed = entries * 10 ** (-target_psnr / 10) - second[:, None] - third
-    needed = np.searchsorted(-first, -allowed)  # of the first channel, for all ranks of the others
+    needed = np.searchsorted(-first, -allowed)  # rank of the first channel for all other ranks
     total = needed + np.arange(len(second))[:, None] + np.arange(len(third))
-    total[needed == len(first)] = sum(map(len, left))
-    if total.min() == sum(map(len, left)):
-        last = sum(rows[-1] for rows in left) / entries
-        counts = tuple(len(rows) - 1 for rows in left)
+    total[needed == len(first)] = sum(map(len, residuals))
+    if total.min() == sum(map(len, residuals)):
+        last = sum(rows[-1] for rows in residuals) / entries
+        counts = tuple(len(rows) - 1 for rows in residuals)
         _warn_out_of_reach(target_psnr, counts, float(_decibels(last)))
         return counts
     j, k = np.unravel_index(total.argmin(), total.shape)
@@ -177,7 +177,7 @@ def residual_energy(total: float, gains: Doubles) -> Doubles:
 def check_target(target_psnr: float) -> None:
     """Raise ValueError unless a target PSNR is a positive number."""
     if not 0 < target_psnr < math.inf:
-        raise ValueError(f"target_psnr is {target_psnr}; expected a number of dB above 0")
+        raise ValueError(f"target_psnr is {target_psnr}; expected a number above 0, in dB")
 
 
 def _decibels(error: NDArray[np.float64] | float) -> Doubles:
@@ -185,14 +185,14 @@ def _decibels(error: NDArray[np.float64] | float) -> Doubles:
 
 
 def _warn_out_of_reach(target_psnr: float, counts: Iterable[int], reached: float) -> None:
-    every = "+".join(map(str, counts))
-    warn(f"{target_psnr:g} dB are out of reach: all {every} components have {reached:.2f}")
+    numbers = "+".join(map(str, counts))
+    warn(f"{target_psnr:g} dB is out of reach: all {numbers} components reach {reached:.2f}")
 
 
 CHANNELS = {"ycbcr": ("Y", "Cb", "Cr"), "rgb": ("R", "G", "B")}
-"""Names of the channels of a space, for warnings."""
+"""Names of the channels of a space."""
 
 
 def name_components(space: str, counts: Iterable[int]) -> str:
-    """Return how many components each channel has, as in "230 Y, 60 Cb, 60 Cr"."""
+    """Return the number of components of each channel as text, e.g. "230 Y, 60 Cb, 60 Cr"."""
     return ", ".join(f"{n} {name}" for n, name in zip(counts, CHANNELS[space], strict=True))

@@ -1,13 +1,13 @@
 """Lists of the Gaussians that touch each tile, and of the tiles that each Gaussian touches.
 
 Both list the same pairs of a Gaussian and a tile: the sum over Gaussians reads them by tile, and
-its adjoint reads them by Gaussian. The adjoint therefore is the exact transpose of the sum, also
-while Gaussians move between two builds of the lists.
+its adjoint by Gaussian. The adjoint therefore is the exact transpose of the sum, even while
+Gaussians move between two builds of the lists.
 
-The Gaussians by tile are the transpose of the tiles by Gaussian. On llvm a counting sort on one
-core is 18 times as fast as a sort of keys in Dr.Jit (450,000 entries). On cuda a radix sort needs
-no copy to the host. Lanes are ordered for SIMD packets of like work, and for blocks of like work
-for every core.
+The Gaussians by tile are the transpose of the tiles by Gaussian. On llvm, a counting sort on one
+core is 18 times as fast as sorting keys in Dr.Jit (450,000 entries). On cuda, a radix sort needs no
+copy to the host. Lanes are ordered so that the lanes of a SIMD packet, and the blocks of all
+cores, have similar amounts of work.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ MAX_LIST_ENTRIES = 1 << 28
 """Largest number of entries in the lists of all tiles; they take 4 GiB while they are built."""
 
 TILE_WINDOW = 32
-"""Side in tiles of the squares within which tiles are ordered by the length of their lists."""
+"""Side, in tiles, of the squares within which tiles are sorted by the length of their lists."""
 
 PIECE_WINDOW = 2048
-"""Pieces among which the pieces are ordered by their length."""
+"""Number of consecutive pieces that are sorted by length."""
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """The tiles that each Gaussian touches, in pieces of few visits: the lanes of the adjoint.
+    """The tiles that each Gaussian touches, cut into pieces: the lanes of the adjoint.
 
     Attributes
     ----------
@@ -60,9 +60,9 @@ class Pieces:
     first, number : UInt32, shape (N,)
         Slots ``[first, first + number)`` of each Gaussian.
     capacity : (int, int)
-        Sizes of `tile` and `slot`. A replay of a frozen program of Dr.Jit 1.5 infers the sizes of
-        its arrays from those of its arguments, and may write outside of memory if one changes. The
-        numbers are part of the arguments, so that other sizes are traced anew.
+        Sizes of `tile` and `slot`. When Dr.Jit 1.5 replays a frozen program, it infers the sizes of
+        its arrays from those of the arguments, and may write out of bounds if one of them has
+        changed. These numbers are part of the arguments, so that other sizes are traced anew.
     """
 
     tile: UInt
@@ -83,25 +83,26 @@ class TileLists:
     ----------
     grid : Grid
     sizes : GridArrays
-        Those of `grid`.
+        The sizes of `grid` as arrays.
     splat : UInt32, shape (capacity,)
         Indices of Gaussians, tile after tile; entries after the last list are not used.
     begin, end : UInt32, shape (tiles,)
-        Range in `splat` of the list of the tile ``order[i]``.
+        Range in `splat` of the list of tile ``order[i]``.
     order : UInt32, shape (tiles,)
-        Tiles in the order of lanes: neighbours in one SIMD packet have lists of like length.
+        Tiles in the order of lanes: the lists in a SIMD packet have similar lengths.
     image : UInt32, shape (N,), or None
         Image of each Gaussian; None if there is only one image.
     pieces : Pieces or None
-        The same pairs by Gaussian, for the adjoint; None if they were not asked for.
+        The same pairs by Gaussian, for the adjoint; None if they were not requested.
     capacity : int
         Size of `splat`, for the same reason as in `Pieces`.
-    steep : bool or Bool, shape (1,)
-        Whether weights take exponentials at every pixel, because a Gaussian is too narrow, a tile
-        is not 4 pixels wide or exponentials cost less; see `eigengs_dr.raster.evaluate.weights`.
-        An array, from `steep_now`, decides on the device.
+    exact_exp : bool or Bool, shape (1,)
+        Whether weights need an exponential at every pixel, because a Gaussian is too narrow, a tile
+        is not 4 pixels wide, or exponentials are cheaper; see
+        `eigengs_dr.raster.evaluate.weights`. With an array, from `update_exact_exp`, the device
+        decides.
     radius : float
-        Cutoff for which the lists were made, in the units of the factor.
+        Cutoff for which the lists were built, in the units of the factor.
     """
 
     grid: Grid
@@ -113,19 +114,19 @@ class TileLists:
     image: UInt | None
     pieces: Pieces | None
     capacity: int
-    steep: bool | Bool
+    exact_exp: bool | Bool
     radius: float
 
     def runs(self, begin: UInt, end: UInt) -> list[tuple[bool, UInt, UInt]]:
-        """Return loops over ``[begin, end)``: whether each takes exponentials, its begin and end.
+        """Return loops over ``[begin, end)``: (exact_exp, begin, end) of each.
 
-        Where the device decides, there are two, of which it leaves one empty.
+        If the device decides, there are two loops, one of which it leaves empty.
         """
-        if isinstance(self.steep, bool):
-            return [(self.steep, begin, end)]
+        if isinstance(self.exact_exp, bool):
+            return [(self.exact_exp, begin, end)]
         return [
-            (False, begin, dr.select(self.steep, begin, end)),
-            (True, begin, dr.select(self.steep, end, begin)),
+            (False, begin, dr.select(self.exact_exp, begin, end)),
+            (True, begin, dr.select(self.exact_exp, end, begin)),
         ]
 
     def __repr__(self) -> str:
@@ -142,12 +143,12 @@ def build_lists(
     adjoint: bool = True,
     ordered: bool = True,
 ) -> TileLists:
-    """List for every tile the Gaussians whose cutoff ellipse touches it.
+    """For every tile, list the Gaussians whose cutoff ellipse touches it.
 
-    Every Gaussian counts its tiles, then writes its tiles. The transpose of this list gives the
-    lists of the tiles, by a counting sort on llvm and by a radix sort on cuda. Their order depends
-    only on the input, so renderings are equal bit by bit. Cost: linear in the number of entries,
-    and one copy of a few bytes from the device to the host.
+    Every Gaussian counts its tiles, then writes them. The transpose of this list gives the lists of
+    the tiles, by a counting sort on llvm and by a radix sort on cuda. Their order depends only on
+    the input, so that renderings are bit-identical. Cost: linear in the number of entries, and one
+    copy of a few bytes from the device to the host.
 
     Parameters
     ----------
@@ -163,7 +164,7 @@ def build_lists(
     adjoint : bool, optional
         Whether to list the tiles of each Gaussian too.
     ordered : bool, optional
-        Whether lanes are to be ordered by their work, where the backend gains from it.
+        Whether to order lanes by their work, if the backend benefits from it.
 
     Returns
     -------
@@ -175,13 +176,13 @@ def build_lists(
         If the lists would have `MAX_LIST_ENTRIES` entries or more.
     """
     types = types_of(shape[0])
-    # Numbers in arrays: as literals, they would compile the programs again and again.
+    # Numbers are in arrays: as literals, each value would compile a program of its own.
     sizes, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
     share = granularity_of(types)
     touched, totals = _count_tiles(shape, radius, wide, sizes, pad)
     narrow, entries = divmod(int(totals[0]), 1 << 40)  # one copy to the host
-    steep = narrow > 0 or not share.products or grid.tile[0] != TILE[0]
+    exact_exp = narrow > 0 or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
         raise ValueError(
             f"{dr.width(touched)} Gaussians touch {entries} tiles, the limit is "
@@ -189,46 +190,46 @@ def build_lists(
         )
     visits = share.visits_for(entries // grid.images, grid.tiles // grid.images)
     image = _images(types, dr.width(touched), grid)
-    # At most one piece of a Gaussian is not full, which bounds their number without reading it.
-    most = _padded(dr.width(touched) + entries // visits) if adjoint else 0
+    # At most one piece of each Gaussian is not full: this bounds their number without a copy.
+    max_pieces = _padded(dr.width(touched) + entries // visits) if adjoint else 0
     tile, last, cut = _list_tiles(
-        shape, wide, sizes, pad, image, touched, visits, (_padded(entries), most)
+        shape, wide, sizes, pad, image, touched, visits, (_padded(entries), max_pieces)
     )
     pieces = _in_order(types, tile, *cut) if adjoint else None
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
     order, begin, end = _lanes(types, grid, starts, ordered and share.ordered)
     lists = TileLists(
-        grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), steep, radius
+        grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), exact_exp, radius
     )
     dr.eval(lists)
     return lists
 
 
-def steep_now(lists: TileLists, shape: list, radius: float) -> TileLists:
-    """Return lists for Gaussians that have changed since, some of which may be steep now.
+def update_exact_exp(lists: TileLists, shape: list, radius: float) -> TileLists:
+    """Return lists with `TileLists.exact_exp` updated for Gaussians that have changed since.
 
-    Nothing is copied to the host, so that frozen programs can record it. A kernel then holds both
-    ways to evaluate weights, and the one that is taken gives the bits that it gives alone.
+    Nothing is copied to the host, so that frozen programs can record it. A kernel then contains
+    both ways to evaluate weights; the result is bit-identical to that of the chosen one alone.
 
     Parameters
     ----------
     lists : TileLists
         With pieces.
     shape : list of 5 Float, shape (N,)
-        The Gaussians as they are now.
+        The current Gaussians.
     radius : float
     """
-    if lists.steep is True:
+    if lists.exact_exp is True:
         return lists
     assert lists.pieces is not None
     types = types_of(shape[0])
-    # All write the same. Dr.Jit does it in the kernel that packs the parameters: a reduction would
-    # take two more.
-    found = dr.zeros(types.UInt, 1)
-    dr.make_opaque(found)
-    dr.scatter(found, 1, types.UInt(0), is_steep(shape, radius) & (lists.pieces.number > 0))
-    return replace(lists, steep=found != 0)
+    # All lanes write the same value. Dr.Jit fuses this with the kernel that packs the parameters; a
+    # reduction would need two more kernels.
+    any_steep = dr.zeros(types.UInt, 1)
+    dr.make_opaque(any_steep)
+    dr.scatter(any_steep, 1, types.UInt(0), is_steep(shape, radius) & (lists.pieces.number > 0))
+    return replace(lists, exact_exp=any_steep != 0)
 
 
 def _images(types: ArrayTypes, count: int, grid: Grid) -> UInt | None:
@@ -241,10 +242,10 @@ def _images(types: ArrayTypes, count: int, grid: Grid) -> UInt | None:
 
 
 def _padded(count: int) -> int:
-    """Round a size up by at most a quarter, and by at most 2^20, to a multiple of 16.
+    """Round a size up to a multiple of 16, by at most a quarter and at most 2^20.
 
-    Frozen programs are traced again for another size, so that sizes should change seldom. For long
-    lists a trace costs less than the memory would.
+    Frozen programs are traced again for each new size, so sizes should change rarely. For long
+    lists, a trace costs less than the memory would.
     """
     step = max(16, 1 << max(0, min(count.bit_length() - 3, 20)))
     return (count // step + 1) * step
@@ -254,9 +255,9 @@ def _padded(count: int) -> int:
 def _count_tiles(
     shape: list, radius: float, wide: FloatLike, grid: GridArrays, pad: FloatLike
 ) -> tuple[UInt, UInt]:
-    """Return the number of tiles that each Gaussian touches, and totals for one copy to the host.
+    """Return the number of tiles that each Gaussian touches, and a total for one copy to the host.
 
-    The total holds the number of all entries, and 2^40 for each Gaussian that is steep.
+    The total is the number of all entries, plus 2^40 for each Gaussian that is steep.
     """
     types = types_of(shape[0])
     UInt64 = dr.uint64_array_t(types.UInt)
@@ -312,7 +313,7 @@ def _emit_tiles(
 ) -> UInt:
     """Write the tiles of each Gaussian to its slots ``[start, last)``."""
     start, last = slots
-    # Zeros, because rounding could let the two walks differ by a tile in different programs.
+    # Zeros, because rounding may make the two traversals differ by a tile in different programs.
     tiles = dr.zeros(types.UInt, capacity)
     dr.make_opaque(tiles)
     first = types.UInt(0) if grid.image is None or image is None else image * grid.image.divisor
@@ -336,22 +337,22 @@ def _find_tiles(
     slots: tuple[UInt, UInt],
     capacity: int,
 ) -> UInt:
-    """Return the tiles of `_emit_tiles` with a lane for each, which walks the rows of its Gaussian.
+    """Return the tiles of `_emit_tiles`, with one lane per entry that searches its Gaussian's rows.
 
-    With a lane for each Gaussian, and one that adds all of its pieces, a GPU waits for the largest
-    one: a fit of 2048x2048 pixels and 320,000 Gaussians took 5.7 s instead of 1.1 s (H200).
+    With one lane per Gaussian, and one that adds all of its pieces, a GPU waits for the largest
+    Gaussian: a fit of 2048x2048 pixels and 320,000 Gaussians took 5.7 s instead of 1.1 s (H200).
     """
     start, last = slots
     i, count = dr.arange(types.UInt, capacity), dr.opaque(types.UInt, dr.width(last))
     dr.eval(start, last)
     owner = _search(count, last, i + 1)
     real = owner < count
-    own = [dr.gather(types.Float, row, owner, real) for row in shape]
+    owner_shape = [dr.gather(types.Float, row, owner, real) for row in shape]
     pad = pad if dr.width(pad) == 1 else dr.gather(types.Float, pad, owner, real)
-    row, stop = tile_rows(own, radius, grid, pad)
+    row, stop = tile_rows(owner_shape, radius, grid, pad)
 
     def visit(row: UInt, left: UInt, tile: UInt) -> tuple:
-        first, last = tile_columns(own, radius, grid, row, pad)
+        first, last = tile_columns(owner_shape, radius, grid, row, pad)
         inside = dr.maximum(last - first, 0)
         here = left < inside
         tile = dr.select(here, row * grid.nx + first + left, tile)
@@ -365,7 +366,7 @@ def _find_tiles(
         label="find tiles",
         max_iterations=-1,
     )[-1]
-    # Rounding could let the two walks differ by a tile in different programs.
+    # Rounding may make the two traversals differ by a tile in different programs.
     first = types.UInt(0)
     if grid.image is not None and image is not None:
         first = dr.gather(types.UInt, image, owner, real) * grid.image.divisor
@@ -387,7 +388,7 @@ def _lanes(types: ArrayTypes, grid: Grid, starts: UInt, ordered: bool) -> tuple[
 
 
 def _cut(types: ArrayTypes, tiles: tuple, slots: tuple, capacity: int) -> tuple:
-    """Cut the tiles of every Gaussian into pieces of like length, at most the granularity.
+    """Cut the tiles of every Gaussian into pieces of similar length, at most the granularity.
 
     Parameters
     ----------
@@ -408,7 +409,7 @@ def _cut(types: ArrayTypes, tiles: tuple, slots: tuple, capacity: int) -> tuple:
     splat, begin, end = (dr.zeros(types.UInt, capacity) for _ in range(3))
     dr.make_opaque(splat, begin, end)
     owner = dr.arange(types.UInt, count)
-    # In integers: a quotient of floats on cuda may round up to one more.
+    # In integers: on cuda, a quotient of floats may be rounded up by one.
     length = (last - start + number - 1) // dr.maximum(number, 1)
 
     def write(i: UInt, at: UInt) -> tuple:
@@ -424,7 +425,7 @@ def _cut(types: ArrayTypes, tiles: tuple, slots: tuple, capacity: int) -> tuple:
 
 
 def _find_cut(types: ArrayTypes, tiles: tuple, slots: tuple, capacity: int) -> tuple:
-    """Return the pieces of `_cut` with a lane for each."""
+    """Return the pieces of `_cut`, with one lane per piece."""
     (start, last), (first, number) = tiles, slots
     i, count = dr.arange(types.UInt, capacity), dr.opaque(types.UInt, dr.width(number))
     stop = first + number
@@ -457,8 +458,8 @@ def _in_order(
 
 
 RADIX_BITS = 8
-"""Largest number of bits of one pass of the radix sort. A pass of Dr.Jit keeps the order of equal
-keys up to 9 bits on cuda, where its counts fit into shared memory."""
+"""Largest number of bits of one pass of the radix sort. On cuda, a pass of Dr.Jit is stable up to
+9 bits, as long as its counts fit into shared memory."""
 
 
 def transpose_by_counting(
@@ -500,7 +501,7 @@ def transpose_pattern(
     columns: NDArray[np.int32], starts: NDArray[np.int32], number: int
 ) -> csc_array:
     """Return the transpose of a sparse pattern of rows, with its indices in ascending order."""
-    # The values mean nothing: memory that is never written takes no room.
+    # The values are not used: memory that is never written takes no space.
     unused = np.empty(len(columns), np.int8)
     return csr_array((unused, columns, starts), shape=(len(starts) - 1, number)).tocsc()
 
@@ -508,15 +509,15 @@ def transpose_pattern(
 def transpose_by_sorting(
     types: ArrayTypes, number: int, tile: UInt, last: UInt, entries: int, capacity: int
 ) -> tuple[UInt, UInt]:
-    """Transpose by a stable radix sort of the bits that tiles need, on the device.
+    """Transpose by a stable radix sort, on the device, of the bits that tile indices need.
 
-    The entries are in the order of Gaussians, and a stable sort by tile keeps it. No copy goes to
-    the host, and numbers are in arrays: as literals, they would compile the programs again for
-    every size. Parameters and results as for `transpose_by_counting`.
+    The entries are in the order of the Gaussians, and a stable sort by tile preserves it. Nothing
+    is copied to the host, and numbers are in arrays: as literals, every size would compile programs
+    of its own. Parameters and results as for `transpose_by_counting`.
     """
     UInt, bits = types.UInt, (number - 1).bit_length()
     i, real = dr.arange(UInt, capacity), dr.opaque(UInt, entries)
-    # Padding gets the largest key: it comes after the entries, and stays there.
+    # Padding gets the largest key, so that it stays behind the entries.
     key = dr.select(i < real, dr.gather(UInt, tile, i), (1 << bits) - 1)
     owner = _search(dr.opaque(UInt, dr.width(last)), last, i + 1)
     key, splat = _sort_stably(key, dr.select(i < real, owner, 0), bits)
@@ -524,7 +525,7 @@ def transpose_by_sorting(
 
 
 def _sort_stably(key: UInt, value: UInt, bits: int) -> tuple[UInt, UInt]:
-    """Sort keys of some bits, and values by their keys, from the lowest digit to the highest.
+    """Sort keys of `bits` bits, and values by their keys, from the lowest digit to the highest.
 
     `drjit.sort` always sorts all 32 or 64 bits.
     """
@@ -541,38 +542,39 @@ def _sort_stably(key: UInt, value: UInt, bits: int) -> tuple[UInt, UInt]:
 
 
 def _search(size: UInt, values: UInt, bound: UInt) -> UInt:
-    """Return how many of the first `size` values, which ascend, are below each bound.
+    """Return how many of the first `size` values, in ascending order, are below each bound.
 
-    The steps depend on the number of bits of the width only, rounded up, so that few programs serve
-    all sizes; `drjit.binary_search` has the size in its program.
+    The number of steps depends only on the bit length of the width, rounded up, so that few
+    programs serve all sizes; `drjit.binary_search` has the size in its program.
     """
-    UInt, found = type(values), dr.zeros(type(values), dr.width(bound))
+    UInt, count = type(values), dr.zeros(type(values), dr.width(bound))
     for bit in reversed(range(-(-dr.width(values).bit_length() // 4) * 4)):
-        index = found + (1 << bit)
+        index = count + (1 << bit)
         valid = index <= size
         below = dr.gather(UInt, values, index - 1, valid) < bound
-        found = dr.select(valid & below, index, found)
-    return found
+        count = dr.select(valid & below, index, count)
+    return count
 
 
 PACKET = 16
-"""Lanes of a SIMD packet; those of AVX-512."""
+"""Number of lanes of a SIMD packet, as in AVX-512."""
 
 
 def order_lanes(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray[np.uint32]:
-    """Return an order of lanes with like lengths in a packet, and packets dealt out evenly.
+    """Return an order of lanes: similar lengths in a packet, empty packets spread evenly.
 
-    Dr.Jit cuts a launch on llvm into blocks of neighbouring lanes, two for each core. Pieces leave
-    a tenth to a third of their lanes empty, all at the end: the last block would have no work. In
-    simulation, the longest thread had 1.27 times the mean work on 2 cores, 1.46 times on 16 and
-    1.51 times on 64; dealt out 1.01, 1.10 and 1.15 times (512x512, 20,000 Gaussians).
+    On llvm, Dr.Jit cuts a launch into blocks of neighbouring lanes, two for each core. A tenth to a
+    third of the lanes of the pieces are empty, all at the end: the last block would have no work.
+    In a simulation, the longest thread had 1.27 times the mean work on 2 cores, 1.46 times on 16
+    and 1.51 times on 64; with an even spread 1.01, 1.10 and 1.15 times (512x512, 20,000
+    Gaussians).
 
     Parameters
     ----------
     length : ndarray of int32, shape (lanes,)
         Work of each lane.
     window : ndarray of int32, shape (lanes,)
-        Numbers of the windows; a lane stays in its window, with its neighbours in space.
+        Index of the window of each lane; a lane stays in its window, near its spatial neighbours.
 
     Returns
     -------
@@ -580,23 +582,23 @@ def order_lanes(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray
         By window, then by descending length; packets without work are spread among the others.
     """
     order = _descending(length, window)
-    dealt = len(order) // PACKET * PACKET
-    packets = order[:dealt].reshape(-1, PACKET)
+    in_packets = len(order) // PACKET * PACKET
+    packets = order[:in_packets].reshape(-1, PACKET)
     full = (length[packets[:, 0]] > 0) | (length[packets[:, -1]] > 0)
     place = np.empty(len(packets), np.uint16)  # NumPy sorts 16 bits fastest
     for kind in (full, ~full):
         place[kind] = np.linspace(0, 65535, kind.sum())
     packets = packets[np.argsort(place, kind="stable")]
-    return np.concatenate([packets.ravel(), order[dealt:]])
+    return np.concatenate([packets.ravel(), order[in_packets:]])
 
 
 def _descending(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray[np.uint32]:
     """Return the stable order by window, then by descending length.
 
-    A counting sort. Each window has as many keys as its longest list has entries, and one: all
-    windows together have no more keys than the lists have entries, beside one for each window.
+    A counting sort. The number of keys of a window is one more than the number of entries of its
+    longest list: except for one per window, there are no more keys than entries of lists.
     """
-    # Lanes of one window come in runs, the rows of its tiles.
+    # The lanes of one window come in runs, the rows of its tiles.
     changes = np.flatnonzero(window[1:] != window[:-1]) + 1
     bounds = np.concatenate([[0], changes, [len(window)]])
     owner = window[bounds[:-1]]

@@ -1,9 +1,9 @@
-"""The tiles of an image, the tiles that a Gaussian touches, and the share of a lane.
+"""The tiles of an image, the tiles that a Gaussian touches, and the amount of work of a lane.
 
 A tile is a block of pixels. A closed form gives the tiles of each row that the cutoff ellipse of a
 Gaussian touches. An elongated Gaussian therefore visits only the tiles along its axis, not all
-tiles of its bounding box. `granularity_of` is the one place that chooses, by backend, how much work
-one lane of a kernel gets.
+tiles of its bounding box. Only `granularity_of` decides, by backend, how much work one lane of a
+kernel gets.
 """
 
 from __future__ import annotations
@@ -19,27 +19,28 @@ from ...backend.types import Bool, Float, FloatLike, UInt
 
 
 class Granularity(NamedTuple):
-    """The share of a lane.
+    """The amount of work of a lane.
 
     Attributes
     ----------
     rows : int
-        Rows of a tile that one lane owns, of the sum over Gaussians and of the adjoint: 1, 2 or 4.
+        Rows of a tile that one lane owns, in the sum over Gaussians and in the adjoint: 1, 2 or 4.
     visits, long_visits : int
-        Largest number of tiles that one lane of the adjoint visits, and the number where lists are
-        long enough to keep `MIN_PIECES` lanes busy. A Gaussian that touches more tiles gets several
-        lanes, so that few large Gaussians fill many cores too; fewer lanes have fewer results to
-        store and to add.
+        Largest number of tiles that one lane of the adjoint visits, and the number for lists that
+        are long enough to keep `MIN_PIECES` lanes busy. A Gaussian that touches more tiles gets
+        several lanes, so that even a few large Gaussians use many cores; fewer lanes have fewer
+        results to store and to add.
     ordered : bool
         Whether lanes are ordered by their work. A SIMD packet of a CPU takes as long as its longest
         lane, and ordering is cheap there; a GPU would need another sort.
     products : bool
-        Whether weights along a row continue one exponential by products, where that is accurate. On
-        a GPU an exponential is one instruction, and products would cost more.
+        Whether weights along a row continue one exponential by products, if that is accurate. On a
+        GPU an exponential is one instruction, and products would cost more.
     block : int
-        Where a Gaussian that covers the image would keep one lane busy while all others wait, as on
-        a GPU: the number of pieces whose results one lane adds, before another adds these blocks.
-        Lists then have a lane for each entry. With 0, one lane lists and adds all of a Gaussian.
+        Number of pieces whose results one lane adds before another lane adds these blocks, for
+        GPUs, where a Gaussian that covers the image would keep one lane busy while all others
+        wait. Lists are then built with a lane for each entry. With 0, one lane lists and adds all
+        tiles of a Gaussian.
     """
 
     rows: int
@@ -50,23 +51,24 @@ class Granularity(NamedTuple):
     block: int
 
     def visits_for(self, entries: int, tiles: int) -> int:
-        """Return the largest number of tiles of a lane, for the lists of an image of some tiles."""
-        large = tiles > SMALL and entries >= MIN_PIECES * self.long_visits
+        """Return the largest number of tiles of a lane, for an image with such lists."""
+        large = tiles > SMALL_IMAGE_TILES and entries >= MIN_PIECES * self.long_visits
         return self.long_visits if large else self.visits
 
 
 MIN_PIECES = 1 << 15
-"""Pieces that keep all cores of a large CPU busy."""
+"""Number of pieces that keeps all cores of a large CPU busy."""
 
-SMALL = 1 << 12
-"""Most tiles of an image, 256x256 pixels, that takes `Granularity.visits` whatever its lists. In a
-batch the number may not depend on the lists of other images: it decides in which order sums run."""
+SMALL_IMAGE_TILES = 1 << 12
+"""Largest number of tiles of an image, 256x256 pixels, that always uses `Granularity.visits`. In a
+batch, the number of visits must not depend on the other images, because it fixes the order of
+summation."""
 
 ON_CPU = Granularity(rows=4, visits=16, long_visits=64, ordered=True, products=True, block=0)
-"""On llvm a lane shares the parameters of a Gaussian among 16 pixels."""
+"""On llvm, a lane reuses the parameters of a Gaussian for 16 pixels."""
 
 ON_GPU = Granularity(rows=1, visits=16, long_visits=16, ordered=False, products=False, block=64)
-"""On a GPU more lanes with fewer registers hide the latency of memory."""
+"""On a GPU, more lanes with fewer registers hide the latency of memory."""
 
 
 def granularity_of(types: ArrayTypes) -> Granularity:
@@ -83,8 +85,8 @@ pixels in registers and visits 1.7 pixels for each pixel inside the ellipse (8x8
 class Grid:
     """Division of `width` x `height` images into `nx` x `ny` tiles each; the last may overhang.
 
-    Several images are one batch: their tiles follow each other, and each has as many Gaussians as
-    the others, which follow each other too. All coordinates are those of the own image.
+    Several images form a batch. Their tiles are consecutive, and so are their Gaussians, of which
+    each image has the same number. Coordinates are relative to the image.
     """
 
     width: int
@@ -127,18 +129,18 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridArrays:
-    """The sizes of a `Grid` in arrays: a number in a program compiles it anew for every size.
+    """The sizes of a `Grid` in arrays; as literals, every size would compile a program of its own.
 
-    There are few of them, because each costs a frozen program a microsecond a call.
+    There are few of them, because each costs a frozen program a microsecond per call.
 
     Attributes
     ----------
     width, height : Float, shape (1,)
     ny : Int32, shape (1,)
     row : Divisor
-        The number of tiles of a row.
+        Number of tiles of a row.
     image : Divisor or None
-        The number of tiles of an image; None if there is only one image.
+        Number of tiles of an image; None if there is only one image.
     tile : (int, int)
     """
 
@@ -235,7 +237,7 @@ def tile_rows(
 
 
 State = TypeVar("State")
-"""What a loop carries: arrays, or lists of them."""
+"""The state of a loop: arrays, or lists of them."""
 
 
 def for_each_row(
@@ -285,8 +287,9 @@ def for_each_tile(
 ) -> State:
     """Call `visit` for every Gaussian and every tile that its ellipse touches, row by row.
 
-    Lanes of a packet wait in every row for the longest row. One loop over rows and columns would
-    not wait, but find the columns of a row for every tile: it took three times as long on llvm.
+    In every row, the lanes of a packet wait for the longest row. One loop over rows and columns
+    would avoid the wait, but compute the columns of a row for every tile: on llvm it took three
+    times as long.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.components.bands import FrequencyBand
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.paper.joint_training import (
-    HALVED,
+    HALVING_STEPS,
     RATE,
     decode_shapes,
     joint_shapes,
@@ -83,12 +83,12 @@ def test_gradient_is_that_of_all_planes(backend):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("step", [2, HALVED - 1, HALVED, 2 * HALVED])
+@pytest.mark.parametrize("step", [2, HALVING_STEPS - 1, HALVING_STEPS, 2 * HALVING_STEPS])
 def test_steps_are_those_of_adan(backend, step):
     """One rate for all, which is halved again and again."""
     before = train(backend, 2) | {"step": np.array(step)}
     after = train(backend, step + 1, state=before)
-    rate = RATE * 0.5 ** (step // HALVED)
+    rate = RATE * 0.5 ** (step // HALVING_STEPS)
     x, m, v, n, last = before["rows"].astype(np.float64)
     g, t = after["rows"][4], step + 1
     m = 0.98 * m + 0.02 * g

@@ -5,7 +5,7 @@ import numpy as np
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, small_basis, small_model
 from eigengs_dr.eigenbasis.components.bands import frequency_bands
-from eigengs_dr.eigenbasis.components.shape_training import ROUND, samples, train_shapes
+from eigengs_dr.eigenbasis.components.shape_training import RESTART_STEPS, samples, train_shapes
 
 
 def test_samples_are_those_of_the_pca_model():
@@ -29,21 +29,26 @@ def test_training_shapes_pays(backend):
     model = eg.EigenGS.fit(
         small_basis(),
         SPLATS,
-        iterations=4 * ROUND,
+        iterations=4 * RESTART_STEPS,
         backend=backend,
         progress=lambda done, total, row: seen.append((done, total)),
     )
     name = "psnr_components"
     assert model.figures[name] > small_model(backend).figures[name] + 0.3
-    assert seen == [(ROUND * i, 4 * ROUND) for i in range(5)]
+    assert seen == [(RESTART_STEPS * i, 4 * RESTART_STEPS) for i in range(5)]
 
 
 def test_training_goes_on(backend):
     """From a round on as if it had not stopped."""
     [band] = frequency_bands(small_basis(), SPLATS, False)
-    arguments = (band, 0, 2 * ROUND + 5, backend)
+    arguments = (band, 0, 2 * RESTART_STEPS + 5, backend)
     whole = list(train_shapes(*arguments))
-    assert [int(state["step"]) for state in whole] == [0, ROUND, 2 * ROUND, 2 * ROUND + 5]
+    assert [int(state["step"]) for state in whole] == [
+        0,
+        RESTART_STEPS,
+        2 * RESTART_STEPS,
+        2 * RESTART_STEPS + 5,
+    ]
     rest = list(train_shapes(*arguments, state=whole[1]))
     assert len(rest) == 2
     for key in ("mean", "factor"):

@@ -111,7 +111,7 @@ def test_components_that_add_nothing_are_left_out():
 
 def test_targets_out_of_reach_are_told(others):
     fall = small_basis().truncation_curve(others)
-    with pytest.warns(UserWarning, match=r"90 dB are out of reach: all 12\+6\+6 components have"):
+    with pytest.warns(UserWarning, match=r"90 dB is out of reach: all 12\+6\+6 components reach"):
         assert fall.rank_for_psnr(90) == (12, 6, 6)
     for target in (0, -3, np.nan, np.inf):
         with pytest.raises(ValueError, match="target_psnr is"):
