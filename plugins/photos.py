@@ -43,8 +43,10 @@ def photo_loss(
 ) -> Loss:
     """Return the squared error of renderings against photos, for `eigengs_dr.fit`.
 
-    A step puts the picture into the scene as texels, and renders one photo after another. So it
-    costs little more than a step of texels.
+    A step puts the picture into the scene as texels, and renders one photo after another. Dr.Jit
+    records the rendering of each camera and replays it, so a step takes less time than one of
+    texels in a loop of `mitsuba.render`. With `parameters`, and with integrators that Dr.Jit cannot
+    record, such as projective ones, a step traces the rendering anew.
 
     Parameters
     ----------
@@ -55,7 +57,7 @@ def photo_loss(
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
         are those of the set. Bitmaps need ``raw: true``; their texels are then light or data, so
         the ``space`` of a fit is by default "linear" for three channels, and "data" for one. An
-        ``envmap`` counts as a bitmap; fit its light with ``space="log"``, and without `bounds`.
+        ``envmap`` counts as a bitmap, of the space "log"; its light has no `bounds`.
     photos : sequence of array_like or tensor, shape (H, W, 3), path-like or mitsuba.Bitmap
         Of the size of the film of its sensor each. Floats, such as those of `mitsuba.render`, are
         linear light; codes of 8 bits are sRGB, and files what they say.
@@ -194,7 +196,7 @@ def photo_loss(
         means = [_mean(p, hidden[n]) for p, n in zip(products, judged, strict=True)]
         return sum(means) / len(means)
 
-    spaces = {name: "linear" if number == 3 else "data" for name, number in channels.items()}
+    spaces = {name: _space_of(known, key) for name, key in keys.items()}
     space = spaces if isinstance(pictures, Mapping) else spaces[""]
     return Loss(function, bounds, parameters, judge if held_out else None, space=space)
 
@@ -269,6 +271,13 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
         f"photo_loss: the scene has no bitmap {key!r}; "
         + (f"it has {', '.join(close)}" if close else "it has none")
     )
+
+
+def _space_of(known: mi.SceneParameters, key: str) -> str:
+    """Return the space of the sums of texels: light above 1 of an ``envmap``, else light or data."""
+    if isinstance(known.properties[key][2], mi.Emitter):
+        return "log"
+    return "linear" if known[key].shape[2] == 3 else "data"
 
 
 def _check_photo(number: int, photo: Any, size: Sequence[int]) -> mi.TensorXf:
