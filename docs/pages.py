@@ -15,8 +15,11 @@ from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
 FOLDER = Path(__file__).parent.parent / "build" / "docs" / "extra"
 """Sphinx copies what is in it beside the manual."""
 
-PLUGIN = Path(__file__).parent / "reference" / "gaussian-texture.md"
-"""The page with the parameters of the texture."""
+REFERENCES = {
+    f"gaussian_{name}": Path(__file__).parent / "reference" / f"gaussian-{name}.md"
+    for name in ("texture", "environment")
+}
+"""The page of each plugin."""
 
 
 def write_pages() -> None:
@@ -38,29 +41,32 @@ ENTRY = re.compile(r"^(\w[\w, ]*) : (.+)\n((?: {4}.*\n?)+)", re.M)
 
 
 def outdated() -> dict[Path, str]:
-    """Return the page of the texture with what it should hold, if its table is another one."""
-    there = PLUGIN.read_text("utf-8")
-    right = filled(there, {"parameters: gaussian_texture": plugin_parameters()}, PLUGIN.name)
-    return {} if right == there else {PLUGIN: right}
+    """Return the pages of plugins with what they should hold, where a table is another one."""
+    pages = {}
+    for plugin, page in REFERENCES.items():
+        there = page.read_text("utf-8")
+        right = filled(there, {f"parameters: {plugin}": plugin_parameters(plugin)}, page.name)
+        pages |= {} if right == there else {page: right}
+    return pages
 
 
-def plugin_parameters() -> str:
-    """Return the table of the parameters of ``gaussian_texture``, from the docstring of its class.
+def plugin_parameters(plugin: str) -> str:
+    """Return the table of the parameters of a plugin, from the docstring of its class.
 
     Flags are those of `mitsuba.traverse`: what it shows can be changed, and perhaps differentiated.
     """
     import mitsuba as mi
 
-    from eigengs_dr.plugins.gaussian_texture import gaussian_texture
-    from eigengs_dr.plugins.parameters import texture_of
+    from eigengs_dr.plugins.parameters import plugin_of
+    from eigengs_dr.plugins.registration import PLUGINS
 
     mi.set_variant("llvm_ad_rgb")
     eg.register_plugins()
-    gaussians = eg.Gaussians.from_arrays([[4, 4]], [[1, 0, 1]], [[1]], size=(8, 8), space="data")
-    model = {"type": "gaussian_texture", "model": str(SHIPPED["natural"])}
-    flags = _flags(mi, texture_of(gaussians)) | _flags(mi, model)
+    gaussians = eg.Gaussians.from_arrays([[4, 4]], [[1, 0, 1]], [[1]], size=(8, 8), space="linear")
+    model = {"type": plugin, "model": str(SHIPPED["natural"])}
+    flags = _flags(mi, plugin_of(plugin, gaussians)) | _flags(mi, model)
     lines = ["| parameter | type | description | default | flags |", "|---|---|---|---|---|"]
-    for names, kind, text in ENTRY.findall(str(inspect.getdoc(gaussian_texture())) + "\n"):
+    for names, kind, text in ENTRY.findall(str(inspect.getdoc(PLUGINS[plugin][1]())) + "\n"):
         kind, _, default = kind.partition(", default: ")
         shown = ", ".join(f"`{name}`" for name in names.split(", "))
         said = " ".join(text.split()).replace("``", "`").removesuffix(".")
@@ -68,9 +74,9 @@ def plugin_parameters() -> str:
     return "\n".join(lines)
 
 
-def _flags(mi: Any, texture: dict[str, Any]) -> dict[str, str]:
-    """Return the flags of a texture's parameters: E for a change, D for derivatives."""
-    parameters = mi.traverse(mi.load_dict(texture))
+def _flags(mi: Any, plugin: dict[str, Any]) -> dict[str, str]:
+    """Return the flags of a plugin's parameters: E for a change, D for derivatives."""
+    parameters = mi.traverse(mi.load_dict(plugin))
     fixed = mi.ParamFlags.NonDifferentiable
     return {key: "E" if parameters.flags(key) & fixed else "D, E" for key, _ in parameters}
 

@@ -8,15 +8,16 @@ except ImportError as error:
     ) from error
 
 from .cone import pixel_angle
-from .environment import bake_environment
+from .environment import bake_environment, environment_of
 from .follow import follow
-from .gaussian_texture import register_plugins
 from .memory import resident_bytes
 from .parameters import gaussians_of, keep_in_bounds, texture_of
 from .photos import photo_loss
+from .registration import register_plugins
 
 __all__ = [
     "bake_environment",
+    "environment_of",
     "follow",
     "gaussians_of",
     "keep_in_bounds",

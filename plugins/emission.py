@@ -25,7 +25,7 @@ from eigengs_dr.backend.recording import guest
 from eigengs_dr.backend.types import Float, Mask, UInt
 from eigengs_dr.gaussian.covariance import max_deviation
 from eigengs_dr.raster.evaluate import widen
-from eigengs_dr.raster.lookup.cells import cell_side, list_cells
+from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.points import Packed, sum_at_points, value_terms
 from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_covariance
 
@@ -35,8 +35,8 @@ from .versions import Texture
 RESOLVED = 0.65
 """Standard deviation of a Gaussian, in spacings of the points, that the points resolve."""
 
-FINEST = 0.25
-"""Smallest spacing of the points, in texels. The largest is one texel, as in a bitmap."""
+FINEST, COARSEST = 0.25, 1.0
+"""Smallest and largest spacing of the points, in texels; the largest is that of a bitmap."""
 
 MOST, FEWEST = 1 << 22, 8
 """Largest number of points, and smallest number along a side."""
@@ -56,16 +56,37 @@ class Survey(NamedTuple):
     largest: Float
 
 
-def make_survey(texture: Texture) -> Survey:
-    """Evaluate the brightness of a ``gaussian_texture`` in cells, without gradients.
+class Spacing(NamedTuple):
+    """How far apart the points of a survey are.
 
-    Cells are as large as texels, or smaller if a Gaussian needs it. If `MOST` or `FINEST` forbids
-    cells that are small enough, Gaussians are widened by ``(RESOLVED h)^2``, which keeps their
-    integrals.
+    Attributes
+    ----------
+    finest, coarsest : float
+        Smallest and largest spacing, in texels.
+    resolved : float
+        Standard deviation of the smallest Gaussian, in spacings, between these two.
+    multiple : int
+        Number that divides the columns and rows of points.
+    """
+
+    finest: float = FINEST
+    coarsest: float = COARSEST
+    resolved: float = RESOLVED
+    multiple: int = 1
+
+
+def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
+    """Evaluate the brightness of a sum of Gaussians in cells, without gradients.
+
+    Cells are as large as texels, or smaller if a Gaussian needs it. If `MOST` or the smallest
+    spacing forbids cells that are small enough, Gaussians are widened by ``(RESOLVED h)^2``, which
+    keeps their integrals; not where they sum to logarithms, whose integrals it would change.
 
     Parameters
     ----------
-    texture : mitsuba.Texture
+    texture : mitsuba.Texture or mitsuba.Emitter
+        A plugin of this package.
+    spacing : Spacing, optional
     """
     with dr.suspend_grad():
         table, size = dr.detach(texture.table), (texture.width, texture.height)
@@ -73,9 +94,9 @@ def make_survey(texture: Texture) -> Survey:
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
         dr.eval(shape, color)
         smallest = _smallest_deviation(shape, color)
-        columns, lines, spacing = _grid(texture, smallest)
-        cells, packed, deviation = table.lists.cells, table.packed, RESOLVED * spacing
-        if deviation > 1.001 * smallest:
+        columns, lines, width = _grid(texture, smallest, spacing or Spacing())
+        cells, packed, deviation = table.lists.cells, table.packed, RESOLVED * width
+        if deviation > 1.001 * smallest and texture.space != "log":
             variance, zero = dr.opaque(mi.Float, deviation**2), mi.Float(0)
             shape, amplitude = widen(shape, kernel_covariance([variance, zero, variance]))
             dr.eval(shape)
@@ -85,16 +106,28 @@ def make_survey(texture: Texture) -> Survey:
             packed = Packed(cells.pack(shape, color), len(color), texture.cutoff)
         index = dr.arange(mi.UInt32, columns * lines)
         uv = mi.Point2f(index % columns, index // columns) + 0.5
-        (x, _), (y, _), _ = texture.point(uv * mi.Point2f(1 / columns, 1 / lines))
-        sums = sum_at_points(cells, packed, x, y, mi.Bool(True), value_terms(packed))
-        sums = sums[texture.part] if packed is table.packed else sums
-        background = table.background[texture.part]
-        seen = show_all(texture, [s + b for s, b in zip(sums, background, strict=True)])
-        light = brightness(texture, seen) + dr.zeros(mi.Float, columns * lines)
-        dr.eval(light)
+        light = _light_at(texture, uv * mi.Point2f(1 / columns, 1 / lines), cells, packed)
         survey = Survey(mi.TensorXf(light, (lines, columns, 1)), dr.mean(light), dr.max(light))
         dr.eval(survey.mean, survey.largest)
     return survey
+
+
+def light_at(texture: Texture, uv: mi.Point2f) -> Float:
+    """Return the shown brightness at points of uv, without gradients and without a footprint."""
+    with dr.suspend_grad():
+        return _light_at(texture, uv, texture.table.lists.cells, texture.table.packed)
+
+
+def _light_at(texture: Texture, uv: mi.Point2f, cells: CellLists, packed: Packed) -> Float:
+    """Return the brightness of a texture whose Gaussians these are."""
+    (x, _), (y, _), _ = texture.point(uv)
+    sums = sum_at_points(cells, packed, x, y, mi.Bool(True), value_terms(packed))
+    sums = sums[texture.part] if packed.channels > texture.channels else sums
+    background = texture.table.background[texture.part]
+    seen = show_all(texture, [s + b for s, b in zip(sums, background, strict=True)])
+    light = brightness(texture, seen) + dr.zeros(mi.Float, dr.width(uv))
+    dr.eval(light)
+    return light
 
 
 def _smallest_deviation(shape: list, color: list) -> float:
@@ -106,14 +139,14 @@ def _smallest_deviation(shape: list, color: list) -> float:
     return float(deviation[drawn & np.isfinite(deviation)].min(initial=1e6))
 
 
-def _grid(texture: Texture, smallest: float) -> tuple[int, int, float]:
+def _grid(texture: Texture, smallest: float, spacing: Spacing) -> tuple[int, int, float]:
     """Return the number of columns and rows of points, and their spacing in texels."""
-    size = np.array([[texture.width], [texture.height]])
-    linear = np.array(texture.to_uv.matrix, np.float64)[:2, :2] * size
-    spans = np.minimum(np.hypot(*linear), 1e9)  # of the unit square, in texels
-    wanted = spans / min(max(smallest / RESOLVED, FINEST), 1.0)
+    spans, multiple = np.minimum(texture.spans(), 1e9), spacing.multiple
+    wanted = spans / min(max(smallest / spacing.resolved, spacing.finest), spacing.coarsest)
     wanted *= min(1.0, math.sqrt(MOST / wanted.prod()))
-    columns, rows = (max(FEWEST, math.ceil(n)) for n in np.minimum(wanted, MOST / FEWEST))
+    columns, rows = (
+        multiple * math.ceil(max(FEWEST, n) / multiple) for n in np.minimum(wanted, MOST / FEWEST)
+    )
     return columns, rows, float((spans / (columns, rows)).max())
 
 

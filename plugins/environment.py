@@ -1,14 +1,75 @@
-"""Environment maps: emitters that take a bitmap, and no texture."""
+"""A set as light from all directions: as Gaussians, or as the bitmap of an ``envmap``."""
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.backend.types import Record
-from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr.backend.arrays import upload
+from eigengs_dr.backend.types import Record, Tensor
+from eigengs_dr.gaussian.gaussians import Fitted, Gaussians
 from eigengs_dr.image.color import rendered_as, to_linear
 from eigengs_dr.raster.render import render
+
+from .parameters import plugin_of
+from .versions import columns_beyond
+
+
+def environment_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
+    """Return a set as the dictionary of a ``gaussian_environment``, for `mitsuba.load_dict`.
+
+    Parameters
+    ----------
+    gaussians : Gaussians or Fit
+        A set of light in equirectangular projection: twice as wide as high.
+    **properties
+        Other properties of the emitter: ``scale``, ``to_world``, ``prefilter``, ``cutoff``.
+
+    Returns
+    -------
+    dict
+        The tensors, size, space and cutoff of the set, and the other properties.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg, mitsuba as mi
+    >>> from eigengs_dr.plugins import environment_of
+    >>> mi.set_variant("llvm_ad_rgb")
+    >>> eg.register_plugins()
+    >>> sky = eg.Gaussians.from_arrays(
+    ...     [[8, 4]], [[0.2, 0, 0.2]], [[9, 9, 8]], size=(16, 8), space="radiance"
+    ... )
+    >>> scene = mi.load_dict({"type": "scene", "sky": environment_of(sky, scale=0.5)})
+    """
+    return plugin_of("gaussian_environment", gaussians, **properties)
+
+
+def texels_of(known: mi.SceneParameters, key: str, picture: Tensor) -> Tensor:
+    """Return a picture as the texels of a parameter: those of an ``envmap`` have more columns.
+
+    Parameters
+    ----------
+    known : mitsuba.SceneParameters
+    key : str
+        Name of the texels.
+    picture : TensorXf, shape (H, W, C)
+
+    Returns
+    -------
+    TensorXf
+        Differentiable. Of an ``envmap``, light from 0, and the columns beyond the seam.
+    """
+    node = known.properties[key][2]
+    if not isinstance(node, mi.Emitter):
+        return mi.TensorXf(picture)
+    height, width, channels = picture.shape
+    left, right = columns_beyond()
+    column = np.arange(-left, width + right) % width
+    texel = (np.arange(height)[:, None] * width + column)[..., None] * channels
+    index = upload(mi.UInt32, (texel + np.arange(channels)).astype(np.uint32).ravel())
+    light = dr.gather(mi.Float, dr.maximum(picture.array, 0), index)
+    return mi.TensorXf(light, (height, width + left + right, channels))
 
 
 def bake_environment(

@@ -1,4 +1,4 @@
-"""Textures that follow a sensor: footprints of its pixels, whatever its film and field of view."""
+"""Plugins that follow a sensor: footprints of its pixels, whatever its film and field of view."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ CLOSE = 1.25
 
 
 def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
-    """Set the prefilter of all Gaussian textures of a scene to the pixels of a sensor.
+    """Set the prefilter of all Gaussian textures and environments of a scene to a sensor's pixels.
 
-    The textures follow the sensor: each rendering reads its field of view and the size of its film,
+    They follow the sensor: each rendering reads its field of view and the size of its film,
     so that a change of either changes the prefilter. A number that is written to the parameter
     ``prefilter`` of a texture ends that.
 
@@ -42,27 +42,28 @@ def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
     >>> scene = mi.load_dict({"type": "scene", "wall": wall, "sensor": {"type": "perspective"}})
     >>> follow(scene)
     """
-    for texture in gaussian_textures(scene):
-        texture.follow(sensor_of(scene, sensor))
+    for plugin in plugins_of(scene):
+        plugin.follow(sensor_of(scene, sensor))
 
 
 def follow_where_asked(scene: mi.Scene, sensor: mi.Sensor | int) -> None:
-    """Let the textures whose prefilter is ``true`` follow a sensor, as `follow` does.
+    """Let the plugins whose prefilter is ``true`` follow a sensor, as `follow` does.
 
     Warns
     -----
     UserWarning
-        If the prefilter of another texture is a number that is not the angle of a pixel.
+        If the prefilter of a texture is a number that is not the angle of a pixel.
     """
     sensor = sensor_of(scene, sensor)
-    for texture in gaussian_textures(scene):
-        if texture.follows:
-            texture.follow(sensor)
-        elif texture.angle and "x_fov" in mi.traverse(sensor):
+    for plugin in plugins_of(scene):
+        is_texture = isinstance(plugin, texture_class())  # environments may be blurred on purpose
+        if plugin.follows:
+            plugin.follow(sensor)
+        elif is_texture and plugin.angle and "x_fov" in mi.traverse(sensor):
             angle = pixel_angle(sensor)
-            if not 1 / CLOSE < texture.angle / angle < CLOSE:
+            if not 1 / CLOSE < plugin.angle / angle < CLOSE:
                 warn(
-                    f"prefilter is {texture.angle:.3g} and a pixel of the camera {angle:.3g}; "
+                    f"prefilter is {plugin.angle:.3g} and a pixel of the camera {angle:.3g}; "
                     "say true, and the texture follows the camera"
                 )
 
@@ -72,7 +73,6 @@ def sensor_of(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
 
 
-def gaussian_textures(scene: mi.Scene) -> list[Texture]:
-    """Return the Gaussian textures of a scene."""
-    nodes = mi.traverse(scene).hierarchy
-    return [n for n in nodes if isinstance(n, texture_class()) and hasattr(n, "follow")]
+def plugins_of(scene: mi.Scene) -> list[Texture]:
+    """Return the textures and environments of Gaussians in a scene."""
+    return [node for node in mi.traverse(scene).hierarchy if hasattr(node, "follow")]

@@ -1,46 +1,31 @@
-"""The Mitsuba texture ``gaussian_texture``: a sum of 2D Gaussians, differentiable and prefiltered.
-
-Dr.Jit treats `self` as loop state, which silently loses gradients, and supports no custom
-derivatives inside a virtual call. So the class below only passes arrays to the functions of
-`eigengs_dr.raster.lookup.points` and `eigengs_dr.raster.lookup.prefilter`.
-"""
+"""The texture ``gaussian_texture``: a sum of 2D Gaussians, differentiable and prefiltered."""
 
 from __future__ import annotations
-
-from dataclasses import replace
-from functools import cache
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.image.color import rendered_as
-from eigengs_dr.raster.lookup.cells import NARROW, SIDE
 from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, sum_at_points
 
 from . import properties
-from .color import STEP, luminance, show_all, slope_of, upload_table, upsample
-from .cone import current_angle, footprint_inputs, seen_metric
+from .color import STEP, luminance, slope_of, upsample
+from .cone import footprint_inputs, seen_metric
 from .emission import Emission, Survey, emission_of, make_survey, outside_of_recordings
-from .lookup import (
-    list_gaussians,
-    make_table,
-    reused,
-    sum_here,
-    sum_over_footprint,
-    table_of_file,
-)
+from .lookup import reused
 from .memory import resident_bytes
-from .parameters import SHAPES
-from .versions import Interaction, Properties, Texture, register_texture, texture_class
+from .sums import plugin_of_sums
+from .versions import Interaction, Properties, texture_class
 
 
 def gaussian_texture() -> type:
     """Return the class of the texture, a `mitsuba.Texture` of the current variant."""
 
-    class GaussianTexture(texture_class()):  # type: ignore[misc]
+    class GaussianTexture(plugin_of_sums(texture_class())):  # type: ignore[misc]
         """A sum of Gaussians over uv, ``(u, v) = (x / width, y / height)``, row 0 at v = 0.
 
         The Gaussians come from `filename`, from `model`, or from the arrays of a set, as
@@ -88,88 +73,27 @@ def gaussian_texture() -> type:
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         """
 
+        transform_name, others = "to_uv", frozenset({"to_uv", "prefilter"})
+
         @guest()  # a thread of Mitsuba, whose caller may hold the lock
         def __init__(self, props: Properties) -> None:
             super().__init__(props)
-            self.source = properties.source_of(props)
-            start = self.source.start
-            self.file = properties.file_name(props)
-            self.raw = properties.raw(props)
-            self.cutoff = properties.cutoff(props, start.cutoff)
-            self.angle, self.follows = properties.prefilter(props)
-            self.prefilter = dr.opaque(mi.Float, self.angle)
-            self.sensor: mi.Sensor | None = None
-            self.wrap = properties.wrap_mode(props)
+            self.read(props, properties.wrap_mode(props), properties.raw(props))
             self.to_uv = properties.to_uv(props)
-            self.width, self.height = start.width, start.height
-            self.space, self.channels = start.space, start.channels
-            self.spectra = upload_table() if mi.is_spectral else None
             properties.check_known(props)
-            self.changed = False
             self.parameters_changed([])
-
-        def traverse(self, callback: mi.TraversalCallback) -> None:
-            for name, tensor in self.source.tensors.items():
-                callback.put(name, tensor, mi.ParamFlags.Differentiable)
-            callback.put("to_uv", self.to_uv, mi.ParamFlags.NonDifferentiable)
-            if self.sensor is not None:
-                self.prefilter = current_angle(self.sensor)
-            callback.put("prefilter", self.prefilter, mi.ParamFlags.NonDifferentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
             if not keys or "to_uv" in keys:
                 properties.check_invertible(self.to_uv)
                 self.transform = mi.Transform3f(self.to_uv)
                 dr.make_opaque(self.transform)  # another transform compiles no other programs
-            self.changed |= bool(set(keys) - {"to_uv", "prefilter"})
-            if "prefilter" in keys:
-                self._set_prefilter()
-            if not keys or set(keys) - {"to_uv", "prefilter"}:
-                self._take_over(not keys or any(key in SHAPES for key in keys))
+            super().parameters_changed(keys)
             sampled = getattr(self, "emission", None) is not None
             self.survey: Survey | None = None
             self.emission: Emission | None = None
             if sampled:  # a frozen rendering cannot make it
                 self._emission()
-
-        def _take_over(self, moved: bool) -> None:
-            """Take over the Gaussians; with new lists if they have moved."""
-            source, settings = self.source, (self.cutoff, self.wrap, self.filtered())
-            if source.file and source.is_that_of_file():
-                self.table, self.part = table_of_file(source.file, *settings), source.part
-                return
-
-            # The lists come first, since they may raise: old lists would read beyond new Gaussians.
-            if moved or not self.table.lists.cells.packs:
-                shape = source.decode(dr.detach(source.tensors)).shape
-                size, side = (self.width, self.height), NARROW if self.changed else SIDE
-                lists = list_gaussians(shape, size, *settings, side)
-            else:
-                lists = self.table.lists
-            table = make_table(lists, self.cutoff, source.tensors, source.decode)
-            # Who has changed parameters once may change colours next, and needs all lists again.
-            self.table = table if self.changed else replace(table, lists=lists)
-            self.part = slice(None)
-
-        def follow(self, sensor: mi.Sensor) -> None:
-            """Take footprints of the pixels of a sensor from now on, see `follow`."""
-            current_angle(sensor)  # it raises where there is none
-            filtered, self.sensor = self.filtered(), sensor
-            if not filtered:
-                self._take_over(True)
-
-        def _set_prefilter(self) -> None:
-            """Take over the parameter ``prefilter``, which may switch footprints on or off."""
-            angle = properties.check_angle(float(dr.slice(self.prefilter)))
-            filtered, self.angle, self.sensor, self.follows = self.filtered(), angle, None, False
-            if filtered != self.filtered():
-                self._take_over(True)
-
-        def _pixel(self) -> Float | None:
-            """Return the angle of a pixel; None if rays alone know it."""
-            if self.sensor is not None:
-                return current_angle(self.sensor)
-            return self.prefilter if self.angle else None
 
         # --- Lookups -----------------------------------------------------------------------------
 
@@ -185,7 +109,7 @@ def gaussian_texture() -> type:
                 return mi.Color3f(*color)
             if self.raw or rendered_as(self.space) is None:
                 raise ValueError(
-                    f"{_name(self)}: a spectral variant needs colours for a reflectance or "
+                    f"{self.label()}: a spectral variant needs colours for a reflectance or "
                     "radiance, not raw data; use a set in a colour space, and raw = false"
                 )
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
@@ -198,8 +122,8 @@ def gaussian_texture() -> type:
         def eval_3(self, si: Interaction, active: Mask = True) -> mi.Color3f:
             if self.channels == 1:
                 raise ValueError(
-                    f"{_name(self)}: a lookup of three channels, such as a normal map, needs a set "
-                    "of two or three channels; this set has one"
+                    f"{self.label()}: a lookup of three channels, such as a normal map, needs a "
+                    "set of two or three channels; this set has one"
                 )
             return mi.Color3f(*self._color(si, active))
 
@@ -207,7 +131,7 @@ def gaussian_texture() -> type:
         def eval_1_grad(self, si: Interaction, active: Mask = True) -> mi.Vector2f:
             if self.channels == 2:
                 raise ValueError(
-                    f"{_name(self)}: a bump map needs heights; this set has x and y of normals"
+                    f"{self.label()}: a bump map needs heights; this set has x and y of normals"
                 )
             (x, sx), (y, sy), inside = self.point(si.uv)
             packed = self.table.packed
@@ -229,21 +153,19 @@ def gaussian_texture() -> type:
             """Look up the channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
             where = (self.wrap, self.angle, id(self.sensor), *np.array(self.to_uv.matrix).flat)
             inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
-            sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))[self.part]
-            background = self.table.background[self.part]
-            shown = show_all(self, [s + b for s, b in zip(sums, background, strict=True)])
+            sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))
             _, _, inside = self.point(si.uv)
-            return [dr.select(inside & active, s, 0) for s in shown]
+            return [dr.select(inside & active, s, 0) for s in self.shown(sums)]
 
         def _look_up(self, si: Interaction) -> list:
             """Sum all channels of the table, in all lanes."""
             (x, sx), (y, sy), inside = self.point(si.uv)
             if not self.filtered():
-                return sum_here(self.table, x, y, inside)
+                return self.sums_at((x, sx), (y, sy), inside)
             # B of a transform with the rows of B^-1
             turned = self.transform.inverse_transpose
             inverse = tuple(turned[j, i] for i in range(2) for j in range(2))
-            seen = seen_metric(si, inverse, self._pixel())
+            seen = seen_metric(si, inverse, self.pixel())
             if self.wrap == "clamp":  # a footprint beyond the border may see what lies inside
                 u, v = self.transform @ si.uv
                 x, y = (
@@ -251,7 +173,7 @@ def gaussian_texture() -> type:
                     near_image(v * self.height, self.height),
                 )
                 sx = sy = type(x)(1)
-            return sum_over_footprint(self.table, (x, sx), (y, sy), inside, seen)
+            return self.sums_at((x, sx), (y, sy), inside, seen)
 
         def point(self, uv: mi.Point2f) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes; whether uv is finite."""
@@ -259,6 +181,11 @@ def gaussian_texture() -> type:
             x = fold(u * self.width, self.width, self.wrap)
             y = fold(v * self.height, self.height, self.wrap)
             return x, y, dr.isfinite(u) & dr.isfinite(v)
+
+        def spans(self) -> NDArray[np.float64]:
+            """Return the columns and rows of texels that the unit square of uv spans."""
+            size = np.array([[self.width], [self.height]])
+            return np.hypot(*(np.array(self.to_uv.matrix, np.float64)[:2, :2] * size))
 
         # --- Sampling ----------------------------------------------------------------------------
 
@@ -313,69 +240,20 @@ def gaussian_texture() -> type:
         def resolution(self) -> mi.ScalarVector2i:
             return mi.ScalarVector2i(self.width, self.height)
 
-        def filtered(self) -> bool:
-            """Return whether lookups average over a footprint; Mitsuba 3.10 asks."""
-            return self.follows or self.sensor is not None or self.angle > 0
-
         def is_spatially_varying(self) -> bool:
             return True
 
         def to_string(self) -> str:
-            follows = self.follows or self.sensor is not None
-            angle = "true" if follows else f"{self.angle:g}"
             transform = str(self.to_uv).replace("\n", "\n  ")
             return (
                 f'GaussianTexture[\n  name = "{self.file}",\n'
                 f"  gaussians = {self.source.count},\n"
                 f"  resolution = [{self.width}, {self.height}],\n"
                 f"  space = {self.space},\n  raw = {int(self.raw)},\n"
-                f"  wrap_mode = {self.wrap},\n  prefilter = {angle},\n"
+                f"  wrap_mode = {self.wrap},\n  prefilter = {self.prefilter_name()},\n"
                 f"  cutoff = {self.cutoff:g},\n"
                 f"  resident_bytes = {resident_bytes(self)},\n"
                 f"  transform = {transform}\n]"
             )
 
     return GaussianTexture
-
-
-def _name(texture: Texture) -> str:
-    return f"gaussian_texture {texture.id()!r}" if texture.id() else "gaussian_texture"
-
-
-def _refuse(props: Properties) -> Texture:
-    raise RuntimeError(
-        f"gaussian_texture does not support the variant {mi.variant()}; "
-        "use mi.set_variant('llvm_ad_rgb') or another variant of llvm, cuda or metal"
-    )
-
-
-def register_plugins() -> None:
-    """Register ``gaussian_texture`` with the current variant of Mitsuba and with later ones.
-
-    Further calls change nothing. In scalar variants, a scene that uses the texture raises an error.
-
-    Raises
-    ------
-    ImportError
-        If Mitsuba is not installed.
-
-    Examples
-    --------
-    >>> import eigengs_dr as eg, mitsuba as mi
-    >>> mi.set_variant("llvm_ad_rgb")
-    >>> eg.register_plugins()
-    """
-    _follow()
-    if mi.variant():
-        _register(mi.variant())
-
-
-@cache  # a second callback would register everything twice
-def _follow() -> None:
-    mi.detail.add_variant_callback(lambda old, new: _register(new))
-
-
-@cache  # once for each variant
-def _register(variant: str) -> None:
-    scalar = variant.startswith("scalar")
-    register_texture("gaussian_texture", _refuse if scalar else gaussian_texture())

@@ -1,4 +1,4 @@
-"""What a texture holds in memory between renderings."""
+"""What a texture or an environment holds in memory between renderings."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ from .versions import Texture
 
 
 def resident_bytes(texture: Texture) -> int:
-    """Return the bytes of the arrays that a texture holds in memory between renderings.
+    """Return the bytes of the arrays that a texture or an environment holds between renderings.
 
     Parameters
     ----------
-    texture : mitsuba.Texture
-        A ``gaussian_texture``, or another texture, such as a ``bitmap``.
+    texture : mitsuba.Texture or mitsuba.Emitter
+        A ``gaussian_texture`` or ``gaussian_environment``, or another plugin, such as a ``bitmap``
+        or an ``envmap``.
 
     Returns
     -------
     int
-        Of a ``gaussian_texture``: its parameters and their derivatives, the lists of Gaussians and
-        what else lookups read; where its light has been sampled, the distribution of that. Textures
-        of one file share arrays, and each counts them. Of another texture: its parameters, as
-        `mitsuba.traverse` shows them, but texels have 1, 2 or 4 channels, as in Dr.Jit's textures:
-        three become four in the first rendering. Dr.Jit's allocator takes up to twice as much: it
-        rounds the size of every array up to a power of two.
+        Of Gaussians: their parameters and their derivatives, the lists of Gaussians and what else
+        lookups read; where their light has been sampled, the distribution of that. Plugins of one
+        file share arrays, and each counts them. Of another plugin: its parameters, as
+        `mitsuba.traverse` shows them, and of an ``envmap`` the table by which it is sampled. Texels
+        have 1, 2 or 4 channels, as in Dr.Jit's textures: three become four in the first rendering.
+        Dr.Jit's allocator takes up to twice as much: it rounds the size of every array up to a
+        power of two.
 
     Examples
     --------
@@ -42,7 +44,8 @@ def resident_bytes(texture: Texture) -> int:
     >>> used = resident_bytes(mi.load_dict(texture_of(g)))
     """
     if not hasattr(texture, "__dict__"):
-        return sum(_texel_bytes(value) for _, value in mi.traverse(texture))
+        tables = _table_bytes(texture) if texture.class_name() == "EnvironmentMapEmitter" else 0
+        return tables + sum(_texel_bytes(value) for _, value in mi.traverse(texture))
     arrays: dict[tuple, int] = {}
     sampled = 0
     for found in _walk(vars(texture), {}):
@@ -60,6 +63,12 @@ def _texel_bytes(value: Any) -> int:
         *size, channels = value.shape
         return math.prod(size) * (1 << (channels - 1).bit_length()) * dr.itemsize_v(value.array)
     return dr.width(value) * dr.itemsize_v(value) if dr.is_jit_v(value) else 0
+
+
+def _table_bytes(envmap: mi.Emitter) -> int:
+    """Return the bytes of a table of sampling, the luminance of texels and its sums over 4^k."""
+    rows, columns, _ = mi.traverse(envmap)["data"].shape
+    return round(7 / 3 * rows * (columns - 1)) * dr.itemsize_v(mi.Float)
 
 
 def _walk(tree: Any, seen: dict[int, Any]) -> Iterator[DrJitArray | Emission]:

@@ -54,12 +54,17 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
     >>> bsdf = mi.load_dict({"type": "diffuse", "reflectance": texture_of(g, wrap_mode="clamp")})
     """
+    return plugin_of("gaussian_texture", gaussians, **properties)
+
+
+def plugin_of(plugin: str, gaussians: Gaussians | Fitted, **properties: object) -> Record:
+    """Return a set as the dictionary of a plugin."""
     gaussians = one_image(set_of(gaussians))
     tensors = to_tensors(gaussians)
     # Mitsuba would try to read a flat tensor of three numbers as a colour, and fail.
     tensors["background"] = tensors["background"][None]
     return {
-        "type": "gaussian_texture",
+        "type": plugin,
         **tensors,
         "width": gaussians.width,
         "height": gaussians.height,
@@ -142,9 +147,7 @@ class SharedFile:
         self.path = path
         whole = Gaussians.load(path, backend)
         if first is not None and first > len(whole):
-            raise ValueError(
-                f"gaussian_texture: {path}: first is {first}; the file has {len(whole)} Gaussians"
-            )
+            raise ValueError(f"{path}: first is {first}; the file has {len(whole)} Gaussians")
         whole = whole if first is None else whole[:first]
         self.like = without_arrays(whole)
         self.tables: WeakValueDictionary[tuple, Any] = WeakValueDictionary()
@@ -165,13 +168,11 @@ class SharedFile:
             If the file holds maps and no name is given, has no such map, or holds no maps.
         """
         if name not in self.maps and None in self.maps:
-            raise ValueError(
-                f"gaussian_texture: {self.path} holds one image and no map {name!r}; leave map out"
-            )
+            raise ValueError(f"{self.path} holds one image and no map {name!r}; leave map out")
         if name not in self.maps:
             missing = "holds maps; say which by" if name is None else f"has no map {name!r};"
             options = ", ".join(map(str, self.maps))
-            raise ValueError(f"gaussian_texture: {self.path} {missing} map = one of {options}")
+            raise ValueError(f"{self.path} {missing} map = one of {options}")
         names = list(self.maps)
         part = slice(None) if name is None else slices(self.like.maps)[names.index(name)]
         return TextureParameters(*self.maps[name], file=self, part=part)
@@ -277,7 +278,7 @@ class TextureParameters:
                 return self._reconstruct(inputs["coefficients"])
             return from_tensors(inputs, self.start)
         except ValueError as error:
-            raise ValueError(f"gaussian_texture: {error}") from error
+            raise ValueError(f"parameters of Gaussians: {error}") from error
 
     def _reconstruct(self, coefficients: Tensor) -> Gaussians:
         """Return the set of some coefficients of a model."""
@@ -354,7 +355,7 @@ class _Derived(dr.CustomOp):
         """Push the derivatives of the parameters through the graph."""
         if "values" in self.outputs:  # loops of a pyramid, which Dr.Jit 1.5 walks backward only
             raise RuntimeError(
-                "gaussian_texture: no forward mode with a prefilter; use drjit.backward, or "
+                "no forward mode of Gaussians with a prefilter; use drjit.backward, or "
                 "prefilter = 0"
             )
         dr.set_grad(self.inputs, self.grad_in("inputs"))

@@ -17,6 +17,8 @@ from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
 
+from .environment import texels_of
+
 JUDGED = 4
 """Photos with held-out pixels, spread over all."""
 
@@ -52,7 +54,8 @@ def photo_loss(
         The bitmap that is looked for, as `mitsuba.traverse` names it, such as
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
         are those of the set. Bitmaps need ``raw: true``; their texels are then light or data, so
-        the ``space`` of a fit is by default "linear" for three channels, and "data" for one.
+        the ``space`` of a fit is by default "linear" for three channels, and "data" for one. An
+        ``envmap`` counts as a bitmap; fit its light with ``space="log"``, and without `bounds`.
     photos : sequence of array_like or tensor, shape (H, W, 3), path-like or mitsuba.Bitmap
         Of the size of the film of its sensor each. Floats, such as those of `mitsuba.render`, are
         linear light; codes of 8 bits are sRGB, and files what they say.
@@ -140,7 +143,7 @@ def photo_loss(
     add_slopes = freeze_rendering(_add_slopes)
     channels = {name: known[key].shape[2] for name, key in keys.items()}
 
-    def texels_of(picture: Any) -> dict[str, mi.TensorXf]:
+    def shown_of(picture: Any) -> dict[str, mi.TensorXf]:
         named = picture if isinstance(picture, Mapping) else {"": picture}
         given = {name: p.shape[2] for name, p in named.items()}
         if given != channels:
@@ -148,7 +151,7 @@ def photo_loss(
                 f"photo_loss: the bitmaps have the channels {_listed(channels)}, the pictures of "
                 f"the fit {_listed(given)}; the names and spaces of eigengs_dr.fit say them"
             )
-        return {key: mi.TensorXf(named[name]) for name, key in keys.items()}
+        return {key: texels_of(known, key, named[name]) for name, key in keys.items()}
 
     def difference(number: int, seed: int, samples: int) -> Any:
         sensor = chosen[number]
@@ -156,7 +159,7 @@ def photo_loss(
         return shown[..., :3] - targets[number]
 
     def function(picture: Any, step: int) -> Any:
-        number, seed, texels = step % len(targets), first + step, texels_of(picture)
+        number, seed, texels = step % len(targets), first + step, shown_of(picture)
         seen = 1 - hidden[number]
         if parameters is None and dr.grad_enabled(picture):
             return dr.custom(_Frozen, partial(slopes, number, seed, seen), texels)
@@ -182,7 +185,7 @@ def photo_loss(
             return value, dr.grad(leaves)
 
     def judge(picture: Any) -> Any:
-        known.update(texels_of(picture))
+        known.update(shown_of(picture))
         products = [
             difference(number, first, JUDGE_SAMPLES * spp)
             * difference(number, first + 1, JUDGE_SAMPLES * spp)
@@ -268,7 +271,7 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
     )
 
 
-def _check_photo(number: int, photo: ArrayLike, size: Sequence[int]) -> mi.TensorXf:
+def _check_photo(number: int, photo: Any, size: Sequence[int]) -> mi.TensorXf:
     """Return a photo as a tensor of linear light, of the size of its film."""
     photo = photo.numpy() if dr.is_array_v(photo) else photo
     floats = np.issubdtype(getattr(photo, "dtype", np.uint8), np.floating)

@@ -1,7 +1,8 @@
-"""The properties of ``gaussian_texture`` and their checks."""
+"""The properties of the plugins and their checks."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from eigengs_dr.backend.selection import backend_of
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
-from eigengs_dr.image.color import SPACES
+from eigengs_dr.image.color import SPACES, rendered_as
 
 from .parameters import TextureParameters, model_source, shared_file, without_arrays
 from .versions import Properties
@@ -21,8 +22,8 @@ WRAPS = ("repeat", "mirror", "clamp")
 """Names of the ways to continue an image outside of its borders."""
 
 
-def _mistake(key: str, value: object, must: str) -> ValueError:
-    return ValueError(f"gaussian_texture: {key} is {value!r}; it must be {must}")
+def _mistake(props: Properties, key: str, value: object, must: str) -> ValueError:
+    return ValueError(f"{props.plugin_name()}: {key} is {value!r}; it must be {must}")
 
 
 def _read(props: Properties, key: str, default: object, kind: type, must: str) -> Any:
@@ -30,7 +31,7 @@ def _read(props: Properties, key: str, default: object, kind: type, must: str) -
     value = props.get(key, default)
     allowed = (int, float) if kind is float else kind
     if isinstance(value, bool) != (kind is bool) or not isinstance(value, allowed):
-        raise _mistake(key, value, must)
+        raise _mistake(props, key, value, must)
     return kind(value)
 
 
@@ -46,8 +47,8 @@ def source_of(props: Properties) -> TextureParameters:
     given = [key for key in ("filename", "model", "mean") if key in props]
     if len(given) != 1:
         raise ValueError(
-            "gaussian_texture: give one of filename (a saved set), model (a saved EigenGS) or "
-            f"mean, factor, color, ... (see texture_of); got {' and '.join(given) or 'none'}"
+            f"{props.plugin_name()}: give one of filename (a saved set), model (a saved EigenGS) "
+            f"or mean, factor, color, ... (see texture_of); got {' and '.join(given) or 'none'}"
         )
     backend = backend_of(mi.variant())
     if given[0] == "model":
@@ -55,12 +56,12 @@ def source_of(props: Properties) -> TextureParameters:
         if coefficients is not None:
             coefficients = np.array(coefficients)
             if coefficients.dtype.kind not in "fiu" or not np.isfinite(coefficients).all():
-                raise ValueError("gaussian_texture: coefficients must be finite numbers")
+                raise ValueError(f"{props.plugin_name()}: coefficients must be finite numbers")
         return model_source(EigenGS.load(_path(props, "model"), backend), coefficients)
     if given[0] == "filename":
         first = _read(props, "first", 0, int, "a number of Gaussians")
         if first < 0:
-            raise _mistake("first", first, "a number of Gaussians")
+            raise _mistake(props, "first", first, "a number of Gaussians")
         name = _read(props, "map", "", str, "the name of a map")
         source = shared_file(_path(props, "filename"), backend, first or None).source(name or None)
     else:
@@ -68,7 +69,8 @@ def source_of(props: Properties) -> TextureParameters:
         source = TextureParameters(without_arrays(gaussians), to_tensors(gaussians))
     if source.start.channels > 3:
         raise ValueError(
-            f"gaussian_texture: the set has {source.start.channels} channels; use a set of 1 to 3"
+            f"{props.plugin_name()}: the set has {source.start.channels} channels; "
+            "use a set of 1 to 3"
         )
     return source
 
@@ -77,10 +79,10 @@ def _from_arrays(props: Properties, backend: str | None) -> Gaussians:
     """Read a set from the properties of `texture_of`."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
     if missing:
-        raise ValueError(f"gaussian_texture: {missing[0]} is missing; see texture_of")
+        raise ValueError(f"{props.plugin_name()}: {missing[0]} is missing; see texture_of")
     width, height = (_read(props, key, 0, int, "an integer") for key in ("width", "height"))
     if props["space"] not in SPACES:
-        raise ValueError(f"gaussian_texture: space {props['space']!r} is not in {SPACES}")
+        raise ValueError(f"{props.plugin_name()}: space {props['space']!r} is not in {SPACES}")
     mean, factor, color, background = (np.array(props[key]) for key in FIELDS)
     size, space, flat = (width, height), props["space"], background.ravel()
     return Gaussians.from_arrays(mean, factor, color, flat, size=size, space=space, backend=backend)
@@ -105,7 +107,7 @@ def cutoff(props: Properties, default: float) -> float:
     """Read ``cutoff`` in standard deviations; by default the cutoff of the set."""
     value = float(_read(props, "cutoff", default, float, "a number"))
     if not 0 < value <= MAX_CUTOFF:
-        raise _mistake("cutoff", value, f"above 0 and at most {MAX_CUTOFF:g}")
+        raise _mistake(props, "cutoff", value, f"above 0 and at most {MAX_CUTOFF:g}")
     return value
 
 
@@ -121,14 +123,45 @@ def prefilter(props: Properties) -> tuple[float, bool]:
     if props.get("prefilter", 0.0) is True:
         return 0.0, True
     value = _read(props, "prefilter", 0.0, float, "true, or the angle of a pixel in radians")
-    return check_angle(value), False
+    return check_angle(value, props.plugin_name()), False
 
 
-def check_angle(value: float) -> float:
+def scale(props: Properties) -> float:
+    """Read ``scale``, the factor of light."""
+    value = float(_read(props, "scale", 1.0, float, "a number"))
+    if not 0 <= value < math.inf:
+        raise _mistake(props, "scale", value, "finite, and at least 0")
+    return value
+
+
+def check_light(gaussians: Gaussians, plugin: str) -> None:
+    """Raise `ValueError` if a set is no light from all directions."""
+    if gaussians.channels not in (1, 3) or rendered_as(gaussians.space) is None:
+        raise ValueError(
+            f"{plugin}: the set has {gaussians.channels} channels in the space "
+            f"{gaussians.space!r}; it needs one or three of light or colour"
+        )
+    if min(gaussians.width, gaussians.height) < 2:
+        raise ValueError(
+            f"{plugin}: the picture has {gaussians.width}x{gaussians.height} pixels; it needs two "
+            "along each side, from pole to pole"
+        )
+
+
+def check_rotation(transform: mi.AffineTransform4f) -> None:
+    """Raise `ValueError` if a transform of directions is no rotation, perhaps with a mirror."""
+    matrix = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
+    if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
+        raise ValueError(
+            "gaussian_environment: to_world scales or shears directions; it must be a rotation"
+        )
+
+
+def check_angle(value: float, plugin: str) -> float:
     """Return the angle of a pixel; raise `ValueError` if it is none."""
     if not 0 <= value < 1:
         raise ValueError(
-            f"gaussian_texture: prefilter is {value}; it is the angle of a pixel in radians, "
+            f"{plugin}: prefilter is {value}; it is the angle of a pixel in radians, "
             "at least 0 and below 1"
         )
     return value
@@ -137,7 +170,7 @@ def check_angle(value: float) -> float:
 def check_known(props: Properties) -> None:
     """Raise `ValueError` if there are properties that nobody has read."""
     if unknown := props.unqueried():
-        raise ValueError(f"gaussian_texture: it has no property {' and '.join(unknown)}")
+        raise ValueError(f"{props.plugin_name()}: it has no property {' and '.join(unknown)}")
 
 
 def wrap_mode(props: Properties) -> str:
@@ -170,7 +203,7 @@ def to_uv(props: Properties) -> mi.ScalarTransform3f:
     """
     transform = props.get("to_uv", mi.ScalarTransform3f())
     if not hasattr(transform, "matrix"):
-        raise _mistake("to_uv", transform, "a transform")
+        raise _mistake(props, "to_uv", transform, "a transform")
     matrix = np.array(transform.matrix, np.float64)
     if matrix.ndim == 3:  # of arrays of Dr.Jit
         if matrix.shape[2] != 1:

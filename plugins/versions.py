@@ -7,12 +7,13 @@ Pull request 1885, which is open, turns `mitsuba.Texture` into `mitsuba.Field`.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from functools import partial
+from functools import cache, partial
 from operator import methodcaller
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.image.color import rendered_as
@@ -58,11 +59,29 @@ def register_texture(name: str, create: Callable[[Properties], Texture]) -> None
         mi.register_field(name, reason_first(field))
 
 
+def register_emitter(name: str, create: Callable[[Properties], Any]) -> None:
+    """Register an emitter with the current variant, by the type of the plugin in scenes."""
+    mi.register_emitter(name, reason_first(create))
+
+
+@cache
+def columns_beyond() -> tuple[int, int]:
+    """Return how many columns an ``envmap`` repeats beyond its left and its right border.
+
+    Mitsuba 3.9 repeats one on both sides, and others one on the right side alone.
+    """
+    columns = 4
+    black = mi.Bitmap(np.zeros((columns, columns, 3), np.float32))
+    small = mi.load_dict({"type": "envmap", "bitmap": black})
+    beyond = mi.traverse(small)["data"].shape[1] - columns
+    return beyond // 2, beyond - beyond // 2
+
+
 _ended: Generator[None] = (_ for _ in ())
 _ended.close()  # its method `throw` raises an error, and adds no traceback
 
 
-def reason_first(create: Callable[[Properties], Texture]) -> type:
+def reason_first(create: Callable[[Properties], Any]) -> type:
     """Return what calls `create` and raises its errors without a traceback.
 
     Mitsuba prints an error of a plugin as nanobind does: the traceback, then what went wrong. Every

@@ -183,6 +183,9 @@ def write_balls(mi, paint):
         Path(f"{name}.xml").write_text(
             BALL.format(color=color, roughness=roughness, cameras=cameras)
         )
+    text, room = Path("known.xml").read_text(), '<emitter type="envmap" id="room">'
+    sky = f'{room}<string name="filename" value="grey.exr"/></emitter>'
+    Path("indoors.xml").write_text(re.sub('<emitter type="constant">.*</emitter>', sky, text))
     scene = mi.load_file("known.xml")
     Path("photos").mkdir()
     for k in range(8):
@@ -205,6 +208,7 @@ def test_textures_are_recovered_from_photos(tmp_path, monkeypatch):
     made = run_blocks(FOLDER / "how-to/recover.md", {"__name__": "page"}, smaller)
     assert made["lamp"][made["light"]].numpy() == pytest.approx(12, rel=0.08)
     assert list(made["material"].image) == ["albedo", "roughness"]
+    assert eg.Gaussians.load("room.npz").space == "log"
     counts, losses = zip(*made["curve"], strict=True)
     assert [*counts] == [8 * 2**k for k in range(len(counts))]
     assert all(more < less for less, more in itertools.pairwise(losses[:-1]))

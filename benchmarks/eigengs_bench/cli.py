@@ -12,6 +12,7 @@ from eigengs_bench.names import (
     KODAK_COUNTS,
     PAPER_SETS,
     PARTS,
+    PEERS,
     PICTURES,
     PRESETS,
     SAMPLES,
@@ -225,6 +226,25 @@ def kodak() -> None:
     """
 
 
+@question("peers", ("kodak384",))
+@data_argument
+@sets_option(("kodak384",))
+@several("--peer", "peers", PEERS, "By default all")
+@several("--image", "photos", click.STRING, "Name of an image, by default the first of a set")
+@number("--gaussians", "Of a fit.", 2000, 1)
+@number("--images", "Of each set.", 1, 1)
+@number("--iterations", "Steps of our longer fits.", 1000, 1)
+@click.option("--timed", is_flag=True, help="Nothing else runs: the seconds count.")
+def peers() -> None:
+    """Compare fits with what else one would pick on a laptop, each on its own terms.
+
+    \b
+    splatthis  2D Gaussians in PyTorch, in an environment below FOLDER: a gigabyte, minutes a photo
+    texels     the best bitmap that takes no more memory, with its pyramid
+    JPEG, AVIF files of as many bytes as a packed fit
+    """
+
+
 @question("scaling")
 @several("--part", "parts", PARTS, "What to vary", PARTS)
 @number("--max-side", "Leave out larger images, in pixels; the largest have 8192.", 4096, 1)
@@ -247,9 +267,14 @@ def kernels() -> None:
 
 
 @question("texture")
+@data_argument
 @click.option("--variant", default="llvm_ad_rgb", help="Of Mitsuba.")
 def texture() -> None:
-    """Time a material ball with textures of Gaussians against one with a bitmap, in Mitsuba."""
+    """Compare textures of Gaussians with bitmaps in Mitsuba: memory, and time of a material ball.
+
+    A poster is seen aslant with a bitmap, and with Gaussians, whose pictures are equally good; DATA
+    has three of its materials in textures/. A poster takes a minute.
+    """
 
 
 @question("inverse")

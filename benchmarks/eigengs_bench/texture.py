@@ -1,4 +1,4 @@
-"""How fast a texture of Gaussians is in Mitsuba: against a bitmap on the same ball."""
+"""How fast a texture of Gaussians is in Mitsuba, and what it holds: against a bitmap."""
 
 import math
 import time
@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 
 import eigengs_dr as eg
+from eigengs_bench import poster
 from eigengs_bench.clock import interleaved
 from eigengs_bench.report import Section, Table, table
 from eigengs_bench.rows import Row, Task
@@ -39,17 +40,27 @@ def run(task: Task, variant: str) -> list[Row]:
     `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
     `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
     memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
+    For the other rows see `eigengs_bench.poster`.
     """
+    rows = task.measure("texture", poster.jobs(variant, task.data), "posters")
     job: Row = {"variant": variant, "at": time.time()}  # each call measures anew
-    return task.measure("texture", [(job, partial(measure, variant, task.progress))])
+    return rows + task.measure("texture", [(job, partial(measure, variant, task.progress))])
 
 
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay out the figures of the last row, and what a user of the texture pays."""
-    row = rows[-1]
+    """Lay out the figures of the last row of a ball, and what a user of the texture pays."""
+    balls = [row for row in rows if "poster" not in row["job"]]
+    posters = [row for row in rows if "poster" in row["job"]]
+    parts = [_posters(posters), _losses(balls, posters)] if posters else []
+    return Section([*_costs(balls), *parts], figures=_figures(balls[-1], posters))
+
+
+def _costs(balls: Sequence[Row]) -> list[Table]:
+    """Lay out the time of pictures, of changes, and memory, of the last row."""
+    row = balls[-1]
     lines = [(k, f"{v:.4g}") for k, v in row.items() if isinstance(v, float)]
     costs = [(f"{n:,} Gaussians", f"{row[f'ratio_{n}']:.2f}") for n in COUNTS]
-    costs.append((f"{SETTLED:,} Gaussians, prefilter", f"{row['ratio_prefiltered']:.2f}"))
+    costs += [(f"{n:,} Gaussians, prefilter", f"{row[f'ratio_filtered_{n}']:.2f}") for n in CHANGED]
     costs.append((f"a step of prb, {SETTLED:,} Gaussians", f"{row['ratio_step']:.2f}"))
     changes = [
         (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
@@ -64,8 +75,76 @@ def summarize(rows: Sequence[Row]) -> Section:
         table(after, columns, changes, name="changes"),
         _memory(row),
     ]
-    ratios = ("ratio_prefiltered", "ratio_step")
-    return Section(tables, figures={name: f"{row[name]:.2f}" for name in ratios})
+    return [one._replace(rows=balls) for one in tables]
+
+
+def _posters(posters: Sequence[Row]) -> Table:
+    """Lay out the bitmaps and the Gaussians whose pictures of posters are equally good."""
+    caption = (
+        "Memory of the smallest bitmap of 8 bits, and of the fewest Gaussians, with which a poster "
+        f"of {poster.TEXELS:,} x {poster.TEXELS:,} texels, seen aslant on a film of "
+        f"{poster.PIXELS} x {poster.PIXELS} pixels, keeps 40 dB; the text 30 dB"
+    )
+    columns = ["poster", "bitmap, texels", "Gaussians", "bitmap", "points", "prefilter"]
+    columns += ["points over bitmap", "over a bitmap of floats"]
+    lines = [
+        (
+            row["job"]["poster"],
+            f"{row['side']} x {row['side']}",
+            f"{row['gaussians']:,}",
+            *(f"{row[k] / 1e3:.0f} kB" for k in ("bitmap_bytes", "bytes", "filtered_bytes")),
+            f"{row['ratio']:.2f}",
+            f"{row['ratio_floats']:.2f}",
+        )
+        for row in posters
+    ]
+    return table(caption, columns, lines, name="posters")._replace(rows=posters)
+
+
+def _figures(row: Row, posters: Sequence[Row]) -> dict[str, str]:
+    """Return figures of a ball, and medians over the posters but the text, for sentences."""
+    pictures = [one for one in posters if one["kind"] != "text"]
+    medians = {k: median(one[k] for one in pictures) for k in ("ratio", "ratio_floats") if pictures}
+    timed = {name: row[f"ratio_{name}"] for name in ("prefiltered", "step")}
+    return {name: f"{value:.2f}" for name, value in (medians | timed).items()}
+
+
+def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
+    """Lay out where Gaussians lose: figures over those of a bitmap, and what to use instead."""
+    row, kinds = balls[-1], ("photo", "material", "text")
+    ratio = {k: [r["ratio"] for r in posters if r["kind"] == k] for k in kinds}
+    floats = [r["ratio_floats"] for r in posters if r["kind"] != "text"]
+    bake, texels = "`eigengs-dr render`, then a bitmap", "a fit through texels"
+    memory = [
+        ("memory, photos", ratio["photo"]),
+        ("memory, materials", ratio["material"]),
+        ("memory, sharp text", ratio["text"]),
+        ("memory, a bitmap of floats", floats),
+    ]
+    lines = [
+        (what, f"{median(n):.2f}", f"{min(n):.2f} to {max(n):.2f}", _better(median(n)))
+        for what, n in memory
+        if n
+    ]
+    lines += [
+        (what, f"{row[name]:.2f}", "", other)
+        for what, name, other in (
+            ("time of a picture", f"ratio_{SETTLED}", bake),
+            ("time of a picture, prefilter", f"ratio_filtered_{SETTLED}", bake),
+            (f"the same, {CHANGED[-1]:,} Gaussians", f"ratio_filtered_{CHANGED[-1]}", bake),
+            ("time of a step of `prb`", "ratio_step", texels),
+        )
+    ]
+    caption = (
+        "Gaussians over bitmaps; memory for equally good pictures of posters, time with "
+        f"{SETTLED:,} Gaussians"
+    )
+    columns = ("figure", "Gaussians over a bitmap", "from poster to poster", "what is better")
+    return table(caption, columns, lines, name="losses")._replace(rows=[*balls, *posters])
+
+
+def _better(ratio: float) -> str:
+    return "Gaussians" if ratio < 1 else "a bitmap of 8 bits"
 
 
 LOOKUPS = {

@@ -259,6 +259,8 @@ def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
     placed, before, last = run.start, run.best, None
     for _ in range(MAX_TRIES):
         trial = run.descend(placed, steps)
+        if trial.missing > before.missing:  # few steps at full rates lose more than they gain
+            trial = before
         _update_slope(run, last, trial)
         gain = LATE_SHARE * max(0.0, before.missing - trial.missing)
         count = min(

@@ -191,7 +191,7 @@ def fit(
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
-        weigh more in the dark. "data" uses one or three channels unchanged (roughness, heights).
+        weigh more in the dark. "data" uses one to three channels unchanged (roughness, heights).
         "normal" uses the codes ``(n + 1) / 2`` of a normal map; renderings have normals of length
         1. "radiance" is "linear" without an upper bound. "log" suits light above 1 best: the
         Gaussians sum to logarithms of light, see `eigengs_dr.image.color.to_log`. For an image of

@@ -65,7 +65,7 @@ def read_pixels(
 
 
 def _read_data(image: EncodedImage, space: str) -> Image:
-    """Check an image of data, shape (H, W, 1) or (H, W, 3), or of normals, shape (H, W, 3)."""
+    """Check an image of data, one to three channels, or of normals, shape (H, W, 3)."""
     pixels = check_data(image, copy=False)
     if space == "normal":
         check_normals(pixels)

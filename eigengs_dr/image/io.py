@@ -193,12 +193,13 @@ def check_image(
 
 
 def check_data(image: object, copy: bool = True) -> NDArray[np.float32]:
-    """Convert an image of data to float32: one or three channels of any finite values.
+    """Convert an image of data to float32: one to three channels, of any finite values.
 
     For parameters, result and errors see `check_image`; integers are scaled to [0, 1], and values
     are not converted to sRGB.
     """
-    return read_floats(image, keep_grey=True, copy=copy, encoding="linear").pixels
+    pixels, said = read_image(image, keep_grey=True, encoding="linear")
+    return to_floats(pixels, "image", keep_grey=True, copy=copy, encoding=said, known=(1, 2, 3))
 
 
 @takes_numbers

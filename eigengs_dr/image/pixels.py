@@ -126,8 +126,11 @@ def to_floats(
     keep_grey: bool = False,
     copy: bool = True,
     encoding: str | None = None,
+    known: tuple[int, ...] = (1, 3),
 ) -> NDArray[np.float32]:
     """Scale to float32 and replicate grey to RGB; errors refer to the image as `name`.
+
+    Numbers of channels that are not `known` are refused.
 
     The range of the pixels is checked if the encoding is given.
     """
@@ -137,9 +140,9 @@ def to_floats(
         raise ImageError(f"{name}: not an array; expected shape (H, W, 3)") from None
     if array.ndim == 2:
         array = array[..., None]
-    if array.ndim != 3 or array.shape[2] not in (1, 3):
-        alpha = array.ndim == 3 and array.shape[2] == 4
-        hint = "drop alpha, as in image[..., :3]" if alpha else "pass one grey or RGB image"
+    if array.ndim != 3 or array.shape[2] not in known:
+        hints = {2: "fit two channels as space='data'", 4: "drop alpha, as in image[..., :3]"}
+        hint = hints.get(array.shape[-1] if array.ndim == 3 else 0, "pass one grey or RGB image")
         raise ImageError(f"{name}: shape {array.shape}, expected (H, W) or (H, W, 3); {hint}")
     if array.size == 0:
         raise ImageError(f"{name}: shape {array.shape} has no pixels; check how it was cropped")

@@ -26,9 +26,11 @@ TWO_VALUES = 0.95
 KEPT = ("to_uv", "wrap_mode")
 """Properties of a bitmap that a ``gaussian_texture`` has too."""
 
+SKY_KEPT = ("to_world", "scale", "sampling_weight")
+"""Properties of an ``envmap`` that a ``gaussian_environment`` has too."""
 
-GAUSSIANS = "gaussian_texture"
-"""Name of the plugin in scenes."""
+GAUSSIANS, SKY = "gaussian_texture", "gaussian_environment"
+"""Names of the plugins in scenes."""
 
 UDIM = re.compile(r"<udim>|<uvtile>|%\(udim\)d", re.IGNORECASE)
 """What stands for the number of a tile in names of files, by Mari, Mudbox and Houdini."""
@@ -109,8 +111,9 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
     for node in state.nodes:
         if "data" in node.props and is_bitmap(node):  # an instance takes the tensor away
             node.props["data"] = mi.TensorXf(np.array(node.props["data"], np.float32))
-        if node.props.plugin_name() == GAUSSIANS:  # Mitsuba does not know what dictionaries name
-            node.type = texture_kind()
+        kinds = {GAUSSIANS: texture_kind(), SKY: mi.ObjectType.Emitter}
+        if kind := kinds.get(node.props.plugin_name()):  # Mitsuba does not know plugins in Python
+            node.type = kind
     return Parsed(config, state)
 
 
@@ -141,7 +144,8 @@ def _make_absolute(props: Properties) -> None:
 
 def file_keys(props: Properties) -> list[str]:
     """Return the properties that name files."""
-    named = ("filename", "model") if props.plugin_name() == GAUSSIANS else ("filename",)
+    has_model = props.plugin_name() in (GAUSSIANS, SKY)
+    named = ("filename", "model") if has_model else ("filename",)
     return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 
 
@@ -163,14 +167,12 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
     uses, left = [], list[tuple[str, str]]()
     for index, node in enumerate(nodes):
         props = node.props
-        if props.plugin_name() == "envmap":
-            left.append((_label(props, None, ""), "an environment map takes no texture"))
         if not is_bitmap(node):
             continue
         # A texture with an id is a child of the scene too, where it has no use.
         above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
         parent, slot = above[0] if above else (0, "")
-        name = _label(props, nodes[parent].props, slot)
+        name = label(props, nodes[parent].props, slot)
         parents_of = [nodes[p].props.plugin_name() for p, _ in above]
         if reason := _reason(props, parents_of):
             left.append((name, reason))
@@ -181,12 +183,18 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
     return uses, left
 
 
+def environment_of(parsed: Parsed) -> int | None:
+    """Return the index of the environment map of a scene, which has one at most."""
+    names = [node.props.plugin_name() for node in parsed.state.nodes]
+    return names.index("envmap") if "envmap" in names else None
+
+
 def is_bitmap(node: mi.parser.SceneNode) -> bool:
     """Return whether a node of a parsed scene is a bitmap texture."""
     return node.type == texture_kind() and node.props.plugin_name() == "bitmap"
 
 
-def _label(props: Properties, parent: Properties | None, slot: str) -> str:
+def label(props: Properties, parent: Properties | None, slot: str) -> str:
     """Name a bitmap by its file and where it is."""
     file = Path(str(props["filename"])).name if "filename" in props else "a bitmap in memory"
     if parent is None:

@@ -1,10 +1,10 @@
-"""What a texture costs a renderer: the bytes that it holds, and the time of a lookup."""
+"""What textures and environments cost a renderer: bytes that they hold, and time of a lookup."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -35,7 +35,8 @@ class Cost(NamedTuple):
     bytes : int
         Memory of all of them between renderings, see `eigengs_dr.plugins.resident_bytes`.
     nanoseconds : float
-        Time of a lookup of the first one, in a grid of points, on all cores.
+        Time of a lookup of the first one, in a grid of points, on all cores. Of an environment,
+        time of a lookup and of a direction that is sampled.
     """
 
     bytes: int
@@ -47,37 +48,37 @@ class Cost(NamedTuple):
         return is_smaller or other.nanoseconds > SLOWEST * self.nanoseconds
 
 
-def costs_of(kinds: Sequence[Sequence[Texture]], raw: bool, channels: int) -> list[Cost]:
-    """Measure textures that show the same image.
+def costs_of(kinds: Sequence[Sequence[Any]], look: Callable[[Any, Interaction], Any]) -> list[Cost]:
+    """Measure plugins that show the same image.
 
     Parameters
     ----------
-    kinds : sequence of sequences of mitsuba.Texture
-        For each kind, all its textures in the scene that share no memory.
-    raw : bool
-        Whether they hold data.
-    channels : int
+    kinds : sequence of sequences of mitsuba.Texture or mitsuba.Emitter
+        For each kind, all its plugins in the scene that share no memory.
+    look : callable
+        ``look(plugin, points)`` returns the lookups at points, see `of_texture`.
 
     Returns
     -------
     list of Cost
         One for each kind.
     """
-    firsts = [textures[0] for textures in kinds]
+    firsts = [plugins[0] for plugins in kinds]
     points = _grid()
     fastest = [float("inf")] * len(kinds)
     for _ in range(1 + ROUNDS):  # the first round compiles
-        taken = [_time(texture, points, raw, channels) for texture in firsts]
+        taken = [_time(look, plugin, points) for plugin in firsts]
         fastest = [min(pair) for pair in zip(fastest, taken, strict=True)]
-    held = [sum(map(resident_bytes, textures)) for textures in kinds]
+    held = [sum(map(resident_bytes, plugins)) for plugins in kinds]
     return [Cost(b, 1e9 * t / SIDE**2) for b, t in zip(held, fastest, strict=True)]
 
 
 def _grid() -> Interaction:
-    """Return points row by row, as the pixels of a camera see them."""
+    """Return points row by row, as the pixels of a camera see them, and directions to them."""
     index = dr.arange(mi.UInt32, SIDE**2)
     points = dr.zeros(mi.SurfaceInteraction3f, SIDE**2)
     points.uv = (mi.Point2f(index % SIDE, index // SIDE) + 0.5) / SIDE
+    points.wi = dr.normalize(mi.Vector3f(points.uv.x - 0.5, points.uv.y - 0.5, 0.5))
     if mi.is_spectral:
         points.wavelengths = type(points.wavelengths)(550)
     dr.eval(points)
@@ -85,14 +86,26 @@ def _grid() -> Interaction:
     return points
 
 
-def _time(texture: Texture, points: Interaction, raw: bool, channels: int) -> float:
+def _time(look: Callable[[Any, Interaction], Any], plugin: Any, points: Interaction) -> float:
     """Return the seconds of a lookup at all points."""
     started = time.perf_counter()
-    if not raw:
-        dr.eval(texture.eval(points))
-    elif channels == 1 or mi.is_monochromatic:
-        dr.eval(texture.eval_1(points))
-    else:
-        dr.eval(texture.eval_3(points))
+    dr.eval(look(plugin, points))
     dr.sync_thread()
     return time.perf_counter() - started
+
+
+def of_texture(raw: bool, channels: int) -> Callable[[Texture, Interaction], Any]:
+    """Return the lookup of a texture with so many channels; `raw` says whether it holds data."""
+
+    def look(texture: Texture, points: Interaction) -> Any:
+        if not raw:
+            return texture.eval(points)
+        grey = channels == 1 or mi.is_monochromatic
+        return texture.eval_1(points) if grey else texture.eval_3(points)
+
+    return look
+
+
+def of_environment(emitter: mi.Emitter, points: Interaction) -> Any:
+    """Look an environment up, and sample a direction."""
+    return emitter.eval(points), emitter.sample_direction(points, points.uv)

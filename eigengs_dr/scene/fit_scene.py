@@ -91,7 +91,7 @@ def fit_for_scene(
     target_psnr: float = 40.0,
     space: str = "linear",
     max_gaussians: int | None = None,
-    iterations: int = 100,
+    iterations: int = 400,
     wrap_mode: str | Sequence[str] = "repeat",
     encoding: str | None = None,
 ) -> SceneFit:
@@ -215,7 +215,7 @@ def _objective(
 ) -> Pixels:
     """Return the objective of a fit, at `DETAIL` texels a Gaussian; cameras judge all texels."""
     times = 2 ** max(0, int(math.log2(max(1.0, seen.sum() / (DETAIL * count))) / 2))
-    target, weight = _shrunk(target, times), _shrunk(weight, times)
+    target, weight = shrunk(target, times), shrunk(weight, times)
     shown = to_coded(target) if space == "linear" else target
     types = types_in(select(backend_of(mi.variant())))
     return Pixels.of(Data(target, shown, weight), space, types)
@@ -224,10 +224,10 @@ def _objective(
 def halved(values: Image, found: Visibility) -> Image:
     """Halve an image while pixels are at least `ENOUGH` texels large."""
     texels = max(float(found.footprint.min() / PIXEL), ENOUGH)
-    return _shrunk(values, 2 ** int(np.log2(texels / ENOUGH)))
+    return shrunk(values, 2 ** int(np.log2(texels / ENOUGH)))
 
 
-def _shrunk(values: Image, times: int) -> Image:
+def shrunk(values: Image, times: int) -> Image:
     """Return means over so many texels along both sides."""
     if times == 1:
         return values

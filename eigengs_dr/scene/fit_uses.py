@@ -20,7 +20,7 @@ from ..fitting.fit import fit
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import psnr
 from ..plugins.versions import Properties
-from .bitmaps import GAUSSIANS, KEPT, Parsed, Unsuitable, Use, space_of
+from .bitmaps import GAUSSIANS, KEPT, SKY, SKY_KEPT, Parsed, Unsuitable, Use, space_of
 from .fit_scene import fit_for_scene, halved
 from .rendering import pictures
 from .visibility import visibility
@@ -78,11 +78,12 @@ class Original:
 
 
 def replace_bitmap(props: Properties, file: str) -> None:
-    """Turn the properties of a bitmap into those of a texture of Gaussians."""
+    """Turn the properties of a bitmap or an ``envmap`` into those of a plugin of Gaussians."""
+    plugin, kept = (SKY, SKY_KEPT) if props.plugin_name() == "envmap" else (GAUSSIANS, KEPT)
     for key in list(props.keys()):
-        if key not in KEPT:
+        if key not in kept:
             del props[key]
-    props.set_plugin_name(GAUSSIANS)
+    props.set_plugin_name(plugin)
     props["filename"] = file
 
 

@@ -57,6 +57,7 @@ def render_in_passes(
     spp: int | None,
     show: Callable[[int, int], None] = lambda *_: None,
     integrator: mi.Integrator | None = None,
+    seed: int = 0,
 ) -> Rendering:
     """Render a scene by one of its cameras; each pass has its own seed.
 
@@ -72,6 +73,8 @@ def render_in_passes(
         ``show(done, total)`` after each pass, in samples per pixel.
     integrator : mitsuba.Integrator, optional
         By default that of the scene.
+    seed : int, optional
+        Of the first pass.
 
     Warns
     -----
@@ -80,6 +83,9 @@ def render_in_passes(
     """
     sensor = scene.sensors()[camera]
     follow_where_asked(scene, sensor)
+    for emitter in scene.emitters():
+        if hasattr(emitter, "importance"):  # of this package: Mitsuba 3.9 tells it no bounds
+            emitter.set_scene(scene)
     width, height = sensor.film().crop_size()
     total = spp or sensor.sampler().sample_count()
     most = max(1, SAMPLES_PER_PASS // (width * height))
@@ -87,7 +93,7 @@ def render_in_passes(
     done = 0
     while done < total:
         count = min(most, total - done)
-        part = mi.render(scene, sensor=camera, integrator=integrator, spp=count, seed=done)
+        part = mi.render(scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done)
         pixels = pixels + count * np.array(part, np.float64)
         done += count
         show(done, total)
@@ -140,7 +146,7 @@ def compare(
     return [psnr(*pair) for pair in zip(before, after, strict=True)]
 
 
-def pictures(scene: mi.Scene, spp: int | None) -> list[NDArray[np.float32]]:
+def pictures(scene: mi.Scene, spp: int | None, seed: int = 0) -> list[NDArray[np.float32]]:
     """Render a scene by each camera in sRGB; equal scenes have the same random numbers.
 
     Parameters
@@ -149,18 +155,19 @@ def pictures(scene: mi.Scene, spp: int | None) -> list[NDArray[np.float32]]:
         Without an integrator, "path" renders it.
     spp : int or None
         Samples per pixel, by default those of the camera.
+    seed : int, optional
 
     Returns
     -------
     list of ndarray of float32, shape (H, W, 3) or (H, W, 1)
     """
-    return [_picture(scene, number, spp) for number in range(len(scene.sensors()))]
+    return [_picture(scene, number, spp, seed) for number in range(len(scene.sensors()))]
 
 
-def _picture(scene: mi.Scene, camera: int, spp: int | None) -> NDArray[np.float32]:
+def _picture(scene: mi.Scene, camera: int, spp: int | None, seed: int) -> NDArray[np.float32]:
     """Render a scene by a camera in sRGB."""
     renderer = scene.integrator() or mi.load_dict({"type": "path"})
-    rendering = render_in_passes(scene, camera, spp, integrator=renderer)
+    rendering = render_in_passes(scene, camera, spp, integrator=renderer, seed=seed)
     light = rendering.picture("RGB")
     if not light.size:  # a renderer of AOVs alone
         light = rendering.pixels[..., :1]

@@ -58,19 +58,15 @@ def _images(
     pictures: NDArray[np.float32] | Mapping[str, NDArray[np.float32]],
     max_width: int = MAX_PICTURE_SIDE,
 ) -> list[str]:
-    """Return a picture, or named pictures, as HTML.
-
-    For data with 2 or more than 3 channels, the first channel is shown.
-    """
+    """Return a picture, or pictures with their names, as HTML."""
     if isinstance(pictures, Mapping):
         return [
             f'<figure style="margin: 0; text-align: center">{_images(picture, max_width)[0]}'
             f"<figcaption>{escape(name)}</figcaption></figure>"
             for name, picture in pictures.items()
         ]
-    pixels = pictures if pictures.shape[2] in (1, 3) else pictures[..., :1]
     style = f"max-width: min(100%, {max_width}px)"
-    return [f'<img src="{photo_uri(np.asarray(pixels, np.float32))}" style="{style}" alt="">']
+    return [f'<img src="{photo_uri(np.asarray(pictures, np.float32))}" style="{style}" alt="">']
 
 
 def _block(text: str, *parts: str) -> str:

@@ -267,12 +267,13 @@ def photo_uri(pixels: NDArray[np.float32]) -> str:
 
     Parameters
     ----------
-    pixels : ndarray of float32, shape (H, W, 3) or (H, W, 1)
-        sRGB or data; clamped.
+    pixels : ndarray of float32, shape (H, W, C)
+        sRGB or data; clamped. Of data with 2 or more than 3 channels, the first is shown.
     """
     from PIL import Image
 
-    height, width = pixels.shape[:2]
+    height, width, channels = pixels.shape
+    pixels = pixels if channels == 3 else pixels[..., :1]
     small = resample(pixels, *within(min(MAX_PHOTO_SIDE, max(width, height)), width, height))
     codes = to_8bit(small).astype(np.uint8)
     picture = Image.fromarray(codes[..., 0] if codes.shape[2] == 1 else codes)

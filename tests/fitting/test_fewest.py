@@ -5,13 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, picture
 from _helpers.photos import coffee
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.control import Redistribute
 from eigengs_dr.fitting.fewest import fewest
 from eigengs_dr.fitting.fit import FitInterrupted, fit
+from eigengs_dr.fitting.objective import Data, Pixels
 from eigengs_dr.fitting.options import Goal, max_gaussians_for
 from eigengs_dr.fitting.place import Random
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
@@ -44,6 +48,21 @@ def test_the_target_is_met_in_its_space(space):
     assert len(found.gaussians) <= 115
     last = [row for row in found.trace if row["gaussians"] == len(found.gaussians)][-1]
     assert last[f"psnr_{space}"] >= reached
+
+
+def test_short_descents_that_lose_do_not_count():
+    """A smooth image, and a placement near the goal: ten steps lose decibels, and say nothing."""
+    image = gaussian_filter(eg.sample("coffee")[60:156, 150:246], (3, 3, 0)).astype(np.float32)
+    types = types_in(select("llvm"))
+    objective = Pixels.of(Data(image, image, None), "data", types)
+
+    def score(gaussians):
+        return [{"psnr": eg.psnr(eg.render(gaussians).numpy(), image, "data")}]
+
+    start = eg.DEFAULT.place_and_solve(objective, 800)
+    assert score(start)[0]["psnr"] > 38
+    found = fewest(objective, eg.DEFAULT, start, score, ("psnr", 45), 9000, 50)
+    assert found.stopped == "met" and len(found.gaussians) < 4000
 
 
 PLACES = ((40, 100), (70, 120), (100, 140), (130, 160), (160, 180), (200, 220), (220, 300))

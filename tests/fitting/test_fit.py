@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.families import small_model
 from _helpers.sets import check_equal
 from _helpers.waves import METHODS, SIDE, SPLATS, check_sound, figures, methods, picture
@@ -164,6 +165,21 @@ def test_kinds_of_images(backend):
         same = np.asarray(same, np.uint8) if isinstance(same, list) else same
         found = figures(fit(same, SPLATS, 10, backend=backend))
         np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def test_two_channels_are_data(backend, tmp_path):
+    """Such as x and y of normals."""
+    image = picture()[..., :2]
+    result = fit(image, SPLATS, 100, space="data", backend=backend)
+    assert result.image.shape == image.shape and result.gaussians.channels == 2
+    error = np.mean((result.image - image) ** 2)
+    assert result.psnr_ycbcr == pytest.approx(-10 * np.log10(error), abs=0.01)
+    result.save(tmp_path / "two.npz")
+    again = eg.picture_of(eg.Gaussians.load(tmp_path / "two.npz", backend))
+    np.testing.assert_allclose(again, result.image, atol=1e-5)
+    assert eg.view(result, image)
+    with pytest.raises(ValueError, match="fit two channels as space='data'"):
+        fit(image, SPLATS, backend=backend)
 
 
 @pytest.mark.parametrize("color", SPACES)

@@ -144,7 +144,7 @@ class TestIntegrators:
     def test_forward_mode_of_a_prefilter_says_that_there_is_none(self):
         """In another process: after an error in a walk, Dr.Jit 1.5 may end it when it exits."""
         told = run_python(FORWARD_WITH_PREFILTER).stdout
-        assert told.startswith("gaussian_texture: no forward mode with a prefilter")
+        assert told.startswith("no forward mode of Gaussians with a prefilter")
 
 
 @pytest.mark.parametrize("prefilter", [0.0, 0.05])

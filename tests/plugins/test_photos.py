@@ -183,3 +183,40 @@ def test_photos_are_light_or_codes():
         for photo in (light, codes, mi.Bitmap(light))
     ]
     np.testing.assert_allclose(values, values[0], rtol=1e-4)
+
+
+def test_an_environment_map_is_recovered():
+    """The light of a matt ball: the mean over half of the directions is all that it shows."""
+    from _helpers.poster import camera
+    from eigengs_dr.plugins import photo_loss
+
+    y, x = np.mgrid[:16, :32]
+    up = np.clip(np.cos(np.pi * y / 15), 0, 1)[..., None]
+    light = 0.2 + up * [0.5, 0.8, 1.5] + 3.0 * ((abs(x - 9) < 3) & (abs(y - 5) < 2))[..., None]
+
+    def lit(pixels):
+        cameras = {
+            f"camera{k}": camera([4 * np.sin(k), 1, 4 * np.cos(k)], SIDE, fov=35, spp=16)
+            for k in (0, 2, 4)
+        }
+        sky = {"type": "envmap", "bitmap": mi.Bitmap(np.float32(pixels))}
+        path = {"type": "prb", "max_depth": 2}
+        return mi.load_dict(
+            {"type": "scene", "integrator": path, "ball": {"type": "sphere"}, "sky": sky, **cameras}
+        )
+
+    def views(scene):
+        return [mi.render(scene, sensor=k, spp=256, seed=7).numpy() for k in range(3)]
+
+    photos, scene = views(lit(light)), lit(np.full((16, 32, 3), 0.5))
+    before = np.mean([(a - b) ** 2 for a, b in zip(views(scene), photos, strict=True)])
+    loss = photo_loss(scene, "sky", photos, bounds=None, spp=16)
+    found = eg.fit(loss=loss, size=(32, 16), gaussians=40, iterations=120, space="log")
+    after = np.mean([(a - b) ** 2 for a, b in zip(views(scene), photos, strict=True)])
+    assert after < 0.05 * before
+    seen = eg.render(found.gaussians).numpy()
+    area = np.sin(np.pi * y / 15)[..., None]
+    assert (seen * area).sum() == pytest.approx((light * area).sum(), rel=0.1)
+    data = mi.traverse(scene)["sky.data"]
+    # The columns of the envmap beyond the seam are those of the other side.
+    np.testing.assert_allclose(np.array(data)[:, 0], np.array(data)[:, -2], rtol=1e-4)

@@ -24,7 +24,7 @@ from ...backend.types import Bool, Float, UInt
 from ..evaluate import weights, widen_inverted
 from ..parameters import gather_index, kernel_covariance, unpack_parameters
 from .footprint import extreme_variances, filtered_terms, inside_share
-from .points import Packed, sum_range
+from .points import Packed, axes_of, sum_range
 from .size_classes import FOOTPRINT_REACH, SizeClasses
 
 FAR = 1e9
@@ -186,7 +186,10 @@ def _local(sizes: SizeClasses, i: UInt, j: UInt, x: Float, y: Float) -> tuple:
     x, y = x - types.Float(i) * sizes.width, y - types.Float(j) * sizes.height
     if sizes.wrap == "repeat":
         return x, y, (one, one, one)
-    odd_x, odd_y = (i & 1) == 1, (j & 1) == 1
+    odd_x, odd_y = (
+        (k & 1) == 1 if way == "mirror" else types.Bool(False)
+        for k, way in zip((i, j), axes_of(sizes.wrap), strict=True)
+    )
     x, y = dr.select(odd_x, sizes.width - x, x), dr.select(odd_y, sizes.height - y, y)
     return x, y, (one, dr.select(odd_x == odd_y, one, -1), one)
 

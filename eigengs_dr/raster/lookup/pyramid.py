@@ -33,7 +33,7 @@ from ..parameters import (
 )
 from ..render import rasterize, to_tensor
 from .footprint import extreme_variances
-from .points import Packed
+from .points import Packed, axes_of
 from .prefilter import sum_prefiltered
 from .size_classes import FOOTPRINT_REACH, SizeClasses
 
@@ -87,7 +87,7 @@ class GaussianPyramid:
 
     Attributes
     ----------
-    wrap : {"repeat", "mirror", "clamp"}
+    wrap : {"repeat", "mirror", "clamp", "sphere"}
         Continuation of the image outside its borders.
     channels : int
     levels : tuple of Level
@@ -206,7 +206,8 @@ def sum_pyramid(
         across, down = types.Float(i) - u, types.Float(j) - v
         q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
         w = falloff(dr.maximum(q, 0), 2 * kernel_radius(SAMPLE_REACH) ** 2) * scale
-        column, row = (_fold(types, k, n, lattice.wrap) for k, n in ((i, nx), (j, ny)))
+        wrap_x, wrap_y = axes_of(lattice.wrap)
+        column, row = _fold(types, i, nx, wrap_x), _fold(types, j, ny, wrap_y)
         point = first + row * types.UInt(nx + 2 * pad) + column
         seen = lattice.gather(point, here)
         sums = [dr.fma(w, c, s) for c, s in zip(seen, sums, strict=True)]

@@ -45,7 +45,7 @@ class SizeClasses:
     ----------
     width, height : int
         Size of the image, in pixels.
-    wrap : {"repeat", "mirror", "clamp"}
+    wrap : {"repeat", "mirror", "clamp", "sphere"}
         Continuation of the image outside its borders.
     row : UInt32, shape (entries,)
         Rows of parameters: class after class, row after row, cell after cell.
@@ -84,7 +84,7 @@ def classify_by_size(
         Size of the image, in pixels.
     cutoff : float
         Standard deviations.
-    wrap : {"repeat", "mirror", "clamp"}
+    wrap : {"repeat", "mirror", "clamp", "sphere"}
     side : float, optional
         Side of the smallest cells that list Gaussians, in mean distances of Gaussians.
 

@@ -1,0 +1,156 @@
+"""Gaussians for an environment map: as cameras see it, and as it lights a scene.
+
+A renderer picks other directions of a set than of a bitmap, so renderings of few samples differ by
+their noise, and cannot judge. The pictures are compared instead, twice: as 8-bit sRGB, which is how
+cameras and mirrors see them, and as the light that white surfaces get, for all their normals.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import zoom
+from skimage.transform import resize_local_mean
+
+from ..fitting.fit import fit
+from ..fitting.options import Goal
+from ..gaussian.gaussians import Gaussians
+from ..image.color import to_coded
+from ..image.metrics import psnr
+from ..plugins.cone import pixel_angle
+from ..raster.render import render
+from .bitmaps import Unsuitable
+from .fit_scene import ENOUGH, shrunk
+
+FINER = 2
+"""Texels of the fit along a texel that cameras resolve, and points of the comparison along one of
+the fit. Without points between, a set of 5,000 Gaussians in logarithms had 1.6 times the light of
+its bitmap: nothing saw them beside the texels."""
+
+CLOSER = (-6.0, 0.0, 8.0)
+"""PSNR of the fit above the goal, in dB: one after the other is tried, since the fit compares light
+with another weight than cameras do."""
+
+BYTES = 100
+"""Bytes of a Gaussian in memory, at least: more Gaussians than a bitmap has memory for are none."""
+
+BLOCKS, NORMALS = (32, 64), (9, 16)
+"""Rows and columns of the directions of light, and of the normals of surfaces."""
+
+
+def fit_environment(
+    scene: mi.Scene,
+    pixels: NDArray[np.float32],
+    target_psnr: float,
+    iterations: int,
+    most_bytes: int,
+) -> tuple[Gaussians, float]:
+    """Find as few Gaussians as show an environment map at a PSNR.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene
+        Its cameras say how fine the map is seen; texels of less than half a pixel are halved.
+    pixels : ndarray of float32, shape (H, W, 3)
+        Linear light.
+    target_psnr : float
+        Of what cameras see, and of the light.
+    iterations : int
+        Steps of the fits.
+    most_bytes : int
+        Memory beyond which no set is wanted.
+
+    Returns
+    -------
+    gaussians : Gaussians
+        Of the size of the map.
+    psnr : float
+        The lower one of the two, in dB.
+
+    Raises
+    ------
+    Unsuitable
+        If the map has light below 0 or that is not finite, is too small, or no set is close enough.
+    """
+    height, width = pixels.shape[:2]
+    if min(height, width) < 8:
+        raise Unsuitable(f"an environment map of {width}x{height} texels is small")
+    if not np.isfinite(pixels).all() or pixels.min() < -1e-3:
+        raise Unsuitable("an environment map with light below 0, or that is not finite")
+    target = np.repeat(pixels.clip(0), 3 // pixels.shape[2], axis=2)
+    target = _as_seen(target, scene)
+    spaces = ("log", "radiance") if target.max() > 1 + 1e-3 else ("linear",)
+    most, reached = max(1, most_bytes // BYTES), list[str]()
+    for space, more in product(spaces, CLOSER):
+        goal = Goal(min(target_psnr + more, 99.0), max_gaussians=min(most, target[..., 0].size))
+        found = fit(
+            target,
+            target_psnr=goal,
+            iterations=iterations,
+            space=space,
+            encoding="linear",
+            progress=False,
+        )
+        kept = closeness(_means(found.gaussians), target)
+        if kept >= target_psnr:
+            return found.gaussians.scaled(width, height), kept
+        reached.append(f"{kept:.1f} dB with {len(found.gaussians):,} Gaussians")
+    raise Unsuitable(f"an environment map: {', '.join(reached)} for a goal of {target_psnr:g} dB")
+
+
+def _means(gaussians: Gaussians) -> NDArray[np.float32]:
+    """Return means of the picture of a set over texels."""
+    width, height = gaussians.width, gaussians.height
+    points = render(gaussians, FINER * width, FINER * height).numpy().clip(0)
+    return points.reshape(height, FINER, width, FINER, -1).mean(axis=(1, 3))
+
+
+def _as_seen(pixels: NDArray[np.float32], scene: mi.Scene) -> NDArray[np.float32]:
+    """Return a map with `FINER` texels along each one that the cameras resolve."""
+    angles = [pixel_angle(s) for s in scene.sensors() if "x_fov" in mi.traverse(s)]
+    texels = min(angles, default=0.0) * pixels.shape[1] / (2 * math.pi * ENOUGH)  # in half a pixel
+    times = 2 ** max(0, int(math.log2(max(1.0, texels))))
+    if times >= FINER:
+        return shrunk(pixels, times // FINER)
+    around = np.pad(pixels, ((0, 0), (1, 1), (0, 0)), mode="wrap")
+    finer = zoom(around, (FINER, FINER, 1), order=1, mode="nearest", grid_mode=True)
+    return np.ascontiguousarray(finer[:, FINER:-FINER])
+
+
+def closeness(found: NDArray[np.float32], target: NDArray[np.float32]) -> float:
+    """Return the lower PSNR in dB of two maps, shape (H, W, 3): as pictures, and as light."""
+    theta = (np.arange(len(target)) + 0.5) * (np.pi / len(target))
+    area = np.repeat(np.sin(theta)[:, None], target.shape[1], axis=1)
+    codes = [to_coded(k.clip(0, 1)) for k in (found, target)]
+    seen = psnr(codes[0], codes[1], weight=area)
+    lights = [_irradiance(k * area[..., None]) for k in (found, target)]
+    white = max(float(lights[1].max()), 1e-12)
+    return min(seen, psnr(*(to_coded((k / white).clip(0, 1)) for k in lights)))
+
+
+def _irradiance(light: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the light on surfaces by their normals, ``sum of L max(n . d, 0)``.
+
+    Parameters
+    ----------
+    light : ndarray, shape (H, W, 3)
+        Times the area of texels.
+    """
+    blocks = resize_local_mean(np.asarray(light, np.float64), BLOCKS, channel_axis=2)
+    cosine = np.maximum(_directions(*NORMALS) @ _directions(*BLOCKS).T, 0)
+    return (cosine @ blocks.reshape(-1, light.shape[2])).reshape(*NORMALS, light.shape[2])
+
+
+def _directions(rows: int, columns: int) -> NDArray[np.float64]:
+    """Return the directions of the centres of cells, shape (rows * columns, 3)."""
+    theta, phi = np.meshgrid(
+        (np.arange(rows) + 0.5) * (np.pi / rows),
+        (np.arange(columns) + 0.5) * (2 * np.pi / columns),
+        indexing="ij",
+    )
+    d = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+    return np.stack(d, axis=-1).reshape(-1, 3)

@@ -1,0 +1,60 @@
+"""Registration of the plugins with the variants of Mitsuba."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import mitsuba as mi
+
+from .gaussian_environment import gaussian_environment
+from .gaussian_texture import gaussian_texture
+from .versions import Properties, register_emitter, register_texture
+
+PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
+    "gaussian_texture": (register_texture, gaussian_texture),
+    "gaussian_environment": (register_emitter, gaussian_environment),
+}
+"""How each plugin is registered, and what makes its class for the current variant."""
+
+
+def register_plugins() -> None:
+    """Register the plugins with the current variant of Mitsuba and with later ones.
+
+    They are ``gaussian_texture`` and ``gaussian_environment``. Further calls change nothing. In
+    scalar variants, a scene that uses them raises an error.
+
+    Raises
+    ------
+    ImportError
+        If Mitsuba is not installed.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg, mitsuba as mi
+    >>> mi.set_variant("llvm_ad_rgb")
+    >>> eg.register_plugins()
+    """
+    _follow()
+    if mi.variant():
+        _register(mi.variant())
+
+
+@cache  # a second callback would register everything twice
+def _follow() -> None:
+    mi.detail.add_variant_callback(lambda old, new: _register(new))
+
+
+@cache  # once for each variant
+def _register(variant: str) -> None:
+    scalar = variant.startswith("scalar")
+    for name, (register, create) in PLUGINS.items():
+        register(name, partial(_refuse, name) if scalar else create())
+
+
+def _refuse(name: str, props: Properties) -> None:
+    raise RuntimeError(
+        f"{name} does not support the variant {mi.variant()}; "
+        "use mi.set_variant('llvm_ad_rgb') or another variant of llvm, cuda or metal"
+    )

@@ -1,0 +1,552 @@
+"""Light from Gaussians: the picture of an ``envmap``, sampling, derivatives, mistakes."""
+
+import gc
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.errors import refused
+from _helpers.poster import camera
+from _helpers.skies import HEIGHT, WIDTH, directions, lit, mi, seen, sky, uniform
+from _helpers.texture import backend
+from _helpers.variants import in_all, in_variants
+from eigengs_dr.image.color import to_log
+from eigengs_dr.plugins import (
+    bake_environment,
+    environment_of,
+    follow,
+    gaussians_of,
+    pixel_angle,
+    resident_bytes,
+)
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+TURNS = {
+    "as it is": [],
+    "about y": [([0, 1, 0], 70)],
+    "about all": [([0, 1, 0], 40), ([1, 0, 0], 100), ([0, 0, 1], -30)],
+}
+
+
+def turn(name):
+    transform = mi.ScalarTransform4f()
+    for axis, angle in TURNS[name]:
+        transform = transform.rotate(axis, angle)
+    return transform
+
+
+def texels(width=WIDTH, height=HEIGHT):
+    """Directions of the centres of texels, without the poles, where all columns meet."""
+    y, x = np.mgrid[1 : height - 1, :width]
+    return directions((x.ravel() + 0.5) / width, y.ravel() / (height - 1))
+
+
+class TestPicture:
+    @pytest.mark.parametrize("space", ["radiance", "log", "linear"])
+    @pytest.mark.parametrize("channels", [1, 3])
+    def test_is_that_of_eg_render(self, space, channels):
+        g = sky(space, channels)
+        found = seen(mi.load_dict(environment_of(g)), texels())
+        expected = eg.render(g).numpy()[1:-1].reshape(-1, channels)
+        top = 1 if space == "linear" else np.inf
+        expected = np.broadcast_to(expected.clip(0, top), found.shape)
+        np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-4)
+
+    @in_all
+    @pytest.mark.parametrize("name", TURNS)
+    def test_is_that_of_an_envmap(self, variant, name):
+        """At texels; spectra differ, and so do their pictures by a little."""
+        g, placed = sky(), {"to_world": turn(name), "scale": 1.5}
+        pictures = []
+        for emitter in (environment_of(g, **placed), bake_environment(g, **placed)):
+            scene = lit(emitter, "direct", 32)
+            pictures.append(np.array(mi.render(scene, spp=512, seed=1)))
+        difference = pictures[0] - pictures[1]
+        assert np.sqrt(np.square(difference).mean()) < 0.025 * pictures[1].mean()
+        assert abs(difference.mean()) < 0.005 * pictures[1].mean()
+
+    @pytest.mark.parametrize("name", TURNS)
+    def test_by_path(self, name):
+        g, placed = sky(), {"to_world": turn(name)}
+        scenes = [lit(make(g, **placed)) for make in (environment_of, bake_environment)]
+        a, b = (np.array(mi.render(scene, spp=256)) for scene in scenes)
+        assert np.sqrt(np.square(a - b).mean()) < 0.03 * b.mean()
+        np.testing.assert_allclose(a.mean((0, 1)), b.mean((0, 1)), rtol=0.005)
+
+    def test_a_constant_light(self):
+        """Energy: a white ball under light of 1 is 1, whatever is sampled."""
+        even = eg.Gaussians.from_arrays(
+            [[8, 4]], [[1, 0, 1]], [[0, 0, 0]], [1, 1, 1], size=(16, 8), space="radiance",
+            backend=backend(),
+        )  # fmt: skip
+        white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "direct"},
+                "ball": {"type": "sphere", "bsdf": white},
+                "sky": environment_of(even),
+                "sensor": camera([0, 0, 5], 4, fov=10),
+            }
+        )
+        image = np.array(mi.render(scene, spp=4096))
+        np.testing.assert_allclose(image.mean((0, 1)), 1, rtol=0.01)
+
+    def test_negative_light_is_none(self):
+        g = sky()
+        g.background *= -5
+        emitter = mi.load_dict(environment_of(g))
+        found = seen(emitter, texels())
+        assert found.min() == 0
+        _, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1000), uniform(1000))
+        assert np.array(weight).min() >= 0
+
+    def test_occluders_are_in_front_of_it_however_large_they_are(self):
+        """What hides the sky hides it, although emitters in Python do not know the scene."""
+        at = mi.ScalarTransform4f()
+        roof = {
+            "type": "rectangle",
+            "to_world": at.translate([0, 5e4, 0]).rotate([1, 0, 0], 90).scale(1e7),
+        }
+        scene = mi.load_dict({"type": "scene", "roof": roof, "sky": environment_of(sky())})
+        si = dr.zeros(mi.SurfaceInteraction3f, 4096)
+        si.n = si.sh_frame.n = mi.Normal3f(0, 1, 0)
+        ds, weight = scene.sample_emitter_direction(si, uniform(4096), True)
+        up = np.array(ds.d.y) > 0.02
+        assert np.array(weight)[:, up].max() == 0
+        assert np.array(weight)[:, np.array(ds.d.y) < -0.02].min() > 0
+
+
+class TestSeamAndPoles:
+    def test_across_the_seam(self):
+        """The last columns and the first ones are neighbours, with and without a footprint."""
+        for prefilter in (0.0, 0.3):
+            emitter = mi.load_dict(environment_of(sky(), prefilter=prefilter))
+            v = np.linspace(0.1, 0.9, 20)
+            left, right = (seen(emitter, directions(v * 0 + u, v)) for u in (1e-5, -1e-5))
+            np.testing.assert_allclose(left, right, rtol=0.01)
+
+    def test_a_gaussian_ends_at_the_seam_as_in_its_picture(self):
+        half = eg.Gaussians.from_arrays(
+            [[0, 16]], [[0.3, 0, 0.3]], [[1]], size=(64, 32), space="radiance", backend=backend()
+        )
+        v = np.full(2, 15.5 / 31)
+        found = seen(mi.load_dict(environment_of(half)), directions(np.array([0.01, 0.99]), v))
+        assert found[0, 0] > 0.9
+        assert found[1, 0] == 0
+        # With a footprint of 0.4 x 0.5 = 0.2 radians, half of the light at the seam.
+        blurred = mi.load_dict(environment_of(half, prefilter=0.5))
+        near = seen(blurred, directions(np.array([0.001, 0.999]), v))
+        np.testing.assert_allclose(near[0], near[1], rtol=0.05)
+
+    @pytest.mark.parametrize("prefilter", [0.0, 0.02])
+    def test_at_the_poles(self, prefilter):
+        emitter = mi.load_dict(environment_of(sky(), prefilter=prefilter))
+        d = np.float32([[0, 1, 0], [0, -1, 0], [1e-4, 1, 0], [0, -1, 1e-4]]).T
+        found = seen(emitter, d / np.linalg.norm(d, axis=0))
+        assert np.isfinite(found).all()
+        ds = dr.zeros(mi.DirectionSample3f, 4)
+        ds.d = mi.Vector3f(*(mi.Float(np.ascontiguousarray(k)) for k in d))
+        density = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f, 4), ds))
+        assert np.isfinite(density).all()
+        assert density.min() > 0
+
+    def test_directions_that_are_not_finite(self):
+        emitter = mi.load_dict(environment_of(sky()))
+        assert (seen(emitter, np.float32([[np.nan], [0], [1]])) == 0).all()
+
+
+class TestFootprint:
+    @pytest.mark.parametrize("prefilter", [0.1, 0.4])
+    def test_is_the_mean_over_a_gaussian_on_the_sphere(self, prefilter):
+        """Away from the poles, where the plane of the picture bends."""
+        g = sky(deviation=(2.0, 3.0))
+        sharp, blurred = (mi.load_dict(environment_of(g, prefilter=p)) for p in (0, prefilter))
+        rng = np.random.default_rng(3)
+        u, v = rng.uniform(0, 1, 8), rng.uniform(0.3, 0.7, 8)
+        found = seen(blurred, directions(u, v))
+        sigma, count = 0.4 * prefilter, 20_000
+        for k in range(8):
+            east, south = sigma * rng.normal(size=(2, count))
+            around = seen(
+                sharp,
+                directions(u[k] + east / (2 * np.pi * np.sin(np.pi * v[k])), v[k] + south / np.pi),
+            )
+            np.testing.assert_allclose(found[k], around.mean(axis=0), rtol=0.03)
+
+    def test_follows_a_sensor(self):
+        scene = lit(environment_of(sky(), prefilter=True), "direct")
+        follow(scene)
+        parameters, angle = mi.traverse(scene), pixel_angle(scene.sensors()[0])
+        assert np.array(parameters["sky.prefilter"]) == pytest.approx(angle)
+        followed = np.array(mi.render(scene, spp=4, seed=1))
+        fixed = lit(environment_of(sky(), prefilter=angle), "direct")
+        np.testing.assert_array_equal(followed, np.array(mi.render(fixed, spp=4, seed=1)))
+
+    def test_without_a_sensor(self):
+        emitter = mi.load_dict(environment_of(sky(), prefilter=True))
+        with refused(ValueError, "gaussian_environment: prefilter = true needs a sensor"):
+            seen(emitter, texels())
+
+
+SETS = {
+    "smooth": {},
+    "sharp": {"deviation": (0.2, 0.5), "count": 10},
+    "log": {"space": "log", "deviation": (0.5, 3.0)},
+    "wide": {"size": (400, 60), "deviation": (1.0, 9.0)},
+}
+
+
+class TestSampling:
+    @pytest.mark.parametrize("name", SETS)
+    def test_the_density_is_one(self, name):
+        emitter, count = mi.load_dict(environment_of(sky(**SETS[name]))), 400_000
+        ds = dr.zeros(mi.DirectionSample3f, count)
+        ds.d = mi.warp.square_to_uniform_sphere(uniform(count))
+        density = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f, count), ds), np.float64)
+        mean = 4 * np.pi * density.mean()
+        assert abs(mean - 1) < 5 * 4 * np.pi * density.std() / np.sqrt(count)
+
+    @pytest.mark.parametrize("name", SETS)
+    def test_samples_have_their_density(self, name):
+        emitter = mi.load_dict(environment_of(sky(**SETS[name]), to_world=turn("about all")))
+        it = dr.zeros(mi.Interaction3f, 10_000)
+        ds, weight = emitter.sample_direction(it, uniform(10_000))
+        density, light = emitter.pdf_direction(it, ds), emitter.eval_direction(it, ds)
+        # Rounding moves few directions over the border of a leaf.
+        same = np.isclose(np.array(density), np.array(ds.pdf), rtol=1e-2)
+        assert same.mean() > 0.995
+        np.testing.assert_allclose(np.array(light / ds.pdf), np.array(weight), rtol=0.02, atol=1e-3)
+
+    @pytest.mark.parametrize("name", SETS)
+    def test_chi_square(self, name):
+        """Mitsuba's own test, of directions against their density."""
+        from mitsuba.chi2 import ChiSquareTest, SphericalDomain
+
+        emitter = mi.load_dict(environment_of(sky(**SETS[name]), to_world=turn("about all")))
+
+        def density(d):
+            ds = dr.zeros(mi.DirectionSample3f, dr.width(d))
+            ds.d = d
+            return emitter.pdf_direction(dr.zeros(mi.Interaction3f, dr.width(d)), ds)
+
+        test = ChiSquareTest(
+            domain=SphericalDomain(),
+            sample_func=lambda sample: (
+                emitter.sample_direction(dr.zeros(mi.Interaction3f, dr.width(sample)), sample)[0].d
+            ),
+            pdf_func=density,
+            sample_dim=2,
+            sample_count=100_000,
+            res=64,
+            ires=32,
+        )
+        assert test.run(), test.messages
+
+    def test_one_sample_finds_the_light(self):
+        """Of a sun 1,000 times as bright as the sky; evenly spread samples have a noise of 20."""
+        sun = eg.Gaussians.from_arrays(
+            [[100, 60]], [[0.7, 0, 0.7]], [[1000]], [1], size=(512, 256), space="radiance",
+            backend=backend(),
+        )  # fmt: skip
+        emitter = mi.load_dict(environment_of(sun))
+        _, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 100_000), uniform(100_000))
+        light = np.array(weight, np.float64)[0]
+        assert light.std() < 0.3 * light.mean()
+
+    @pytest.mark.parametrize("value", [0, -1])
+    def test_black_light_is_sampled_evenly_in_the_picture(self, value):
+        g = sky()
+        g.color *= 0
+        g.background *= value
+        emitter = mi.load_dict(environment_of(g))
+        ds, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 100), uniform(100))
+        assert np.isfinite(np.array(ds.pdf)).all()
+        assert (np.array(weight) == 0).all()
+
+    @in_all
+    def test_rays_from_the_light(self, variant):
+        """Light traced from the sky is that traced from the camera."""
+        scene = lit(environment_of(sky()), side=12)
+        scene.environment().set_scene(scene)
+        images = []
+        for kind, spp in (("ptracer", 1024), ("path", 256)):
+            depth = {"max_depth": 3, "hide_emitters": True}
+            integrator = mi.load_dict({"type": kind, **depth})
+            images.append(np.array(mi.render(scene, integrator=integrator, spp=spp)).mean())
+        assert images[0] == pytest.approx(images[1], rel=0.02)
+
+    @in_variants(["llvm_ad_spectral_polarized"])
+    def test_polarized(self, variant):
+        g = sky()
+        a, b = (
+            np.array(mi.render(lit(make(g), side=12), spp=64)).mean((0, 1))
+            for make in (environment_of, bake_environment)
+        )
+        np.testing.assert_allclose(a, b, rtol=0.02)
+
+
+def of_sky(scene):
+    parameters = mi.traverse(scene)
+    parameters.keep(r"sky\.(mean|factor|color|background|scale)")
+    return parameters
+
+
+def upstream(scene):
+    width, height = scene.sensors()[0].film().crop_size()
+    return mi.TensorXf(np.random.default_rng(1).normal(size=(height, width, 3)).astype(np.float32))
+
+
+def direction_like(array):
+    return np.random.default_rng(2).normal(size=np.shape(array)).astype(np.float32)
+
+
+STEPS = {"mean": 2e-2, "factor": 1e-3, "scale": 1e-2}
+
+
+class TestDerivatives:
+    @pytest.mark.parametrize("space", ["radiance", "log"])
+    @pytest.mark.parametrize("prefilter", [0.0, 0.2])
+    def test_are_finite_differences(self, space, prefilter):
+        g = sky(space, count=12, size=(32, 16))
+        emitter = environment_of(g, cutoff=6.0, prefilter=prefilter)
+        scene = mi.load_dict({"type": "scene", "sky": emitter})
+        parameters, environment = of_sky(scene), scene.environment()
+        d = texels(32, 16)
+        weight = np.random.default_rng(1).normal(size=(d.shape[1], 3))
+
+        def loss():
+            si = dr.zeros(mi.SurfaceInteraction3f, d.shape[1])
+            si.wi = -mi.Vector3f(*(mi.Float(np.ascontiguousarray(k)) for k in d))
+            light = environment.eval(si)
+            return sum(
+                dr.sum(light[k] * mi.Float(weight[:, k].astype(np.float32))) for k in range(3)
+            )
+
+        for key, value in parameters:
+            dr.enable_grad(value)
+            parameters[key] = value
+        parameters.update()
+        dr.backward(loss())
+        found = {key: np.array(dr.grad(value)) for key, value in parameters}
+        for key, gradient in found.items():
+            along, start = direction_like(gradient), np.array(dr.detach(parameters[key]))
+            step, kind = STEPS.get(key.split(".")[-1], 2e-3), type(parameters[key])
+            values = []
+            for sign in (1, -1):
+                parameters[key] = kind(np.float32(start + sign * step * along))
+                parameters.update()
+                values.append(np.array(dr.detach(loss()), np.float64).item())
+            parameters[key] = kind(start)
+            parameters.update()
+            expected = (values[0] - values[1]) / (2 * step)
+            assert (gradient * along).sum() == pytest.approx(expected, rel=0.02, abs=0.05), key
+
+    @pytest.mark.parametrize("integrator", ["direct", "path", "prb"])
+    def test_through_integrators(self, integrator):
+        """Linear in the colours: the derivative is the picture of other colours."""
+        g = sky(count=12, size=(32, 16))
+        scene = lit(environment_of(g), integrator, 12)
+        parameters, weight = of_sky(scene), upstream(scene)
+        parameters.keep(r"sky\.color")
+        dr.enable_grad(parameters["sky.color"])
+        parameters.update()
+        scene.integrator().render_backward(scene, parameters, weight, seed=3, spp=512)
+        gradient = np.array(dr.grad(parameters["sky.color"]))
+        along = np.abs(direction_like(gradient))
+        values = []
+        for sign in (1, -1):
+            parameters["sky.color"] = mi.TensorXf(g.color.numpy().T + sign * 0.2 * along)
+            parameters.update()
+            with dr.suspend_grad():
+                image = np.array(mi.render(scene, spp=512, seed=4), np.float64)
+            values.append((image * np.array(weight)).sum())
+        expected = (values[0] - values[1]) / 0.4
+        assert (gradient * along).sum() == pytest.approx(expected, rel=0.05)
+
+    @pytest.mark.parametrize("integrator", ["direct", "prb"])
+    @pytest.mark.parametrize("name", ["mean", "factor", "color", "background", "scale"])
+    def test_forward_mode_is_backward_mode(self, integrator, name):
+        found = []
+        for mode in ("forward", "backward"):
+            scene = lit(environment_of(sky(count=12, size=(32, 16))), integrator, 8)
+            parameters, along, key = of_sky(scene), mi.Float(0), f"sky.{name}"
+            dr.enable_grad(along)
+            kind = type(parameters[key])
+            start = kind(parameters[key])
+            parameters[key] = start + along * kind(direction_like(np.array(start)))
+            parameters.update()
+            image = mi.render(scene, parameters, seed=3, spp=8)
+            if mode == "forward":
+                dr.forward(along)
+                found.append((np.array(dr.grad(image)) * np.array(upstream(scene))).sum())
+            else:
+                dr.backward(dr.sum(image * upstream(scene), axis=None))
+                found.append(dr.grad(along)[0])
+        assert abs(found[1]) > 1e-3
+        assert found[0] == pytest.approx(found[1], rel=2e-3)
+
+
+class TestChanges:
+    def test_a_change_of_the_set_is_a_new_set(self):
+        first, second = sky(seed=0), sky(seed=0)
+        second.color *= 0.5
+        second.mean += 1.5
+        emitter = mi.load_dict(environment_of(first))
+        parameters = mi.traverse(emitter)
+        parameters["color"] = mi.TensorXf(second.color.numpy().T)
+        parameters["mean"] = mi.TensorXf(second.mean.numpy().T)
+        parameters.update()
+        expected = mi.load_dict(environment_of(second))
+        np.testing.assert_allclose(seen(emitter, texels()), seen(expected, texels()), rtol=1e-4)
+        it, sample = dr.zeros(mi.Interaction3f, 500), uniform(500)
+        a, b = (np.array(e.sample_direction(it, sample)[0].d) for e in (emitter, expected))
+        np.testing.assert_allclose(a, b, atol=1e-4)
+        again = gaussians_of({f"sky.{k}": v for k, v in parameters}, "sky", first)
+        np.testing.assert_array_equal(again.mean.numpy(), second.mean.numpy())
+
+    def test_rotation_and_scale(self):
+        emitter = mi.load_dict(environment_of(sky()))
+        parameters = mi.traverse(emitter)
+        parameters["to_world"] = mi.AffineTransform4f(turn("about all"))
+        parameters["scale"] = mi.Float(2)
+        parameters.update()
+        expected = mi.load_dict(environment_of(sky(), to_world=turn("about all"), scale=2.0))
+        np.testing.assert_allclose(seen(emitter, texels()), seen(expected, texels()), rtol=1e-5)
+
+    def test_in_a_frozen_rendering(self):
+        scene = lit(environment_of(sky()), "direct", 8)
+        parameters = mi.traverse(scene)
+        frozen = dr.freeze(lambda scene: mi.render(scene, spp=4, seed=1))
+        for step in range(4):
+            parameters["sky.color"] = parameters["sky.color"] * 0.7
+            parameters["sky.to_world"] = mi.AffineTransform4f(
+                mi.ScalarTransform4f().rotate([0, 1, 0], 40 * step)
+            )
+            parameters.update()
+            np.testing.assert_array_equal(
+                np.array(frozen(scene)), np.array(mi.render(scene, spp=4, seed=1))
+            )
+        frozen.clear()
+
+    @pytest.mark.parametrize("name", ["mean", "factor", "color", "background"])
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -5.0, 1e30])
+    def test_broken_parameters_leave_finite_light(self, name, value):
+        emitter = mi.load_dict(environment_of(sky(count=8, size=(32, 16))))
+        parameters = mi.traverse(emitter)
+        broken = np.array(parameters[name])
+        broken[: max(1, len(broken) // 4)] = value
+        parameters[name] = mi.TensorXf(broken)
+        parameters.update()
+        found = seen(emitter, texels(32, 16))
+        ds, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f, 50), uniform(50))
+        if value != 1e30:
+            assert np.isfinite(found).all()
+        assert not np.isnan(found).any()
+        assert np.isfinite(np.array(ds.d)).all()
+        assert found.min() >= 0
+
+
+class TestMemory:
+    def test_is_below_that_of_an_envmap(self):
+        """A set of 16 bytes for each of its 2,600 texels would be no gain."""
+        g = sky(count=500, size=(512, 256), deviation=(3.0, 20.0))
+        sizes = [
+            resident_bytes(mi.load_dict(make(g))) for make in (environment_of, bake_environment)
+        ]
+        assert sizes[0] < 0.2 * sizes[1]
+
+    def test_counts_the_table_of_an_envmap(self):
+        """16 bytes of a texel and 4 x 7/3 of the table."""
+        held = resident_bytes(mi.load_dict(bake_environment(sky(size=(400, 200)))))
+        assert held == pytest.approx(400 * 200 * (16 + 28 / 3), rel=0.02)
+
+    def test_is_freed(self):
+        import weakref
+
+        emitter = mi.load_dict(environment_of(sky()))
+        seen(emitter, texels())
+        table = weakref.ref(emitter.table)
+        del emitter
+        gc.collect()
+        assert table() is None
+
+
+class TestFile:
+    def test_is_read(self, tmp_path):
+        sky().save(tmp_path / "sky.npz")
+        scene = tmp_path / "scene.xml"
+        scene.write_text(
+            '<scene version="3.0.0"><emitter type="gaussian_environment">'
+            '<string name="filename" value="sky.npz"/><float name="scale" value="2"/>'
+            '<transform name="to_world"><rotate y="1" angle="70"/></transform>'
+            "</emitter></scene>"
+        )
+        emitter = mi.load_file(str(scene)).environment()
+        expected = mi.load_dict(environment_of(sky(), scale=2.0, to_world=turn("about y")))
+        np.testing.assert_allclose(seen(emitter, texels()), seen(expected, texels()), rtol=1e-3)
+        assert 'name = "sky.npz"' in str(emitter)
+
+    def test_of_a_single_bright_channel(self):
+        g = eg.Gaussians.from_arrays(
+            [[8, 4]], [[0.3, 0, 0.3]], [[0]], to_log(np.float32([30.0])), size=(16, 8),
+            space="log", backend=backend(),
+        )  # fmt: skip
+        np.testing.assert_allclose(seen(mi.load_dict(environment_of(g)), texels()), 30, rtol=1e-3)
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("properties", "message"),
+        [
+            ({"scale": -1.0}, "scale is -1.0; it must be finite, and at least 0"),
+            ({"scale": "bright"}, "scale is 'bright'; it must be a number"),
+            ({"prefilter": 2.0}, "prefilter is 2.0; it is the angle of a pixel"),
+            ({"wrap_mode": "clamp"}, "it has no property wrap_mode"),
+            ({"space": "cmyk"}, "space 'cmyk'"),
+            ({"cutoff": 99.0}, "cutoff is 99.0; it must be above 0"),
+        ],
+    )
+    def test_of_properties(self, properties, message):
+        with pytest.raises(RuntimeError) as caught:
+            mi.load_dict({**environment_of(sky()), **properties})
+        first_line = str(caught.value).splitlines()[0]
+        assert "gaussian_environment: " in first_line
+        assert message in first_line
+
+    @pytest.mark.parametrize(
+        ("g", "message"),
+        [
+            (lambda: sky("data"), "3 channels in the space 'data'; it needs one or three of light"),
+            (lambda: sky("data", channels=2), "2 channels in the space 'data'"),
+            (lambda: sky(channels=4), "4 channels; use a set of 1 to 3"),
+            (lambda: sky(size=(8, 1)), "8x1 pixels; it needs two along each side"),
+        ],
+    )
+    def test_of_sets(self, g, message):
+        with pytest.raises(RuntimeError, match=message):
+            mi.load_dict(environment_of(g()))
+
+    def test_no_source(self):
+        with pytest.raises(RuntimeError, match="gaussian_environment: give one of filename"):
+            mi.load_dict({"type": "gaussian_environment"})
+
+    def test_a_transform_that_scales(self):
+        scaled = mi.ScalarTransform4f().scale(2)
+        with pytest.raises(RuntimeError, match="to_world scales or shears directions"):
+            mi.load_dict(environment_of(sky(), to_world=scaled))
+
+    def test_parameters_of_another_shape(self):
+        emitter = mi.load_dict(environment_of(sky()))
+        parameters = mi.traverse(emitter)
+        parameters["color"] = mi.TensorXf(np.zeros((3, 3), np.float32))
+        with pytest.raises(Exception, match=r"color has shape \(3, 3\)"):
+            parameters.update()
+
+    @in_variants(["scalar_rgb"])
+    def test_scalar_variants(self, variant):
+        with pytest.raises(RuntimeError, match="gaussian_environment does not support the variant"):
+            mi.load_dict({"type": "gaussian_environment", "filename": "x.npz"})

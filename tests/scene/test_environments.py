@@ -1,0 +1,102 @@
+"""Environment maps that become Gaussians, and those that stay."""
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.poster import camera, mi
+from eigengs_dr.scene import costs
+
+pytestmark = pytest.mark.mitsuba
+
+QUICK = {"iterations": 30, "spp": 64}
+
+
+def horizon(width=256, height=128, sun=0.0):
+    """A sky over a ground, with a soft sun; light shape (height, width, 3)."""
+    y, x = np.mgrid[:height, :width]
+    theta, phi = np.pi * y / (height - 1), 2 * np.pi * (x + 0.5) / width
+    up = 1 / (1 + np.exp(8 * (theta - np.pi / 2)))
+    light = up[..., None] * [0.3, 0.5, 0.9] + (1 - up)[..., None] * [0.25, 0.2, 0.15]
+    away = np.square(theta - 0.9) + np.square((phi - 2) * np.sin(0.9))
+    return (light + sun * np.exp(-away / (2 * 0.1**2))[..., None]).astype(np.float32)
+
+
+def scene(**emitter):
+    """A shiny ball under an environment map."""
+    coat = {"type": "principled", "base_color": {"type": "rgb", "value": 0.6}, "roughness": 0.4}
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 4},
+        "sensor": camera([0, 0, 4], fov=60, spp=64),
+        "ball": {"type": "sphere", "bsdf": coat},
+        "sky": {"type": "envmap", **emitter},
+    }
+
+
+@pytest.mark.parametrize("sun", [0.0, 200.0])
+def test_a_smooth_sky_takes_less_memory(sun, tmp_path, monkeypatch):
+    monkeypatch.setattr(costs, "SLOWEST", np.inf)  # a busy machine times anything
+    mi.Bitmap(horizon(sun=sun)).write(str(tmp_path / "sky.exr"))
+    turn = mi.ScalarTransform4f().rotate([0, 1, 0], 50)
+    given = {"filename": str(tmp_path / "sky.exr"), "scale": 0.7, "to_world": turn}
+    found = eg.convert_scene(scene(**given), tmp_path / "new", 36, **QUICK)
+    [environment] = found.textures
+    assert environment.names == ("sky.exr (environment)",)
+    assert environment.file == "sky.npz"
+    assert environment.psnr >= 36
+    assert environment.gaussian_bytes < 0.5 * environment.bytes
+    assert found.left == [] and found.better == []
+    # The renderings differ by no more than their noise.
+    assert found.missed(36) == []
+    assert found.psnr[0] > found.noise[0] - 1
+    saved = eg.Gaussians.load(tmp_path / "new" / "sky.npz")
+    assert (saved.width, saved.height) == (256, 128)
+    assert saved.space == ("log" if sun else "linear")
+    images = [
+        np.array(mi.render(s, spp=256)).mean((0, 1))
+        for s in (mi.load_dict(scene(**given)), mi.load_file(str(found.scene)))
+    ]
+    np.testing.assert_allclose(images[1], images[0], rtol=0.03)
+
+
+def test_noise_stays(tmp_path):
+    noise = np.random.default_rng(0).uniform(0, 1, (32, 64, 3)).astype(np.float32)
+    found = eg.convert_scene(scene(bitmap=mi.Bitmap(noise)), tmp_path / "new", **QUICK)
+    assert found.textures == []
+    [(name, reason)] = found.left
+    assert name == "a bitmap in memory (environment)"
+    assert reason.startswith("an environment map: ")
+    assert "for a goal of 40 dB" in reason
+    assert found.noise == []
+    assert 'type="envmap"' in found.scene.read_text()
+
+
+@pytest.mark.parametrize(
+    ("pixels", "others", "words"),
+    [
+        (horizon(8, 4), {}, "8x4 texels is small"),
+        (horizon() - 0.5, {}, "light below 0"),
+        (horizon(), {"to_world": "scaled"}, "to_world scales or shears"),
+    ],
+)
+def test_what_stays_and_why(pixels, others, words, tmp_path):
+    if others:
+        others = {"to_world": mi.ScalarTransform4f().scale(2)}
+    given = scene(bitmap=mi.Bitmap(pixels), **others)
+    found = eg.convert_scene(given, tmp_path / "new", iterations=10, spp=0)
+    [(_, reason)] = found.left
+    assert words in reason
+
+
+def test_gaussians_that_are_there_stay(tmp_path):
+    """Also from memory: they become a file."""
+    from eigengs_dr.plugins import environment_of
+
+    sky = eg.Gaussians.from_arrays(
+        [[32, 8]], [[0.1, 0, 0.1]], [[1, 1, 2]], [0.2, 0.2, 0.2], size=(64, 32), space="radiance"
+    )
+    given = {**scene(), "sky": environment_of(sky, scale=2.0)}
+    found = eg.convert_scene(given, tmp_path / "new", spp=4)
+    assert found.textures == [] and found.psnr[0] > 60
+    assert mi.load_file(str(found.scene)).environment() is not None
