@@ -1,6 +1,6 @@
-"""Compose the pictures of how-to pages: ``python docs/pictures.py`` writes docs/images/how-to-*.jpg.
+"""Compose pictures of how-to pages: ``python docs/pictures.py`` writes docs/images/how-to-*.jpg.
 
-All of them are fits of photos that scikit-image ships. They take a minute on two cores.
+All of them show fits of photos that scikit-image ships. They take half a minute on two cores.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 IMAGES = Path(__file__).parent / "images"
-CELL, GAP = 240, 6  # pixels: sides of a picture, and white between two
+CELL, GAP = 240, 6  # pixels: side of a picture, and white between two
 ERROR_GAIN = 4  # errors are shown as absolute differences of sRGB values, times this
 
 
@@ -54,7 +54,7 @@ def seams(photo: np.ndarray) -> list[np.ndarray]:
 
 
 def foveated(photo: np.ndarray) -> list[np.ndarray]:
-    """Fit a photo, and fit it with the foveated loss of the page, around the left eye."""
+    """Fit a photo, and fit it with a foveated loss, like that of the page, around the left eye."""
     y, x = np.indices(photo.shape[:2]) - np.array([110, 70])[:, None, None]
     fovea = np.exp(-(x**2 + y**2) / (2 * 45**2))[..., None].astype(np.float32)
     plain = eg.fit(photo, 600, space="rgb")
@@ -67,8 +67,8 @@ def foveated(photo: np.ndarray) -> list[np.ndarray]:
         near = dr.mean(weight * dr.square(error), axis=None)
         return near + 0.2 * dr.mean(dr.square(blocks), axis=None)
 
-    own = eg.fit(photo, 600, space="rgb", loss=loss)
-    return [photo, np.repeat(fovea, 3, 2), plain.image, own.image]
+    sharp = eg.fit(photo, 600, space="rgb", loss=loss)
+    return [photo, np.repeat(fovea, 3, 2), plain.image, sharp.image]
 
 
 def strokes(photo: np.ndarray) -> list[np.ndarray]:
@@ -99,9 +99,9 @@ def between(parts: list[np.ndarray], axis: int) -> np.ndarray:
 def cell_of(picture: np.ndarray) -> Image.Image:
     """Bring a picture to the size of a cell; pixels that are magnified stay squares."""
     codes = Image.fromarray(np.uint8(255 * picture.clip(0, 1) + 0.5))
-    larger = codes.width < CELL
-    way = Image.Resampling.NEAREST if larger else Image.Resampling.LANCZOS
-    return codes.resize((CELL, CELL), way)
+    is_magnified = codes.width < CELL
+    resampling = Image.Resampling.NEAREST if is_magnified else Image.Resampling.LANCZOS
+    return codes.resize((CELL, CELL), resampling)
 
 
 if __name__ == "__main__":
