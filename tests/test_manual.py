@@ -57,6 +57,14 @@ def numbers(tensor):
     return np.array(dr.detach(tensor).numpy(), np.float64)
 
 
+def test_gaussians_that_a_loop_adds_reduce_its_loss(own_loop):
+    before, after = (
+        np.mean((eg.render(own_loop[name]).numpy() - own_loop["photo"]) ** 2)
+        for name in ("frozen", "larger")
+    )
+    assert len(own_loop["larger"]) == 400 and after < 0.9 * before
+
+
 def test_losses_of_the_page_are_of_use(own_loss):
     """Each fit has less of its loss than a fit of the image, or finds what it looks for."""
     photo, loss_of = own_loss["photo"], own_loss["l1_ssim"]
