@@ -27,7 +27,7 @@ APT_INSTALL := apt_install() { \
 	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
 	|| { echo "make setup: $$2" >&2; exit 1; }; }
 
-.PHONY: help setup demo scenes test layers test-slow test-cuda-sim docs pages bench report basis clean
+.PHONY: help setup demo scenes test layers test-slow test-cuda-sim docs pages dist bench report basis clean
 
 help:
 	@echo "make demo       fit a photo; shows PSNR, time and the pictures it wrote"
@@ -37,6 +37,7 @@ help:
 	@echo "make test-cuda-sim  the cuda tests without a GPU, under the simulated driver CUDASIM=PATH"
 	@echo "make docs       build the manual, build/docs/html/index.html; every warning is an error"
 	@echo "make pages      write measured tables, charts and figures into README.md and docs/"
+	@echo "make dist       the wheel and the source distribution, in dist/, checked"
 	@echo "make bench      time the renderer"
 	@echo "make report     measure a part of everything and write build/results, in half an hour; resumes after a break"
 	@echo "make basis      train the basis that ships, again"
@@ -113,6 +114,12 @@ docs: $(DOCS_READY)
 pages: $(READY)
 	$(BIN)/eigengs-dr bench pages
 	$(BIN)/python docs/pages.py
+
+# The wheel is built from the source distribution, so that this is known to be whole.
+dist: $(READY)
+	@rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
 
 bench: $(READY)
 	$(BIN)/eigengs-dr bench kernels

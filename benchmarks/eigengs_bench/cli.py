@@ -12,6 +12,7 @@ from eigengs_bench.names import (
     KODAK_COUNTS,
     PAPER_SETS,
     PARTS,
+    PEERS,
     PICTURES,
     PRESETS,
     SAMPLES,
@@ -222,6 +223,25 @@ def kodak() -> None:
       eigengs-dr bench kodak data --counts 5000 --counts 10000 --steps 5000
       eigengs-dr bench kodak data --images 4 --timed
       eigengs-dr bench kodak data --counts 28000 --steps 0 --solve-steps 30
+    """
+
+
+@question("peers", ("kodak384",))
+@data_argument
+@sets_option(("kodak384",))
+@several("--peer", "peers", PEERS, "By default all")
+@several("--image", "photos", click.STRING, "Name of an image, by default the first of a set")
+@number("--gaussians", "Of a fit.", 2000, 1)
+@number("--images", "Of each set.", 1, 1)
+@number("--iterations", "Steps of our longer fits.", 1000, 1)
+@click.option("--timed", is_flag=True, help="Nothing else runs: the seconds count.")
+def peers() -> None:
+    """Compare fits with what else one would pick on a laptop, each on its own terms.
+
+    \b
+    splatthis  2D Gaussians in PyTorch, in an environment below FOLDER: a gigabyte, minutes a photo
+    texels     the best bitmap that takes no more memory, with its pyramid
+    JPEG, AVIF files of as many bytes as a packed fit
     """
 
 

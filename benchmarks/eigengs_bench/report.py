@@ -34,6 +34,7 @@ QUESTIONS = {
     "kodak": "The Kodak photos, beside published figures",
     "number": "Gaussians that a PSNR takes",
     "rate": "Bytes that a PSNR takes",
+    "peers": "What else one would pick",
     "scaling": "What size costs",
     "kernels": "How fast the renderer is",
     "texture": "How fast a texture is in Mitsuba",

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
+import PIL
+import pytest
 import skimage
 import tifffile
 from PIL import Image, ImageCms
@@ -21,6 +23,10 @@ PALETTE = np.random.default_rng(2).integers(0, 256, (256, 3), np.uint8)
 COLORS = PALETTE[GREY[..., 0]] / 255
 OVER_WHITE = 1 - ALPHA / 255 * (1 - RGB / 255)
 PEAKS = {"u1": 255, "u2": 65535, "u4": 2**32 - 1, "f2": 1, "f4": 1, "f8": 1}
+
+NEEDS_PILLOW_13 = pytest.mark.skipif(
+    int(PIL.__version__.split(".")[0]) < 13, reason="TIFF of YCbCr needs Pillow 13"
+)
 
 
 class Kind(NamedTuple):

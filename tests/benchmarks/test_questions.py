@@ -1,11 +1,16 @@
 """Each question: that its command measures, shows and goes on, and that its sums are right."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import eigengs_dr as eg
 from _helpers.benchmarks import (  # noqa: F401  data is a fixture
     data,
     lines_of,
@@ -21,6 +26,7 @@ from eigengs_bench import (
     kodak,
     overview,
     pareto,
+    peers,
     pictures,
     rate,
     scaling,
@@ -32,6 +38,7 @@ from eigengs_bench.names import SETS, ImageSet
 from eigengs_bench.rows import FILE, read
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.image.io import load_image, save_image
+from eigengs_dr.image.resize import resample
 
 
 def answered(out, bench, *arguments):
@@ -302,6 +309,94 @@ def test_means_at_equal_slope_give_hard_images_more():
     expected = rate.SLOPES / np.log(4)
     inside = (expected < 400) & (expected > 20)
     np.testing.assert_allclose(error[inside[: len(error)]], expected[inside], rtol=0.05)
+
+
+# --- What else one would pick ---
+
+
+def test_peers(small, tmp_path, backend):
+    chosen = [word for peer in ("texels", "JPEG", "AVIF") for word in ("--peer", peer)]
+    arguments = ("--set", "samples", "--gaussians", 300, "--iterations", 3, "--backend", backend)
+    rows, text = answered(tmp_path / "out", "peers", *chosen, *arguments)
+    made = {row["job"]["peer"]: row for row in rows}
+    codecs = ["JPEG 4:2:0", "JPEG 4:4:4", "AVIF 4:4:4"]
+    assert list(made) == [peers.OURS, peers.PACKED, "texels", *codecs]
+    assert made["texels"]["memory"] <= made[peers.OURS]["memory"] == 4 * (300 * 8 + 3)
+    assert made["texels"]["number"] == made["texels"]["memory"] / 4
+    for name, figures in made.items():
+        assert np.isfinite(figures["psnr_rgb"]) and name in text
+    assert made["AVIF 4:4:4"]["bytes"] <= made[peers.PACKED]["bytes"]
+    assert "Image-GS" in text and "What a peer does better" in text
+
+
+FAKE = """#!{python}
+import json, pathlib, shutil, sys
+words = dict(zip(sys.argv[2::2], sys.argv[3::2]))
+shutil.copy(sys.argv[1], words["--preview"])
+pathlib.Path(words["-o"]).write_text("<svg/>")
+log = pathlib.Path(words["--artifacts-dir"])
+log.mkdir()
+count = int(words["--splats"]) - 1
+figures = {{"total_time_sec": len(words["--stages"].split(",")), "final_splat_count": count}}
+figures["final_metrics"] = {{"psnr_srgb": 20.5}}
+(log / "run_manifest.json").write_text(json.dumps(figures))
+sys.exit("of no use\\nno splats" if count < 1 else 0)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the program that stands for a peer is a script")
+def test_a_peer_draws_its_own_picture(tmp_path, monkeypatch):
+    program = tmp_path / "splatthis"
+    program.write_text(FAKE.format(python=sys.executable))
+    program.chmod(0o755)
+    monkeypatch.setattr(peers, "environment", lambda folder, requirements: folder.parents[0])
+    image = one_image()
+    found = peers._splatthis(tmp_path, image, 5, "3,2,1")
+    assert (found["seconds"], found["number"], found["bytes"]) == (3, 4, 6)
+    assert (
+        found["psnr_rgb"] == 100
+        and found["own_psnr_rgb"] == 20.5
+        and "torch==2.13.0" in found["requirements"]
+    )
+    with pytest.raises(ValueError, match="splatthis failed: no splats"):
+        peers._splatthis(tmp_path, image, 1, "3,2,1")
+
+
+def test_a_peer_has_an_environment_of_its_own(tmp_path):
+    programs = peers.environment(tmp_path / "peer", ["pip"])  # is there: nothing is fetched
+    [python] = programs.glob("python3")
+    code = "import sys, importlib.util as u; print(sys.prefix, u.find_spec('eigengs_dr'))"
+    shown = subprocess.run([python, "-I", "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.split() == [str(tmp_path / "peer"), "None"]
+    (tmp_path / "peer" / "kept").touch()
+    assert peers.environment(tmp_path / "peer", ["pip"]) == programs
+    assert (tmp_path / "peer" / "kept").exists()
+    missing = str(tmp_path / "missing-1.0-py3-none-any.whl")
+    with pytest.raises(ValueError, match="cannot be installed"):
+        peers.environment(tmp_path / "peer", [missing])
+
+
+@given(st.integers(2, 40), st.integers(1, 40))
+def test_bilinear_weights(size, count):
+    weights = peers.bilinear(size, count)
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    if count == size:
+        np.testing.assert_allclose(weights, np.eye(size), atol=1e-12)
+    # A ramp of texels is a ramp of pixels between the outer texels.
+    at = (np.arange(size) + 0.5) * count / size
+    ramp = np.clip(at, 0.5, count - 0.5)
+    np.testing.assert_allclose(weights @ (np.arange(count) + 0.5), ramp, atol=1e-9)
+
+
+def test_texels_are_those_of_least_squares():
+    """No texels of the same size are closer: those that a filter makes are not."""
+    image = np.asarray(one_image(), np.float64)
+    found = peers._texels(image.astype(np.float32), 20)
+    side = int(32 * (peers.memory_of(20) / (4 * 32 * 32)) ** 0.5)
+    up = peers.bilinear(32, side)
+    filtered = np.clip(resample(image.astype(np.float32), side, side), 0, 1)
+    shown = np.einsum("yr,rkc,xk->yxc", up, filtered, up)
+    assert found["number"] == side**2 and found["psnr_rgb"] > eg.psnr(shown, image, "rgb") + 0.2
 
 
 # --- What size costs, and how fast the renderer is ---

@@ -13,6 +13,7 @@ from PIL import Image
 import eigengs_dr as eg
 from _helpers.errors import one_line, refused
 from _helpers.files import BYTES, png
+from _helpers.image_kinds import NEEDS_PILLOW_13
 from eigengs_dr.image.formats import PICTURE_SUFFIXES
 from eigengs_dr.image.io import (
     SAMPLES,
@@ -24,8 +25,10 @@ from eigengs_dr.image.io import (
     to_8bit,
 )
 
+YCBCR = pytest.param("YCbCr", marks=NEEDS_PILLOW_13)
 
-@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "CMYK", "YCbCr", "I;16", "F"])
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "CMYK", YCBCR, "I;16", "F"])
 def test_every_mode_of_an_opaque_file(tmp_path, mode):
     grey = np.array([[0, 255, 0], [255, 255, 0]], np.uint8)
     image = {

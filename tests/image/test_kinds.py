@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from _helpers.image_kinds import KINDS
+from _helpers.image_kinds import KINDS, NEEDS_PILLOW_13
 from eigengs_dr.blocks.windows import open_source
 from eigengs_dr.image.io import ImageError, check_image, load_image
 
@@ -44,7 +44,15 @@ def rows_of(page):
     return {(name, what): verdict for name, what, verdict in rows}
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: f"{kind.format}, {kind.what}")
+def marked(kinds):
+    """Kinds as parameters, but for those that an older Pillow writes wrong."""
+    return [
+        pytest.param(kind, marks=NEEDS_PILLOW_13) if kind.what == "YCbCr, 8 bits" else kind
+        for kind in kinds
+    ]
+
+
+@pytest.mark.parametrize("kind", marked(KINDS), ids=lambda kind: f"{kind.format}, {kind.what}")
 def test_the_manual_says_what_becomes_of_a_file(kind, tmp_path):
     rows = rows_of(PAGE.read_text(encoding="utf-8"))
     assert verdict_of(kind, tmp_path) == rows.get((kind.format, kind.what))
@@ -57,7 +65,7 @@ def test_the_manual_has_no_other_rows():
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
-    "kind", [kind for kind in KINDS if kind.format == "TIFF"], ids=lambda kind: kind.what
+    "kind", marked(kind for kind in KINDS if kind.format == "TIFF"), ids=lambda kind: kind.what
 )
 def test_a_window_of_a_large_file_shows_the_same(kind, tmp_path):
     path = tmp_path / "a.tif"

@@ -1,0 +1,265 @@
+"""What else one would pick on a laptop: a package of Gaussians, codecs, and a smaller bitmap.
+
+A row has the figures of `judge` of a picture, "seconds" of what made it, "bytes" of its file,
+"memory", the bytes of the parameters that a renderer reads, and "number" of Gaussians or texels.
+The seconds count where the job is "timed": nothing else ran on the machine.
+
+A package that fits Gaussians has a virtual environment of its own below the folder of the rows, and
+draws its own picture.
+"""
+
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from venv import EnvBuilder
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from PIL import Image as pillow
+
+import eigengs_dr as eg
+from eigengs_bench import report as fr
+from eigengs_bench.clock import Image, judge
+from eigengs_bench.images import images_of
+from eigengs_bench.names import PEERS
+from eigengs_bench.rate import BUDGET, CODECS, WARM_UP
+from eigengs_bench.rows import Job, Row, Task
+from eigengs_dr.image.io import save_image, to_8bit
+
+OURS, PACKED, TEXELS = "eigengs_dr", "eigengs_dr, packed", "texels"
+# With the build of PyTorch that it fits with.
+REQUIREMENTS = ("splatthis==0.3.2", "torch==2.13.0")
+# A third of its steps, and its steps, by the profile that is its default and its most costly one.
+SPLATTHIS = {"170 steps": "70,50,33,17", "500 steps": "200,150,100,50"}
+CODED = {"JPEG": ("JPEG 4:2:0", "JPEG 4:4:4"), "AVIF": ("AVIF 4:4:4",)}
+BETTER = {
+    "splatthis": "writes SVG, CSS and PowerPoint that need no program of its own",
+    "JPEG": "any program shows it; encodes and decodes in milliseconds",
+    "AVIF": "fewer bytes at equal PSNR, in the mean of Kodak",
+    "texels": "higher MS-SSIM at equal memory; a lookup reads four texels, everywhere; no fit",
+}
+
+
+def run(
+    task: Task,
+    names: Sequence[str],
+    peers: Sequence[str],
+    photos: Sequence[str],
+    gaussians: int,
+    timed: bool,
+) -> list[Row]:
+    """Measure images of sets, or some of them by their names, by this package and by the peers."""
+    shared: Row = {"gaussians": gaussians, "timed": timed}
+    jobs = (
+        ({"set": name, "image": photo, **shared, **label}, work)
+        for name in names
+        for photo, image in images_of(task, name, sys.maxsize if photos else None)
+        if not photos or photo in photos
+        for label, work in _jobs(task, image, gaussians, peers or PEERS)
+    )
+    return task.measure("peers", list(jobs))
+
+
+def _jobs(task: Task, image: Image, count: int, peers: Sequence[str]) -> Iterator[Job]:
+    packed = cache(partial(_packed, task, image, count))
+    for steps in sorted({min(100, task.iterations), task.iterations}):
+        work = partial(_fit, task, image, count, steps)
+        yield {"peer": OURS, "setting": f"{steps:,} steps"}, work
+    yield {"peer": PACKED, "setting": f"{task.iterations:,} steps"}, packed
+    if "splatthis" in peers:
+        for setting, stages in SPLATTHIS.items():
+            work = partial(_splatthis, task.folder / "peers", image, count, stages)
+            yield {"peer": "splatthis", "setting": setting}, work
+    if TEXELS in peers:
+        yield {"peer": TEXELS, "setting": "equal memory"}, partial(_texels, image, count)
+    for title in (title for peer in peers for title in CODED.get(peer, ())):
+        work = partial(_coded_as_small, packed, image, title)
+        yield {"peer": title, "setting": "equal bytes"}, work
+
+
+# ---------------------------------------------------------------------------------------------
+#  This package
+# ---------------------------------------------------------------------------------------------
+
+
+def memory_of(count: int) -> int:
+    """Return the bytes of a set of three channels: mean, factor, colour; and one background."""
+    return 4 * (8 * count + 3)
+
+
+def _fit(task: Task, image: Image, count: int, steps: int) -> Row:
+    made = partial(eg.fit, image, count, backend=task.backend)
+    made(iterations=min(WARM_UP, steps))
+    result = made(iterations=steps)
+    memory = {"memory": memory_of(count), "number": count}
+    return {"seconds": result.seconds, **memory, **judge(result.image, image)}
+
+
+def _packed(task: Task, image: Image, count: int) -> Row:
+    made = partial(eg.fit, image, count, backend=task.backend)
+    made(iterations=min(WARM_UP, task.iterations))
+    started = time.perf_counter()
+    result = made(iterations=task.iterations)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "fit.egs"
+        size = eg.pack(result.gaussians, path, image, BUDGET).bytes
+        seconds = time.perf_counter() - started
+        shown = eg.picture_of(eg.Gaussians.load(path, task.backend))
+    return {"seconds": seconds, "bytes": size, "number": count, **judge(shown, image)}
+
+
+# ---------------------------------------------------------------------------------------------
+#  The peers
+# ---------------------------------------------------------------------------------------------
+
+
+def environment(folder: Path, requirements: Sequence[str]) -> Path:
+    """Make a virtual environment with some packages, if it is not there; return its programs.
+
+    `ValueError` with the last words of pip if a package cannot be installed.
+    """
+    programs, done = folder / ("Scripts" if os.name == "nt" else "bin"), folder / "packages.txt"
+    wanted = "\n".join(requirements)
+    if not done.exists() or done.read_text() != wanted:
+        EnvBuilder(clear=True, with_pip=True).create(folder)
+        python = str(programs / "python")
+        command = [python, "-m", "pip", "install", "--quiet", *requirements]
+        process = subprocess.run(command, capture_output=True, text=True, check=False)
+        if process.returncode:
+            words = (process.stderr.strip() or "pip failed").splitlines()[-1]
+            raise ValueError(f"{folder}: {' '.join(requirements)} cannot be installed: {words}")
+        done.write_text(wanted)
+    return programs
+
+
+def _pixels(file: Path | io.BytesIO) -> Image:
+    """Decode a picture of 8 bits."""
+    return np.asarray(pillow.open(file).convert("RGB")).astype(np.float32) / np.float32(255)
+
+
+def _splatthis(folder: Path, image: Image, count: int, stages: str) -> Row:
+    """Fit with splatthis, which counts its seconds itself, without those of its imports."""
+    program = environment(folder / "splatthis", REQUIREMENTS) / "splatthis"
+    with TemporaryDirectory() as place:
+        here = Path(place)
+        source, drawing, preview = here / "image.png", here / "fit.svg", here / "preview.png"
+        save_image(source, image)
+        settings = ["--splats", count, "--stages", stages, "--artifacts-dir", here / "log"]
+        words = [program, source, "-o", drawing, "--preview", preview, *settings]
+        command = [str(word) for word in words]
+        process = subprocess.run(command, capture_output=True, text=True, check=False)
+        if process.returncode:
+            raise ValueError(f"splatthis failed: {(process.stderr or '?').splitlines()[-1]}")
+        log = json.loads((here / "log" / "run_manifest.json").read_text())
+        shown = _pixels(preview)
+        size = drawing.stat().st_size
+    figures = {"seconds": log["total_time_sec"], "number": log["final_splat_count"], "bytes": size}
+    # What its optimiser sees, before the splats are drawn as those of SVG.
+    figures["own_psnr_rgb"] = log["final_metrics"]["psnr_srgb"]
+    return {**figures, "requirements": list(REQUIREMENTS), **judge(shown, image)}
+
+
+def _texels(image: Image, count: int) -> Row:
+    """Fit a bitmap of 8 bits, which with its pyramid takes no more memory than a set.
+
+    The texels are those of least squares under bilinear lookups, so no bitmap of this size is
+    closer, but for rounding.
+    """
+    started = time.perf_counter()
+    height, width = image.shape[:2]
+    share = min(
+        1.0, memory_of(count) / (4 * height * width)
+    )  # 3 bytes, and a third for the pyramid
+    rows, columns = (max(1, int(side * share**0.5)) for side in (height, width))
+    up, across = bilinear(height, rows), bilinear(width, columns)
+    inverse = np.linalg.pinv(up), np.linalg.pinv(across)
+    texels = np.einsum("ry,yxc,kx->rkc", inverse[0], image, inverse[1], optimize=True)
+    texels = np.round(255 * np.clip(texels, 0, 1)) / 255
+    seconds = time.perf_counter() - started
+    shown = np.einsum("yr,rkc,xk->yxc", up, texels, across, optimize=True).astype(np.float32)
+    memory = {"memory": 4 * rows * columns, "number": rows * columns}
+    return {"seconds": seconds, **memory, **judge(shown, image)}
+
+
+def bilinear(size: int, count: int) -> NDArray[np.float64]:
+    """Return the weights of texels at pixel centres along a side, shape (size, count)."""
+    at = (np.arange(size) + 0.5) * count / size - 0.5
+    first = np.floor(at)
+    weights = np.zeros((size, count))
+    for texel, weight in ((first, 1 - (at - first)), (first + 1, at - first)):
+        np.add.at(weights, (np.arange(size), np.clip(texel, 0, count - 1).astype(int)), weight)
+    return weights
+
+
+def _coded_as_small(packed: Callable[[], Row], image: Image, title: str) -> Row:
+    """Encode at the best quality whose file has at most as many bytes as a packed fit."""
+    size = packed()["bytes"]
+    source, codec = pillow.fromarray(to_8bit(image).astype(np.uint8)), CODECS[title]
+
+    def encoded(quality: int) -> bytes:
+        file = io.BytesIO()
+        source.save(file, codec.kind, **codec.set_to(quality))
+        return file.getvalue()
+
+    low, high = 0, 100  # files of `low` fit, but for the worst quality, which counts as it is
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if len(encoded(middle)) <= size else (low, middle)
+    started = time.perf_counter()
+    content = encoded(low)
+    seconds = time.perf_counter() - started
+    shown = _pixels(io.BytesIO(content))
+    return {"seconds": seconds, "bytes": len(content), "quality": low, **judge(shown, image)}
+
+
+# ---------------------------------------------------------------------------------------------
+#  Tables
+# ---------------------------------------------------------------------------------------------
+
+
+def summarize(rows: Sequence[Row]) -> fr.Section:
+    """Lay out what each peer reaches, a table a set, what it does better, and those on a GPU."""
+    points, tables = fr.frame_of(rows), []
+    for name, part in points.groupby("set", sort=False):
+        tables.append(_table(str(name), part))
+    better = fr.table("What a peer does better", ("peer", "better"), BETTER.items(), "better")
+    known = pd.read_csv(str(files("eigengs_bench") / "published_peers.csv"), dtype=str)
+    gpu = fr.Table("Packages that need a CUDA GPU, by what they publish", known, "published")
+    return fr.Section([*tables, better._replace(rows=()), gpu._replace(rows=())])
+
+
+def _table(name: str, points: pd.DataFrame) -> fr.Table:
+    cells: dict[str, tuple[str, Callable[[pd.Series], str]]] = {
+        "parts": ("number", partial(_mean, decimals=0)),
+        "s": ("seconds", partial(fr.median, decimals=3)),
+        "bytes of file": ("bytes", partial(_mean, decimals=0)),
+        "bytes in memory": ("memory", partial(_mean, decimals=0)),
+        "psnr_rgb": ("psnr_rgb", _mean),
+        "as it says": ("own_psnr_rgb", _mean),
+        "psnr_ycbcr": ("psnr_ycbcr", _mean),
+        "MS-SSIM": ("ms_ssim", partial(_mean, decimals=3)),
+    }
+    points = points.reindex(columns=[*points, *{key for key, _ in cells.values()} - {*points}])
+    points["seconds"] = points.seconds.where(points.timed)
+    timed = points[points.timed]  # instead of those of the same name that are not
+    lines = pd.concat([timed, points[~points.timed]]).drop_duplicates(["image", "peer", "setting"])
+    caption = (
+        f"{name}, {fr.counted(points.image)}, {points.gaussians.iloc[0]:,} Gaussians: what else "
+        "makes a picture of them; parts are Gaussians or texels, codecs have the bytes of the "
+        "packed set, and texels its memory with their pyramid"
+    )
+    return fr.grouped(caption, lines, ["peer", "setting"], cells)._replace(name=name)
+
+
+def _mean(values: pd.Series, decimals: int = 1) -> str:
+    """Write a mean; `MISSING` if a peer has no such figure."""
+    return fr.number(values.mean(), decimals)
