@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
 from typing import Any
@@ -43,8 +44,10 @@ def photo_loss(
 ) -> Loss:
     """Return the squared error of renderings against photos, for `eigengs_dr.fit`.
 
-    A step puts the picture into the scene as texels, and renders one photo after another. So it
-    costs little more than a step of texels.
+    A step puts the picture into the scene as texels, and renders one photo after another. Dr.Jit
+    records the rendering of each camera and replays it, so a step takes less time than one of
+    texels in a loop of `mitsuba.render`. With `parameters`, and with integrators that Dr.Jit cannot
+    record, such as projective ones, a step traces the rendering anew.
 
     Parameters
     ----------
@@ -55,7 +58,7 @@ def photo_loss(
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
         are those of the set. Bitmaps need ``raw: true``; their texels are then light or data, so
         the ``space`` of a fit is by default "linear" for three channels, and "data" for one. An
-        ``envmap`` counts as a bitmap; fit its light with ``space="log"``, and without `bounds`.
+        ``envmap`` counts as a bitmap, of the space "log"; its light has no `bounds`.
     photos : sequence of array_like or tensor, shape (H, W, 3), path-like or mitsuba.Bitmap
         Of the size of the film of its sensor each. Floats, such as those of `mitsuba.render`, are
         linear light; codes of 8 bits are sRGB, and files what they say.
@@ -107,115 +110,156 @@ def photo_loss(
     >>> loss = photo_loss(scene, "wall.bsdf.reflectance", [photo])
     >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40)
     """
+    if not 0 <= held_out < 1:
+        raise ValueError(f"photo_loss: held_out is {held_out}; it must be in [0, 1)")
+    if spp < 1:
+        raise ValueError(f"photo_loss: spp is {spp}; it must be at least 1")
     known = mi.traverse(scene)
     keys = dict(pictures) if isinstance(pictures, Mapping) else {"": pictures}
     keys = {name: _data_of(known, key) for name, key in keys.items()}
     for key in parameters.keys() if parameters is not None else ():
         _check_known(known, key)
-    if not 0 <= held_out < 1:
-        raise ValueError(f"photo_loss: held_out is {held_out}; it must be in [0, 1)")
-    if spp < 1:
-        raise ValueError(f"photo_loss: spp is {spp}; it must be at least 1")
-    if len(photos) == 0:
-        raise ValueError("photo_loss: there are no photos; give one for each sensor")
-    if sensors is not None and len(sensors) != len(photos):
-        raise ValueError(f"photo_loss: {len(photos)} photos, but {len(sensors)} sensors")
-    if sensors is None and len(photos) > len(scene.sensors()):
-        raise ValueError(
-            f"photo_loss: {len(photos)} photos, but the scene has {len(scene.sensors())} sensors"
-        )
-    named = range(len(photos)) if sensors is None else sensors
-    chosen = [scene.sensors()[s] if isinstance(s, int) else s for s in named]
+    chosen = _sensors_of(scene, sensors, len(photos))
     targets = [
         _check_photo(number, photo, sensor.film().crop_size())
         for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
     ]
     judged = sorted({k * len(targets) // JUDGED for k in range(JUDGED)})
     generator = np.random.default_rng(seed)
+    shares = [held_out * (number in judged) for number in range(len(targets))]
     hidden = [
-        mi.TensorXf(
-            np.float32(generator.random((*target.shape[:2], 1)) < held_out * (number in judged))
-        )
-        for number, target in enumerate(targets)
+        mi.TensorXf(np.float32(generator.random((*target.shape[:2], 1)) < share))
+        for target, share in zip(targets, shares, strict=True)
     ]
     integrator = scene.integrator() if integrator is None else integrator
-    first = seed * STEPS_OF_A_SEED
-    add_slopes = freeze_rendering(_add_slopes)
-    channels = {name: known[key].shape[2] for name, key in keys.items()}
+    drawn = scene, known, keys, chosen, integrator, spp
+    taken = _Photos(*drawn, targets, hidden, judged, parameters, seed * STEPS_OF_A_SEED)
+    spaces = {name: _space_of(known, key) for name, key in keys.items()}
+    space = spaces if isinstance(pictures, Mapping) else spaces[""]
+    judge = taken.judge if held_out else None
+    return Loss(taken.loss, bounds, parameters, judge, space=space)
 
-    def shown_of(picture: Any) -> dict[str, mi.TensorXf]:
-        named = picture if isinstance(picture, Mapping) else {"": picture}
-        given = {name: p.shape[2] for name, p in named.items()}
-        if given != channels:
-            raise ValueError(
-                f"photo_loss: the bitmaps have the channels {_listed(channels)}, the pictures of "
-                f"the fit {_listed(given)}; the names and spaces of eigengs_dr.fit say them"
-            )
-        return {key: texels_of(known, key, named[name]) for name, key in keys.items()}
 
-    def difference(number: int, seed: int, samples: int) -> Any:
-        sensor = chosen[number]
-        shown = mi.render(scene, known, sensor, integrator, seed, spp=samples)
-        return shown[..., :3] - targets[number]
+@dataclass
+class _Photos:
+    """Photos of a scene, and the parts of them that no step sees.
 
-    def function(picture: Any, step: int) -> Any:
-        number, seed, texels = step % len(targets), first + step, shown_of(picture)
-        seen = 1 - hidden[number]
-        if parameters is None and dr.grad_enabled(picture):
-            return dr.custom(_Frozen, partial(slopes, number, seed, seen), texels)
-        known.update(texels)
-        if parameters is not None:
-            known.update(parameters)
-        return _mean(dr.square(difference(number, seed, spp)), seen)
+    Attributes
+    ----------
+    scene : mitsuba.Scene
+    known : mitsuba.SceneParameters
+    keys : dict of str to str
+        The names of the texels in the scene, by the names of the maps.
+    sensors : list of mitsuba.Sensor
+    integrator : mitsuba.Integrator
+    spp : int
+    photos : list of tensor, shape (H, W, 3)
+    hidden : list of tensor, shape (H, W, 1)
+        1 for held-out pixels, else 0.
+    judged : list of int
+        The photos that have some.
+    parameters : optimiser, or None
+    first : int
+        Seed of the first rendering.
+    """
 
-    def slopes(number: int, seed: int, seen: mi.TensorXf, texels: dict) -> tuple[Any, dict]:
-        nonlocal add_slopes
+    scene: mi.Scene
+    known: mi.SceneParameters
+    keys: dict[str, str]
+    sensors: list[mi.Sensor]
+    integrator: mi.Integrator
+    spp: int
+    photos: list[mi.TensorXf]
+    hidden: list[mi.TensorXf]
+    judged: list[int]
+    parameters: Any
+    first: int
+
+    def __post_init__(self) -> None:
+        self.channels = {name: self.known[key].shape[2] for name, key in self.keys.items()}
+        self.add_slopes = freeze_rendering(_add_slopes)
+
+    def loss(self, picture: Any, step: int) -> Any:
+        """Return the squared error of the rendering of one photo."""
+        number, seed, texels = step % len(self.photos), self.first + step, self.texels(picture)
+        if self.parameters is None and dr.grad_enabled(picture):
+            return dr.custom(_Frozen, partial(self.slopes, number, seed), texels)
+        self.known.update(texels)
+        if self.parameters is not None:
+            self.known.update(self.parameters)
+        return _mean(dr.square(self.difference(number, seed, self.spp)), 1 - self.hidden[number])
+
+    def slopes(self, number: int, seed: int, texels: dict) -> tuple[Any, dict]:
+        """Return the squared error of a photo, and its derivatives by texels; replayed."""
         with dr.resume_grad():
             leaves = {key: dr.detach(t) for key, t in texels.items()}
             dr.enable_grad(leaves)
-            known.update(leaves)
-            drawn = scene, integrator, chosen[number], spp, dr.opaque(mi.UInt32, seed)
+            self.known.update(leaves)
+            drawn = self.scene, list(texels), self.sensors[number], self.integrator, self.spp
+            seen = dr.opaque(mi.UInt32, seed), self.photos[number], 1 - self.hidden[number]
             try:
-                value = add_slopes(*drawn, targets[number], seen)
+                value = self.add_slopes(*drawn, *seen)
             except RuntimeError:  # Dr.Jit cannot record projective integrators, say
-                add_slopes = _add_slopes
+                self.add_slopes = _add_slopes
                 dr.clear_grad(leaves)
-                value = add_slopes(*drawn, targets[number], seen)
-            known.update(texels)
+                value = self.add_slopes(*drawn, *seen)
+            self.known.update(texels)
             return value, dr.grad(leaves)
 
-    def judge(picture: Any) -> Any:
-        known.update(shown_of(picture))
-        products = [
-            difference(number, first, JUDGE_SAMPLES * spp)
-            * difference(number, first + 1, JUDGE_SAMPLES * spp)
-            for number in judged
+    def judge(self, picture: Any) -> Any:
+        """Return the squared error of held-out pixels, see `JUDGE_SAMPLES`."""
+        self.known.update(self.texels(picture))
+        samples = JUDGE_SAMPLES * self.spp
+        means = [
+            _mean(
+                self.difference(number, self.first, samples)
+                * self.difference(number, self.first + 1, samples),
+                self.hidden[number],
+            )
+            for number in self.judged
         ]
-        means = [_mean(p, hidden[n]) for p, n in zip(products, judged, strict=True)]
         return sum(means) / len(means)
 
-    spaces = {name: "linear" if number == 3 else "data" for name, number in channels.items()}
-    space = spaces if isinstance(pictures, Mapping) else spaces[""]
-    return Loss(function, bounds, parameters, judge if held_out else None, space=space)
+    def texels(self, picture: Any) -> dict[str, mi.TensorXf]:
+        """Return the texels of each bitmap by its name in the scene."""
+        named = picture if isinstance(picture, Mapping) else {"": picture}
+        given = {name: p.shape[2] for name, p in named.items()}
+        if given != self.channels:
+            raise ValueError(
+                f"photo_loss: the bitmaps have the channels {_listed(self.channels)}, the pictures "
+                f"of the fit {_listed(given)}; the names and spaces of eigengs_dr.fit say them"
+            )
+        return {key: texels_of(self.known, key, named[name]) for name, key in self.keys.items()}
+
+    def difference(self, number: int, seed: int, samples: int) -> Any:
+        """Return a rendering less its photo."""
+        sensor, integrator = self.sensors[number], self.integrator
+        shown = mi.render(self.scene, self.known, sensor, integrator, seed, spp=samples)
+        return shown[..., :3] - self.photos[number]
 
 
 def _add_slopes(
     scene: mi.Scene,
-    integrator: mi.Integrator,
+    keys: list[str],
     sensor: mi.Sensor,
+    integrator: mi.Integrator,
     spp: int,
     seed: mi.UInt32,
     photo: mi.TensorXf,
     weight: mi.TensorXf,
 ) -> mi.TensorXf:
-    """Return the squared error of a rendering; parameters of the scene get its derivatives.
+    """Return the squared error of a rendering; some parameters of the scene get its derivatives.
 
     To be frozen, so it leaves the scene as it is: Dr.Jit 1.5 replays a change of a bitmap with the
     memory of the recording, which may be gone.
     """
-    shown = mi.render(scene, mi.traverse(scene), sensor, integrator, seed, spp=spp)
+    known = mi.traverse(scene)
+    shown = mi.render(scene, known, sensor, integrator, seed, spp=spp)
     error = _mean(dr.square(shown[..., :3] - photo), weight)
-    dr.backward(error)
+    dr.set_grad(error, 1)
+    # Forward from here marks what depends on these; backward then visits nothing else.
+    dr.enqueue(dr.ADMode.Forward, [known[key] for key in keys])
+    dr.traverse(dr.ADMode.Backward)
     return dr.detach(error)
 
 
@@ -246,6 +290,21 @@ STEPS_OF_A_SEED = 1 << 16
 """Random numbers of two seeds differ if steps are fewer."""
 
 
+def _sensors_of(
+    scene: mi.Scene, sensors: Sequence[mi.Sensor | int] | None, count: int
+) -> list[mi.Sensor]:
+    """Return one sensor for each photo: those that were given, or the first ones of the scene."""
+    if not count:
+        raise ValueError("photo_loss: there are no photos; give one for each sensor")
+    known = scene.sensors()
+    if sensors is not None and len(sensors) != count:
+        raise ValueError(f"photo_loss: {count} photos, but {len(sensors)} sensors")
+    if sensors is None and count > len(known):
+        raise ValueError(f"photo_loss: {count} photos, but the scene has {len(known)} sensors")
+    named = range(count) if sensors is None else sensors
+    return [known[sensor] if isinstance(sensor, int) else sensor for sensor in named]
+
+
 def _listed(channels: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {number}".strip() for name, number in channels.items())
 
@@ -269,6 +328,13 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
         f"photo_loss: the scene has no bitmap {key!r}; "
         + (f"it has {', '.join(close)}" if close else "it has none")
     )
+
+
+def _space_of(known: mi.SceneParameters, key: str) -> str:
+    """Return the space of the sums of texels: logarithms for an ``envmap``, else light or data."""
+    if isinstance(known.properties[key][2], mi.Emitter):
+        return "log"
+    return "linear" if known[key].shape[2] == 3 else "data"
 
 
 def _check_photo(number: int, photo: Any, size: Sequence[int]) -> mi.TensorXf:

@@ -5,6 +5,7 @@ photo, and of the maps of a material. The parameters of a pyramid are difference
 next coarser level (Weier et al. 2025, doi 10.1145/3730855), so coarse ones move many texels.
 """
 
+import gc
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -197,6 +198,7 @@ def _jobs(task: Task) -> Iterator[Job]:
 
 def recover(mi: Any, scene: Scene, method: str, steps: int) -> Row:
     """Recover the maps of a scene by a method; return seconds, parameters and PSNRs."""
+    gc.collect()  # Mitsuba traces the plugins of every scene that is still there
     if method == "fit":
         return fit(mi, scene, steps)
     name = pyramid.__name__ if method == FROZEN else method

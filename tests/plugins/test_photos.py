@@ -123,6 +123,22 @@ def test_frozen_steps_have_the_derivatives_of_plain_ones(integrator):
             dr.flush_malloc_cache()
 
 
+def test_other_derivatives_stay_as_they_are():
+    """Parameters of the scene that the user differentiates get nothing from a fit."""
+    import drjit as dr
+
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), photos_of(wall(true_texture()), spp=4)
+    values = mi.traverse(scene)
+    values["sky.radiance.value"] = mi.Float(1)
+    dr.enable_grad(values["sky.radiance.value"])
+    values.update()
+    light = values["sky.radiance.value"]
+    eg.fit(loss=photo_loss(scene, NAME, photos), size=(32, 32), gaussians=10, iterations=20)
+    assert dr.grad_enabled(light) and dr.grad(light)[0] == 0
+
+
 def test_a_light_is_found_along():
     """Of which the photos say nothing but the product with the texture; where that is known."""
     from eigengs_dr.plugins import photo_loss
