@@ -194,8 +194,11 @@ class _Photos:
         with dr.resume_grad():
             leaves = {key: dr.detach(t) for key, t in texels.items()}
             dr.enable_grad(leaves)
-            self.known.update(leaves)
-            drawn = self.scene, list(texels), self.sensors[number], self.integrator, self.spp
+            # What the user differentiates gets nothing: Mitsuba would add to all derivatives.
+            known = ((k, v) for k, v in self.known if k not in texels and dr.grad_enabled(v))
+            others = {key: type(value)(value) for key, value in known}
+            self.known.update(leaves | {key: dr.detach(value) for key, value in others.items()})
+            drawn = self.scene, self.sensors[number], self.integrator, self.spp
             seen = dr.opaque(mi.UInt32, seed), self.photos[number], 1 - self.hidden[number]
             try:
                 value = self.add_slopes(*drawn, *seen)
@@ -203,7 +206,7 @@ class _Photos:
                 self.add_slopes = _add_slopes
                 dr.clear_grad(leaves)
                 value = self.add_slopes(*drawn, *seen)
-            self.known.update(texels)
+            self.known.update(texels | others)
             return value, dr.grad(leaves)
 
     def judge(self, picture: Any) -> Any:
@@ -240,7 +243,6 @@ class _Photos:
 
 def _add_slopes(
     scene: mi.Scene,
-    keys: list[str],
     sensor: mi.Sensor,
     integrator: mi.Integrator,
     spp: int,
@@ -248,18 +250,14 @@ def _add_slopes(
     photo: mi.TensorXf,
     weight: mi.TensorXf,
 ) -> mi.TensorXf:
-    """Return the squared error of a rendering; some parameters of the scene get its derivatives.
+    """Return the squared error of a rendering; parameters of the scene get its derivatives.
 
     To be frozen, so it leaves the scene as it is: Dr.Jit 1.5 replays a change of a bitmap with the
     memory of the recording, which may be gone.
     """
-    known = mi.traverse(scene)
-    shown = mi.render(scene, known, sensor, integrator, seed, spp=spp)
+    shown = mi.render(scene, mi.traverse(scene), sensor, integrator, seed, spp=spp)
     error = _mean(dr.square(shown[..., :3] - photo), weight)
-    dr.set_grad(error, 1)
-    # Forward from here marks what depends on these; backward then visits nothing else.
-    dr.enqueue(dr.ADMode.Forward, [known[key] for key in keys])
-    dr.traverse(dr.ADMode.Backward)
+    dr.backward(error)
     return dr.detach(error)
 
 

@@ -48,6 +48,11 @@ def own_loss():
     return run_blocks(FOLDER / "how-to/own-loss.md", {"__name__": "page"})
 
 
+@pytest.fixture(scope="module")
+def own_loop():
+    return run_blocks(FOLDER / "how-to/own-loop.md", {"__name__": "page"})
+
+
 def numbers(tensor):
     return np.array(dr.detach(tensor).numpy(), np.float64)
 
@@ -79,23 +84,23 @@ def test_the_network_of_the_page_fits():
     assert rows[-1]["loss"] < 0.5 * rows[0]["loss"]
 
 
-def test_the_loops_of_the_page_fit(own_loss):
+def test_the_loops_of_the_page_fit(own_loop):
     """The loop of descents ends where `fit` does; the frozen one gains."""
-    photo, start = own_loss["photo"], own_loss["start"]
-    as_fit = eg.fit(photo, 300, iterations=100, space="rgb", loss=own_loss["l1_ssim"])
-    assert own_loss["losses"][-1] == pytest.approx(as_fit.loss, rel=0.01)
-    assert sorted(own_loss["losses"], reverse=True) == own_loss["losses"]
-    before, after = (eg.psnr(numbers(eg.render(g)), photo) for g in (start, own_loss["frozen"]))
+    photo, start = own_loop["photo"], own_loop["start"]
+    as_fit = eg.fit(photo, 300, iterations=100, space="rgb", loss=own_loop["l1"])
+    assert own_loop["losses"][-1] == pytest.approx(as_fit.loss, rel=0.01)
+    assert sorted(own_loop["losses"], reverse=True) == own_loop["losses"]
+    before, after = (eg.psnr(numbers(eg.render(g)), photo) for g in (start, own_loop["frozen"]))
     assert after > before + 2
-    assert own_loss["take_step"].n_recordings <= 3
-    a, _, c = own_loss["frozen"].factor.numpy()
+    assert own_loop["take_step"].n_recordings <= 3
+    a, _, c = own_loop["frozen"].factor.numpy()
     assert (a > 0).all() and (c > 0).all()
 
 
 @pytest.mark.parametrize("name", ["l1_ssim", "masked", "foveated"])
-def test_a_loss_of_the_page_has_the_derivative_of_finite_differences(own_loss, name):
+def test_a_loss_of_the_page_has_the_derivative_of_finite_differences(own_loss, own_loop, name):
     values, step = np.random.default_rng(3).uniform(0.2, 0.8, (2, 64, 64, 3))
-    Tensor = type(own_loss["exact"])  # in double precision
+    Tensor = type(own_loop["exact"])  # in double precision
     for known in ("wanted", "weight", "fovea"):
         own_loss[known] = Tensor(own_loss[known])
     picture = Tensor(values)
@@ -106,13 +111,13 @@ def test_a_loss_of_the_page_has_the_derivative_of_finite_differences(own_loss, n
     assert (dr.grad(picture).numpy() * step).sum() == pytest.approx(wanted, rel=1e-5)
 
 
-def test_the_traced_loop_of_the_page_is_a_sum_with_derivatives(own_loss):
-    g = dr.detach(own_loss["double"])
+def test_the_traced_loop_of_the_page_is_a_sum_with_derivatives(own_loop):
+    g = dr.detach(own_loop["double"])
     Float = dr.leaf_t(g.mean)
     at = [np.array([10.5, 30.5]), np.array([20.5, 40.5])]
     x, y = map(Float, at)
     dr.enable_grad(g.mean)
-    found = own_loss["brightness"](g, x, y, len(g))
+    found = own_loop["brightness"](g, x, y, len(g))
     dr.backward(dr.sum(found))
 
     def total(mean):
@@ -234,7 +239,12 @@ ROOM = """<scene version="3.0.0">
   </bsdf></shape>
 </scene>"""
 
-RUN_AS_A_WHOLE = ("how-to/own-loss.md", "how-to/recover.md", "getting-started.md")  # above
+RUN_AS_A_WHOLE = (  # above
+    "how-to/own-loss.md",
+    "how-to/own-loop.md",
+    "how-to/recover.md",
+    "getting-started.md",
+)
 
 
 def is_mitsuba(page):
