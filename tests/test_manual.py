@@ -414,6 +414,15 @@ def test_links_of_pages_work_in_a_checkout(check):
     assert check["broken"]() == []
 
 
+def test_files_of_the_architecture_exist():
+    """Folders and files on the page and in its drawing lie in the package, or beside it."""
+    texts = (FOLDER / "architecture.md", FOLDER / "images/architecture.svg")
+    paths = re.findall(r"[`>]([a-z_]+/[\w/]*(?:\.py)?)[`<]", "".join(t.read_text() for t in texts))
+    tops = (ROOT / "eigengs_dr", ROOT)
+    assert len(paths) > 30
+    assert not [path for path in paths if not any((top / path).exists() for top in tops)]
+
+
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory):
     """A copy of README.md, the pages, the charts and their rows."""
