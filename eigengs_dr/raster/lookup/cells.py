@@ -365,9 +365,8 @@ def _append(runs: UInt, active: Bool, number: UInt, slot: UInt, stop: UInt, half
     Returns the next slot, the end of the slots of the cell, and `half`.
     """
     active = active & (slot < stop)
-    odd = slot % 2 != 0
-    dr.scatter(runs, half | (number << 16), slot // 2, active & odd)
-    half = dr.select(active & ~odd, number, half)
+    dr.scatter(runs, half | (number << 16), slot // 2, active & (slot % 2 != 0))
+    half = dr.select(active & (slot % 2 == 0), number, half)
     return slot + dr.select(active, type(slot)(1), 0), stop, half
 
 
@@ -386,13 +385,13 @@ def _number(types: ArrayTypes, count: int, lists: list[TileLists]) -> _Bands:
     grid = lists[-1].grid
     if count <= MOST:
         return _Bands(None, dr.opaque(types.UInt, 0), grid.height, [None for _ in lists])
-    entries = [one.splat.numpy() for one in lists]
+    splats = [one.splat.numpy() for one in lists]
     side, bands = grid.tile[1], 2
     while True:
         band = side * -(-grid.ny // bands)
         cuts = [_cut(one, band) for one in lists]
         members = [
-            _members(count, [splat[k] for splat, k in zip(entries, parts, strict=True)])
+            _members(count, [splat[k] for splat, k in zip(splats, parts, strict=True)])
             for parts in zip(*cuts, strict=True)
         ]
         if max(map(len, members)) <= MOST:
@@ -403,16 +402,16 @@ def _number(types: ArrayTypes, count: int, lists: list[TileLists]) -> _Bands:
                 "Gaussians"
             )
         bands = min(2 * bands, grid.ny)
-    local, numbers = np.zeros(count, np.uint32), [np.zeros_like(splat) for splat in entries]
+    local, numbers = np.zeros(count, np.uint32), [np.zeros_like(splat) for splat in splats]
     for inside, parts in zip(members, zip(*cuts, strict=True), strict=True):
         local[inside] = np.arange(1, len(inside) + 1)
-        for number, splat, part in zip(numbers, entries, parts, strict=True):
+        for number, splat, part in zip(numbers, splats, parts, strict=True):
             number[part] = local[splat[part]]
     rest = np.setdiff1d(np.arange(count), np.concatenate(members))
     gaussian = np.concatenate([*(np.concatenate([[count], m]) for m in members), rest])
     first = np.cumsum([0, *(1 + len(m) for m in members[:-1])])
-    gaussian, first, *numbers = upload_rows(types.UInt, [gaussian, first, *numbers])
-    return _Bands(gaussian, first, band, numbers)
+    stored, starts, *uploaded = upload_rows(types.UInt, [gaussian, first, *numbers])
+    return _Bands(stored, starts, band, list(uploaded))
 
 
 def _cut(lists: TileLists, band: int) -> list[slice]:
