@@ -18,7 +18,7 @@ import mitsuba as mi
 from eigengs_dr.backend.detail import indices_of, scope
 from eigengs_dr.backend.types import Bool, Float
 from eigengs_dr.raster.binning.lists import TileLists
-from eigengs_dr.raster.lookup.cells import SIDE, CellLists, cell_side, list_cells
+from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.footprint import bound_covariance
 from eigengs_dr.raster.lookup.points import Packed, invert, sum_at_points, value_terms
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered, where_any
@@ -59,12 +59,7 @@ class Lists:
 
 
 def list_gaussians(
-    shape: list,
-    size: tuple[int, int],
-    cutoff: float,
-    wrap: str,
-    filtered: bool,
-    side: float = SIDE,
+    shape: list, size: tuple[int, int], cutoff: float, wrap: str, filtered: bool
 ) -> Lists:
     """List Gaussians for lookups at points or, if `filtered`, over footprints.
 
@@ -75,13 +70,11 @@ def list_gaussians(
     size : (int, int)
     cutoff, wrap, filtered
         See the properties of the texture.
-    side : float, optional
-        Side of cells in mean distances of Gaussians.
     """
     if filtered:
-        sizes = classify_by_size(shape, *size, cutoff, wrap, side)
+        sizes = classify_by_size(shape, *size, cutoff, wrap)
         return Lists(sizes.cells, sizes)  # slopes and the survey look at points
-    level = shape, cell_side(*size, dr.width(shape), side)
+    level = shape, cell_side(*size, dr.width(shape))
     return Lists(list_cells([level], *size, kernel_radius(cutoff)), None)
 
 

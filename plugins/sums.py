@@ -14,7 +14,6 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.types import Bool, Float
-from eigengs_dr.raster.lookup.cells import NARROW, SIDE
 
 from . import properties
 from .color import show_all, upload_table
@@ -91,8 +90,7 @@ def plugin_of_sums(base: type) -> Any:
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved or not self.table.lists.cells.packs:
                 shape = source.decode(dr.detach(source.tensors)).shape
-                size, side = (self.width, self.height), NARROW if self.changed else SIDE
-                lists = list_gaussians(shape, size, *settings, side)
+                lists = list_gaussians(shape, (self.width, self.height), *settings)
             else:
                 lists = self.table.lists
             table = make_table(lists, self.cutoff, source.tensors, source.decode)

@@ -8,7 +8,7 @@ parameters of its own; few Gaussians reach into two bands, and their rows are st
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -16,11 +16,12 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arrays import ArrayTypes, types_of, upload
+from ...backend.arrays import ArrayTypes, types_of, upload_rows
+from ...backend.recording import record
 from ...backend.types import Bool, Float, UInt
-from ..binning.lists import build_lists
-from ..binning.tiles import Grid
-from ..parameters import pack_parameters
+from ..binning.lists import TileLists, build_lists
+from ..binning.tiles import Grid, GridArrays, State, tile_columns
+from ..parameters import NUM_SHAPE_PARAMS, pack_parameters, unpack_parameters
 
 MOST = (1 << 16) - 1
 """Largest number of Gaussians of a band. Their numbers start at 1: row 0 of a band is blank."""
@@ -31,12 +32,14 @@ BLANK = (0.0, 0.0, 1.0, 0.0, 1.0)
 SIDE = 1.05
 """Side of cells in mean distances of Gaussians."""
 
-NARROW = 0.75
-"""Side of the cells of Gaussians that change: a point has 15 % fewer Gaussians to look at, in sums
-and in their derivatives, but lists take twice the memory."""
-
 RUN = 4
 """Numbers that a step of a sum reads at once, in one gather: two words of 32 bits."""
+
+COLUMNS = 4
+"""Cells of a strip, of one row, which one lane lists: they share the extent of a Gaussian."""
+
+PAD = 0.5
+"""Pixels by which lists enlarge Gaussians: what is right for pixel centres is then for points."""
 
 
 @dataclass(frozen=True)
@@ -150,15 +153,22 @@ class CellLists:
         return dr.gather(types.UInt, self.first, band)
 
 
-def cell_side(width: int, height: int, count: int, side: float = SIDE) -> int:
-    """Return the side of cells in pixels, for a side in mean distances of Gaussians."""
-    return max(1, round(side * math.sqrt(width * height / count)))
+def cell_side(width: int, height: int, count: int) -> int:
+    """Return the side of cells in pixels, about `SIDE`."""
+    return max(1, round(SIDE * math.sqrt(width * height / count)))
 
 
 def list_cells(
     levels: Sequence[tuple[list, int]], width: int, height: int, radius: float
 ) -> CellLists:
     """List the Gaussians of every cell of an image.
+
+    A sort lists the Gaussians of strips, of `COLUMNS` cells each. Then one lane a strip tests
+    these, twice: to count the runs of its cells, and to write them. Entries of cells are neither
+    sorted nor copied to the host, and their order is that of the Gaussians.
+
+    Cost: a sort of the entries of strips, less than half as many as those of cells; for each of
+    them two tests and `COLUMNS` comparisons; and one copy of a few bytes to the host.
 
     Parameters
     ----------
@@ -177,103 +187,244 @@ def list_cells(
         If more than `MOST` Gaussians touch one row of cells.
     """
     types, count = types_of(levels[0][0][0]), dr.width(levels[0][0])
+    lists = [_list_strips(shape, width, height, side, radius) for shape, side in levels]
+    bands, reach = _number(types, count, lists), dr.opaque(types.Float, radius)
     grids = [Grid(width, height, (side, side)) for _, side in levels]
-    lists = [_lists(shape, grid, radius) for (shape, _), grid in zip(levels, grids, strict=True)]
-    numbered = _number(count, height, grids, lists)
-    found, starts, total = [], [], 0
-    for entries, (_, ends) in zip(numbered.entries, lists, strict=True):
-        lengths = np.diff(ends)
-        begin = np.concatenate([[0], np.cumsum(-(-lengths // RUN))])
-        filled = np.zeros(RUN * begin[-1], np.uint16)
-        filled[np.repeat(RUN * begin[:-1] - ends[:-1], lengths) + np.arange(ends[-1])] = entries
-        found.append(filled)
-        starts.append(upload(types.UInt, (total + begin).astype(np.uint32)))
-        total += int(begin[-1])
-    gaussian = numbered.gaussian
-    joint = np.concatenate(found) if total else np.zeros(RUN, np.uint16)
+    strips = [
+        _Strips(one.splat, number, one.begin, one.end, one.sizes, grid.in_arrays(types), grid.tiles)
+        for one, number, grid in zip(lists, bands.numbers, grids, strict=True)
+    ]
+    rows, starts = _count_runs([shape for shape, _ in levels], strips, reach)
+    runs = _write_runs(rows, strips, starts, reach, _rounded(int(starts[-1][-1])))
     cells = []
     for grid, start in zip(grids, starts, strict=True):
         density = dr.opaque(types.Float, 1 / grid.tile[0])
-        columns, rows = (dr.opaque(types.UInt, n) for n in (grid.nx, grid.ny))
-        cells.append(Cells(start, density, columns, rows))
+        columns, lines = (dr.opaque(types.UInt, n) for n in (grid.nx, grid.ny))
+        cells.append(Cells(start, density, columns, lines))
     return CellLists(
         count,
         cells,
-        upload(types.UInt, joint.view(np.uint32)),
-        None if gaussian is None else upload(types.UInt, gaussian.astype(np.uint32)),
-        upload(types.UInt, numbered.first.astype(np.uint32)),
-        dr.opaque(types.Float, 1 / numbered.band),
-        dr.opaque(types.UInt, len(numbered.first) - 1),
+        runs,
+        bands.gaussian,
+        bands.first,
+        dr.opaque(types.Float, 1 / bands.height),
+        dr.opaque(types.UInt, dr.width(bands.first) - 1),
     )
 
 
-def _lists(shape: list, grid: Grid, radius: float) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Return the Gaussians of all cells, cell after cell, and the ends of their lists."""
-    # Lists are built for pixel centres; half a pixel of padding makes them valid for all points.
-    lists = build_lists(shape, radius, grid, pad=0.5, adjoint=False, ordered=False)
-    ends = np.concatenate([[0], lists.end.numpy()]).astype(np.int64)
-    return lists.splat.numpy()[: ends[-1]].astype(np.uint32, copy=False), ends
+def _list_strips(shape: list, width: int, height: int, side: int, radius: float) -> TileLists:
+    """List the Gaussians of every strip of cells with this side."""
+    grid = Grid(width, height, (COLUMNS * side, side))
+    return build_lists(shape, radius, grid, pad=PAD, adjoint=False, ordered=False)
+
+
+def _rounded(runs: int) -> int:
+    """Round a number of runs up, by 3 % or 8: a program is recorded for each size of its arrays."""
+    step = max(8, 1 << max(0, runs.bit_length() - 6))
+    return (runs // step + 1) * step
 
 
 @dataclass(frozen=True)
-class _Numbered:
-    """Rows of parameters, and the lists in numbers of rows; see `CellLists`."""
+class _Strips:
+    """The Gaussians near each strip, for one division of an image into cells.
 
-    gaussian: NDArray[np.int64] | None
-    first: NDArray[np.int64]
-    band: int
-    entries: list[NDArray[np.uint16]]
+    Attributes
+    ----------
+    splat : UInt32, shape (capacity,)
+        Gaussians, strip after strip.
+    number : UInt32, shape (capacity,), or None
+        Their numbers in the band of the strip; None for one band, where they are one more.
+    begin, end : UInt32, shape (strips,)
+        Range of each strip in `splat`.
+    grid, cells : GridArrays
+        Division of the image into strips, and into cells.
+    tiles : int
+        Number of cells.
+    """
+
+    splat: UInt
+    number: UInt | None
+    begin: UInt
+    end: UInt
+    grid: GridArrays
+    cells: GridArrays
+    tiles: int
 
 
-def _number(count: int, height: int, grids: list[Grid], lists: list) -> _Numbered:
+def _visit_strips(
+    rows: Float,
+    strips: _Strips,
+    radius: Float,
+    start: Callable[[list], State],
+    visit: Callable[[list, UInt, State], State],
+    label: str,
+) -> tuple[list, State]:
+    """Test the Gaussians near each strip in each of its cells.
+
+    Parameters
+    ----------
+    rows : Float
+        The shapes of the Gaussians, from `pack_parameters`.
+    strips : _Strips
+    radius : Float
+    start : callable
+        ``start(cells) -> state``: the first state.
+    visit : callable
+        ``visit(touched, number, state) -> state`` with a Bool for each cell.
+    label : str
+        Name of the loop for profilers.
+
+    Returns
+    -------
+    cells : list of (UInt, Bool)
+        For each cell of a strip, its index in the image, and whether it exists.
+    state
+        The last one.
+    """
+    types, grid = types_of(rows), strips.cells
+    row, column = strips.grid.row.divmod(dr.arange(types.UInt, dr.width(strips.begin)))
+    row, first_column = types.Int(row), types.Int(column * COLUMNS)
+    columns = [first_column + k for k in range(COLUMNS)]
+    cells = [(types.UInt(row * grid.nx + column), column < grid.nx) for column in columns]
+
+    def body(i: UInt, stop: UInt, state: State) -> tuple:
+        here = i < stop
+        gaussian = dr.gather(types.UInt, strips.splat, i, here)
+        shape = unpack_parameters(rows, gaussian, NUM_SHAPE_PARAMS, here)
+        first, last = tile_columns(shape, radius, grid, row, PAD)
+        touched = [here & (first <= column) & (column < last) for column in columns]
+        number = gaussian + 1
+        if strips.number is not None:
+            number = dr.gather(types.UInt, strips.number, i, here)
+        return i + 1, stop, visit(touched, number, state)
+
+    state = dr.while_loop(
+        (strips.begin, strips.end, start(cells)), lambda i, stop, _: i < stop, body, label=label
+    )[-1]
+    dr.eval(state)  # else each scatter of a part would repeat the loop
+    return cells, state
+
+
+@record
+def _count_runs(
+    shapes: list, levels: list[_Strips], radius: Float
+) -> tuple[list[Float], list[UInt]]:
+    """Return the rows of the shapes of all levels, and where the runs of each cell begin."""
+    types = types_of(radius)
+    packed, starts = [], list[UInt]()
+
+    def add(touched: list, number: UInt, counts: list) -> list:
+        return [n + dr.select(t, types.UInt(1), 0) for t, n in zip(touched, counts, strict=True)]
+
+    for shape, strips in zip(shapes, levels, strict=True):
+        rows = pack_parameters(shape)
+        dr.eval(rows)
+        cells, counts = _visit_strips(
+            rows, strips, radius, lambda cells: [types.UInt(0) for _ in cells], add, "count runs"
+        )
+        runs = dr.zeros(types.UInt, strips.tiles + 1)
+        dr.make_opaque(runs)
+        for (cell, exists), count in zip(cells, counts, strict=True):
+            dr.scatter(runs, (count + (RUN - 1)) // RUN, cell, exists)
+        before = dr.gather(types.UInt, starts[-1], dr.width(starts[-1]) - 1) if starts else 0
+        packed.append(rows)
+        starts.append(dr.prefix_sum(runs) + before)
+        dr.eval(starts)
+    return packed, starts
+
+
+@record
+def _write_runs(
+    packed: list[Float], levels: list[_Strips], starts: list[UInt], radius: Float, capacity: int
+) -> UInt:
+    """Return the runs of all cells of all levels, see `CellLists`."""
+    types = types_of(radius)
+    # Zeros, because rounding may make the two passes differ by a cell in different programs.
+    runs = dr.zeros(types.UInt, RUN // 2 * capacity)
+    dr.make_opaque(runs)
+
+    def append(touched: list, number: UInt, places: list) -> list:
+        return [_append(runs, t, number, *one) for t, one in zip(touched, places, strict=True)]
+
+    for rows, strips, start in zip(packed, levels, starts, strict=True):
+
+        def begin(cells: list, start: UInt = start) -> list:
+            ends = [[dr.gather(types.UInt, start, c + k, e) for k in (0, 1)] for c, e in cells]
+            return [(first * RUN, last * RUN, types.UInt(0)) for first, last in ends]
+
+        _, places = _visit_strips(rows, strips, radius, begin, append, "write runs")
+        for slot, stop, half in places:
+            dr.scatter(runs, half, slot // 2, (slot % 2 != 0) & (slot < stop))
+        dr.eval(runs)
+    return runs
+
+
+def _append(runs: UInt, active: Bool, number: UInt, slot: UInt, stop: UInt, half: UInt) -> tuple:
+    """Append a number to the runs of a cell; `half` is the first number of a word without second.
+
+    Returns the next slot, the end of the slots of the cell, and `half`.
+    """
+    active = active & (slot < stop)
+    dr.scatter(runs, half | (number << 16), slot // 2, active & (slot % 2 != 0))
+    half = dr.select(active & (slot % 2 == 0), number, half)
+    return slot + dr.select(active, type(slot)(1), 0), stop, half
+
+
+@dataclass(frozen=True)
+class _Bands:
+    """Rows of parameters, see `CellLists`, and for each level the numbers of `_Strips`."""
+
+    gaussian: UInt | None
+    first: UInt
+    height: int  # of a band, in pixels
+    numbers: list[UInt | None]
+
+
+def _number(types: ArrayTypes, count: int, lists: list[TileLists]) -> _Bands:
     """Number the Gaussians of as few bands as possible, of equal height."""
+    grid = lists[-1].grid
     if count <= MOST:
-        entries = [(splat + 1).astype(np.uint16) for splat, _ in lists]
-        return _Numbered(None, np.zeros(1, np.int64), height, entries)
-    side, rows = grids[-1].tile[1], grids[-1].ny
-    bands = 2
+        return _Bands(None, dr.opaque(types.UInt, 0), grid.height, [None for _ in lists])
+    splats = [one.splat.numpy() for one in lists]
+    side, bands = grid.tile[1], 2
     while True:
-        band = side * -(-rows // bands)
-        parts = [_cut(height, band, grid, *one) for grid, one in zip(grids, lists, strict=True)]
-        members = [_members(count, cut) for cut in zip(*parts, strict=True)]
+        band = side * -(-grid.ny // bands)
+        cuts = [_cut(one, band) for one in lists]
+        members = [
+            _members(count, [splat[k] for splat, k in zip(splats, parts, strict=True)])
+            for parts in zip(*cuts, strict=True)
+        ]
         if max(map(len, members)) <= MOST:
             break
-        if bands >= rows:
+        if bands >= grid.ny:
             raise ValueError(
                 f"more than {MOST:,} Gaussians touch {side} rows of pixels: use fewer or smaller "
                 "Gaussians"
             )
-        bands = min(2 * bands, rows)
-    entries = [np.concatenate(cut) for cut in _local(count, members, parts)]
+        bands = min(2 * bands, grid.ny)
+    local, numbers = np.zeros(count, np.uint32), [np.zeros_like(splat) for splat in splats]
+    for inside, parts in zip(members, zip(*cuts, strict=True), strict=True):
+        local[inside] = np.arange(1, len(inside) + 1)
+        for number, splat, part in zip(numbers, splats, parts, strict=True):
+            number[part] = local[splat[part]]
     rest = np.setdiff1d(np.arange(count), np.concatenate(members))
-    sizes = [1 + len(m) for m in members]
     gaussian = np.concatenate([*(np.concatenate([[count], m]) for m in members), rest])
-    return _Numbered(gaussian, np.cumsum([0, *sizes[:-1]]), band, entries)
+    first = np.cumsum([0, *(1 + len(m) for m in members[:-1])])
+    stored, starts, *uploaded = upload_rows(types.UInt, [gaussian, first, *numbers])
+    return _Bands(stored, starts, band, list(uploaded))
 
 
-def _cut(
-    height: int, band: int, grid: Grid, splat: NDArray[np.uint32], ends: NDArray[np.int64]
-) -> list[NDArray[np.uint32]]:
-    """Cut lists at the borders of bands."""
-    rows = np.minimum(np.arange(0, height + band, band) // grid.tile[1], grid.ny)
-    ends = ends[rows * grid.nx]
-    return [splat[begin:end] for begin, end in pairwise(ends)]
+def _cut(lists: TileLists, band: int) -> list[slice]:
+    """Return the entries of each band, of some height in pixels."""
+    grid = lists.grid
+    ends = np.concatenate([[0], lists.end.numpy()])
+    rows = np.minimum(np.arange(0, grid.height + band, band) // grid.tile[1], grid.ny)
+    return [slice(*ends) for ends in pairwise(ends[rows * grid.nx].tolist())]
 
 
-def _members(count: int, lists: Sequence[NDArray[np.uint32]]) -> NDArray[np.int64]:
+def _members(count: int, lists: list[NDArray[np.uint32]]) -> NDArray[np.int64]:
     """Return the Gaussians in some lists, in ascending order."""
     listed = np.zeros(count, bool)
     for splat in lists:
         listed[splat] = True
     return np.flatnonzero(listed)
-
-
-def _local(count: int, members: list, parts: list) -> list[list[NDArray[np.uint16]]]:
-    """Return the parts of lists in the numbers of their bands."""
-    number = np.zeros(count, np.uint16)
-    found: list[list[NDArray[np.uint16]]] = [[] for _ in parts]
-    for band, inside in enumerate(members):
-        number[inside] = np.arange(1, len(inside) + 1)
-        for cut, into in zip(parts, found, strict=True):
-            into.append(number[cut[band]])
-    return found

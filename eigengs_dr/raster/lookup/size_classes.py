@@ -13,7 +13,7 @@ from ...backend.types import Float, UInt
 from ...gaussian.covariance import max_deviation
 from ..evaluate import widen
 from ..parameters import EXP2_SCALE, kernel_radius
-from .cells import SIDE, CellLists, cell_side, list_cells
+from .cells import CellLists, cell_side, list_cells
 
 MIN_CLASS_SIZE = 1.0
 """Largest standard deviation in the smallest size class, in pixels."""
@@ -71,9 +71,7 @@ class SizeClasses:
     cells: CellLists
 
 
-def classify_by_size(
-    shape: list, width: int, height: int, cutoff: float, wrap: str, side: float = SIDE
-) -> SizeClasses:
+def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str) -> SizeClasses:
     """Sort Gaussians for `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
 
     Parameters
@@ -85,8 +83,6 @@ def classify_by_size(
     cutoff : float
         Standard deviations.
     wrap : {"repeat", "mirror", "clamp", "sphere"}
-    side : float, optional
-        Side of the smallest cells that list Gaussians, in mean distances of Gaussians.
 
     Returns
     -------
@@ -95,7 +91,9 @@ def classify_by_size(
         out.
     """
     types = types_of(shape[0])
-    x, y, a, b, c = (np.asarray(s.numpy(), np.float64) for s in shape)
+    x, y, a, b, c = (np.array(s.numpy(), np.float64) for s in shape)
+    # Dr.Jit writes lists while the host sorts.
+    spreads, cells = _list_widened(shape, width, height, kernel_radius(cutoff))
     with np.errstate(all="ignore"):
         size = EXP2_SCALE * max_deviation(a, b, c)
         drawn = np.isfinite(x + y + size) & (a > 0) & (c > 0)
@@ -118,7 +116,6 @@ def classify_by_size(
         table.append([largest**2, first, columns, rows, 1 / length, origin, 0, 0])
         first += columns * rows
     starts = np.cumsum(np.concatenate([[0], *counts] if counts else [[0, 0]]))
-    spreads, cells = _list_widened(shape, width, height, kernel_radius(cutoff), side)
     # gather_index reads pairs: the array must have an even length and must not be empty.
     found = np.concatenate([*order, [0]]).astype(np.int64)
     found = np.pad(found, (0, len(found) % 2))
@@ -135,11 +132,11 @@ def classify_by_size(
 
 
 def _list_widened(
-    shape: list, width: int, height: int, radius: float, side: float
+    shape: list, width: int, height: int, radius: float
 ) -> tuple[tuple[float, ...], CellLists]:
     """List the Gaussians widened by each of `LISTED_FOOTPRINTS`, all in one array."""
     Float, count = types_of(shape[0]).Float, dr.width(shape)
-    spacing, smallest = math.sqrt(width * height / count), cell_side(width, height, count, side)
+    spacing, smallest = math.sqrt(width * height / count), cell_side(width, height, count)
     spreads, levels = tuple(k * spacing for k in LISTED_FOOTPRINTS), []
     for number, spread in enumerate(spreads):
         variance = dr.opaque(Float, (spread / EXP2_SCALE) ** 2)

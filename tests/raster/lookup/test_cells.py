@@ -7,6 +7,8 @@ import pytest
 from _helpers.footprints import check_gradient, exact_at, some_points, stacked
 from _helpers.sets import random_scene
 from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.raster.binning.lists import build_lists
+from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.lookup import cells as numbered
 from eigengs_dr.raster.lookup.cells import cell_side, list_cells
 from eigengs_dr.raster.lookup.points import Packed, invert, sum_at_points, value_terms
@@ -51,6 +53,21 @@ def test_bands_sum_all_gaussians_that_reach_a_point(backend, few_numbers, side):
     exact, sure = exact_at(scene, points, 3.0)
     found = stacked(sums_of(scene.on(backend), points, side))
     np.testing.assert_allclose(found[sure], exact[sure], atol=2e-5)
+
+
+@pytest.mark.parametrize("side", [1, 5, 16])
+def test_cells_list_the_gaussians_that_tiles_of_their_size_list(backend, side):
+    """In the same order; strips of several cells hang over the image."""
+    gaussians = small_scene().on(backend)
+    cells, grid = lists_of(gaussians, side), Grid(*BANDED, (side, side))
+    shape, radius = dr.detach(decode_parameters(gaussians).shape), kernel_radius(3.0)
+    tiles = build_lists(shape, radius, grid, pad=0.5, adjoint=False, ordered=False)
+    numbers = cells.runs.numpy().view(np.uint16)
+    runs, splat = 4 * cells.levels[0].starts.numpy(), tiles.splat.numpy()
+    ends = zip(runs[:-1], runs[1:], tiles.begin.numpy(), tiles.end.numpy(), strict=True)
+    for first, last, begin, end in ends:
+        listed = numbers[first:last]
+        np.testing.assert_array_equal(listed[listed > 0] - 1, splat[begin:end])
 
 
 @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
