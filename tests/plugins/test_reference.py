@@ -19,7 +19,8 @@ pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 def described():
     """Flags by the names of parameters."""
     made = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "pages.py"))
-    rows = [line.strip("| ").split(" | ") for line in made["plugin_parameters"]("gaussian_texture").splitlines()[2:]]
+    lines = made["plugin_parameters"]("gaussian_texture").splitlines()
+    rows = [line.strip("| ").split(" | ") for line in lines[2:]]
     assert all(row[1] and row[2] for row in rows)
     return {name.strip("` "): row[4:] for row in rows for name in row[0].split(",")}
 
