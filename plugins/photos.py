@@ -142,7 +142,7 @@ def photo_loss(
     return Loss(taken.loss, bounds, parameters, judge, space=space)
 
 
-@dataclass
+@dataclass(repr=False)  # that of a scene takes hundreds of lines
 class _Photos:
     """Photos of a scene, and the parts of them that no step sees.
 
@@ -300,7 +300,10 @@ def _sensors_of(
     if sensors is not None and len(sensors) != count:
         raise ValueError(f"photo_loss: {count} photos, but {len(sensors)} sensors")
     if sensors is None and count > len(known):
-        raise ValueError(f"photo_loss: {count} photos, but the scene has {len(known)} sensors")
+        raise ValueError(
+            f"photo_loss: {count} photos, but the scene has {len(known)} sensors; give sensors=, "
+            "one for each photo"
+        )
     named = range(count) if sensors is None else sensors
     return [known[sensor] if isinstance(sensor, int) else sensor for sensor in named]
 

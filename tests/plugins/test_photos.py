@@ -58,6 +58,7 @@ def test_a_texture_is_recovered():
 
     scene, photos = wall(GREY), photos_of(wall(true_texture()))
     loss = photo_loss(scene, NAME, photos)
+    assert len(repr(loss)) < 300 and "\n" not in repr(loss)
     found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=120)
     inner = np.s_[4:-4, 4:-4]
     error = np.mean((found.image[inner] - eg.image.color.to_coded(true_texture())[inner]) ** 2)
@@ -166,7 +167,7 @@ def test_photos_that_do_not_fit_are_refused():
             photos,
             "no bitmap 'wall.bsdf.reflektance'; it has wall.bsdf.ref",
         ),
-        (NAME, photos + photos, "6 photos, but the scene has 3 sensors"),
+        (NAME, photos + photos, "6 photos, but the scene has 3 sensors; give sensors="),
         (NAME, [], "there are no photos"),
         (NAME, [GREY], r"photo 0 has shape \(32, 32, 3\), but its film has 24x24"),
         (NAME, [np.full_like(photos[0], np.nan)], "not finite"),
