@@ -56,9 +56,10 @@ def photo_loss(
     pictures : str or mapping of str to str
         The bitmap that is looked for, as `mitsuba.traverse` names it, such as
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
-        are those of the set. Bitmaps need ``raw: true``; their texels are then light or data, so
-        the ``space`` of a fit is by default "linear" for three channels, and "data" for one. An
-        ``envmap`` counts as a bitmap, of the space "log"; its light has no `bounds`.
+        are those of the set. Bitmaps need ``raw: true``, and those of files of 8 bits also
+        ``format: "variant"``, to hold floats. Their texels are then light or data, so the ``space``
+        of a fit is by default "linear" for three channels, and "data" for one. An ``envmap`` counts
+        as a bitmap, of the space "log"; its light has no `bounds`.
     photos : sequence of array_like or tensor, shape (H, W, 3), path-like or mitsuba.Bitmap
         Of the size of the film of its sensor each. Floats, such as those of `mitsuba.render`, are
         linear light; codes of 8 bits are sRGB, and files what they say.
@@ -88,7 +89,8 @@ def photo_loss(
     Raises
     ------
     ValueError
-        If a name is unknown, or photos and sensors do not fit together.
+        If a name is unknown, a bitmap does not hold floats, or photos and sensors do not fit
+        together.
 
     Notes
     -----
@@ -140,7 +142,7 @@ def photo_loss(
     return Loss(taken.loss, bounds, parameters, judge, space=space)
 
 
-@dataclass
+@dataclass(repr=False)  # that of a scene takes hundreds of lines
 class _Photos:
     """Photos of a scene, and the parts of them that no step sees.
 
@@ -298,7 +300,10 @@ def _sensors_of(
     if sensors is not None and len(sensors) != count:
         raise ValueError(f"photo_loss: {count} photos, but {len(sensors)} sensors")
     if sensors is None and count > len(known):
-        raise ValueError(f"photo_loss: {count} photos, but the scene has {len(known)} sensors")
+        raise ValueError(
+            f"photo_loss: {count} photos, but the scene has {len(known)} sensors; give sensors=, "
+            "one for each photo"
+        )
     named = range(count) if sensors is None else sensors
     return [known[sensor] if isinstance(sensor, int) else sensor for sensor in named]
 
@@ -319,6 +324,11 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
     """Return the name of the texels of a bitmap among the parameters of a scene."""
     name = key if key.endswith(".data") else f"{key}.data"
     if name in known:
+        if not dr.is_float_v(known[name]):
+            raise ValueError(
+                f"photo_loss: the bitmap {key!r} holds bytes, which have no derivative; "
+                'give it <string name="format" value="variant"/>'
+            )
         return name
     bitmaps = [k.removesuffix(".data") for k, _ in known if k.endswith(".data")]
     close = get_close_matches(key, bitmaps, 1) or bitmaps

@@ -23,6 +23,14 @@ def test_a_mistyped_option_says_the_right_one(name, photo):
         getattr(eg, name)(photo, zzz=5)
 
 
+def test_mistaken_arguments_name_the_function(photo):
+    g = eg.fit(photo, 20, iterations=0).gaussians
+    with pytest.raises(TypeError, match=r"^render\(\) got an unexpected keyword argument 'scale'$"):
+        eg.render(g, scale=2)
+    with pytest.raises(TypeError, match=r"^pack\(\) missing a required argument: 'output'$"):
+        eg.pack(g)
+
+
 def test_arrays_of_other_shapes_are_refused_by_name(photo):
     g = eg.fit(photo, 20, iterations=0).gaussians
     with pytest.raises(ValueError, match=r"mean has shape \(7, 2\), expected \(20, 2\)"):

@@ -56,7 +56,10 @@ def takes_numbers(function: Function) -> Function:
 
     @wraps(function)
     def call(*values: object, **options: object) -> object:
-        bound = arguments.bind(*values, **options)
+        try:
+            bound = arguments.bind(*values, **options)
+        except TypeError as error:  # as Python says it, which names the function
+            raise TypeError(f"{function.__qualname__}() {error}") from None
         bound.arguments.update(plain_numbers(bound.arguments, annotations))
         return function(*bound.args, **bound.kwargs)
 

@@ -24,8 +24,10 @@ def wall(texture, light=1.0):
     for number, x in enumerate((-1, 0, 1)):
         view = at.look_at([x, 0, 2.6], [0, 0, 0], [0, 1, 0])
         cameras[f"camera{number}"] = {"type": "perspective", "film": film, "to_world": view}
-    data = mi.TensorXf(np.ascontiguousarray(texture, np.float32))
-    paint = {"type": "bitmap", "data": data, "raw": True}
+    paint = texture
+    if not isinstance(texture, dict):
+        data = mi.TensorXf(np.ascontiguousarray(texture, np.float32))
+        paint = {"type": "bitmap", "data": data, "raw": True}
     return mi.load_dict(
         {
             "type": "scene",
@@ -56,6 +58,7 @@ def test_a_texture_is_recovered():
 
     scene, photos = wall(GREY), photos_of(wall(true_texture()))
     loss = photo_loss(scene, NAME, photos)
+    assert len(repr(loss)) < 300 and "\n" not in repr(loss)
     found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=120)
     inner = np.s_[4:-4, 4:-4]
     error = np.mean((found.image[inner] - eg.image.color.to_coded(true_texture())[inner]) ** 2)
@@ -164,7 +167,7 @@ def test_photos_that_do_not_fit_are_refused():
             photos,
             "no bitmap 'wall.bsdf.reflektance'; it has wall.bsdf.ref",
         ),
-        (NAME, photos + photos, "6 photos, but the scene has 3 sensors"),
+        (NAME, photos + photos, "6 photos, but the scene has 3 sensors; give sensors="),
         (NAME, [], "there are no photos"),
         (NAME, [GREY], r"photo 0 has shape \(32, 32, 3\), but its film has 24x24"),
         (NAME, [np.full_like(photos[0], np.nan)], "not finite"),
@@ -184,6 +187,19 @@ def test_photos_that_do_not_fit_are_refused():
     for space, message in (("data", "channels 3, .* fit 1"), ({"a": "linear"}, "fit a 3")):
         with pytest.raises(ValueError, match=message):
             eg.fit(loss=loss, size=(8, 8), gaussians=5, iterations=4, space=space)
+
+
+def test_bitmaps_of_bytes_are_refused(tmp_path):
+    """Mitsuba keeps a file of 8 bits as bytes, which have no derivative."""
+    from eigengs_dr.plugins import photo_loss
+
+    eg.save_image(tmp_path / "grey.png", GREY)
+    paint = {"type": "bitmap", "filename": str(tmp_path / "grey.png"), "raw": True}
+    photos = photos_of(wall(GREY), spp=1)
+    with pytest.raises(ValueError, match=f"{NAME}' holds bytes.*variant"):
+        photo_loss(wall(paint), NAME, photos)
+    loss = photo_loss(wall(paint | {"format": "variant"}), NAME, photos)
+    eg.fit(loss=loss, size=(8, 8), gaussians=5, iterations=4)
 
 
 def test_photos_are_light_or_codes():
