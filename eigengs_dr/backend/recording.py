@@ -273,7 +273,7 @@ def freeze_rendering(function: Program) -> Program:
         with _calling():
             return frozen(*arguments)
 
-    weakref.finalize(call, _retire, frozen.clear)
+    weakref.finalize(call, _retired.append, frozen.clear)  # perhaps during a recording
     return call
 
 

@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import types_of
-from ..backend.recording import freeze_program
+from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import decode, from_log, unit_codes
@@ -295,9 +295,10 @@ class LossObjective(Pixels):
     ) -> tuple[Float, list[Float]]:
         """Return the value of the loss, and its derivatives by the pictures.
 
-        Those by parameters of the user stay in these; no other array gets any.
+        Those by parameters of the user stay in these; no other array gets any. The function may
+        render: if the collector freed another scene meanwhile, the process might end.
         """
-        with dr.resume_grad():
+        with dr.resume_grad(), collector_off():
             leaves = [self._tensor(k, rows) for k, rows in enumerate(shown)]
             dr.enable_grad(leaves)
             value = self._number(self.loss.function(self._named(leaves), self.calls.step))
