@@ -353,7 +353,9 @@ def _retire(release: Callable[[], None]) -> None:
 
 def _clear_retired() -> None:
     """Free retired objects, unless a program is running or a user's function is being recorded."""
-    while _retired and not _calls and not dr.flag(dr.JitFlag.FreezingScope):
+    # A rendering that is traced is a recording, too.
+    scopes = dr.JitFlag.FreezingScope, dr.JitFlag.SymbolicScope
+    while _retired and not _calls and not any(map(dr.flag, scopes)):
         _retired.popleft()()
 
 
