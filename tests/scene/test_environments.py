@@ -40,14 +40,16 @@ def test_a_smooth_sky_takes_less_memory(sun, tmp_path, monkeypatch):
     mi.Bitmap(horizon(sun=sun)).write(str(tmp_path / "sky.exr"))
     turn = mi.ScalarTransform4f().rotate([0, 1, 0], 50)
     given = {"filename": str(tmp_path / "sky.exr"), "scale": 0.7, "to_world": turn}
-    found = eg.convert_scene(scene(**given), tmp_path / "new", 36, **QUICK)
+    found = eg.convert_scene(scene(**given), tmp_path / "new", 40, iterations=100, spp=64)
     [environment] = found.textures
     assert environment.names == ("sky.exr (environment)",)
     assert environment.file == "sky.npz"
-    assert environment.psnr >= 36
+    assert environment.psnr >= 40
     assert environment.gaussian_bytes < 0.5 * environment.bytes
     assert found.left == [] and found.better == []
-    assert found.missed(36) == [] and found.psnr[0] > 36
+    # The renderings differ by no more than their noise.
+    assert found.missed(40) == []
+    assert found.psnr[0] > found.noise[0] - 1
     saved = eg.Gaussians.load(tmp_path / "new" / "sky.npz")
     assert (saved.width, saved.height) == (256, 128)
     assert saved.space == ("log" if sun else "linear")
@@ -55,7 +57,7 @@ def test_a_smooth_sky_takes_less_memory(sun, tmp_path, monkeypatch):
         np.array(mi.render(s, spp=256)).mean((0, 1))
         for s in (mi.load_dict(scene(**given)), mi.load_file(str(found.scene)))
     ]
-    np.testing.assert_allclose(images[1], images[0], rtol=0.05)
+    np.testing.assert_allclose(images[1], images[0], rtol=0.03)
 
 
 def test_noise_stays(tmp_path):
