@@ -17,6 +17,7 @@ from eigengs_dr.backend.arrays import types_of, upload
 from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.channels import slices
+from eigengs_dr.gaussian.file import file_errors
 from eigengs_dr.gaussian.gaussians import (
     FIELDS,
     Fitted,
@@ -206,7 +207,8 @@ def shared_file(path: str, backend: str | None, first: int | None) -> SharedFile
 
     A file that has changed on disk counts as another one. For errors see `Gaussians.load`.
     """
-    state = os.stat(path)
+    with file_errors(path):
+        state = os.stat(path)
     identity = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
     key = (*identity, mi.variant(), backend, first)
     found = _files.get(key)

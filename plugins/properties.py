@@ -14,6 +14,7 @@ from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.color import SPACES, rendered_as
+from eigengs_dr.image.formats import SUFFIXES
 
 from .parameters import TextureParameters, model_source, shared_file, without_arrays
 from .versions import Properties
@@ -63,7 +64,14 @@ def source_of(props: Properties) -> TextureParameters:
         if first < 0:
             raise _mistake(props, "first", first, "a number of Gaussians")
         name = _read(props, "map", "", str, "the name of a map")
-        source = shared_file(_path(props, "filename"), backend, first or None).source(name or None)
+        file = _path(props, "filename")
+        if Path(file).suffix.lower() in SUFFIXES:
+            bitmap = "envmap" if props.plugin_name() == "gaussian_environment" else "bitmap"
+            raise ValueError(
+                f"{file}: is an image, not a set of Gaussians; make one by 'eigengs-dr fit', or "
+                f"give the image to the plugin {bitmap}"
+            )
+        source = shared_file(file, backend, first or None).source(name or None)
     else:
         gaussians = _from_arrays(props, backend)
         source = TextureParameters(without_arrays(gaussians), to_tensors(gaussians))

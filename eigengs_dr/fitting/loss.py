@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from inspect import signature
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import drjit as dr
@@ -65,6 +66,8 @@ class Loss:
     ------
     ValueError
         If the bounds do not rise, or the target is not above 0.
+    TypeError
+        If the function or the judge takes other arguments, or the parameters are no optimiser.
 
     Examples
     --------
@@ -88,6 +91,9 @@ class Loss:
     def __post_init__(self) -> None:
         if not callable(self.function):
             raise TypeError(f"Loss: {self.function!r} is no function of (picture, step)")
+        _check_arguments("function", self.function, "picture, step")
+        if self.judge is not None:
+            _check_arguments("judge", self.judge, "picture")
         if self.parameters is not None and not hasattr(self.parameters, "step"):
             raise TypeError(
                 f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser, such "
@@ -97,6 +103,21 @@ class Loss:
             raise ValueError(f"Loss: bounds are {self.bounds}; the first must be the smaller")
         if self.target is not None and not 0 < self.target < math.inf:
             raise ValueError(f"Loss: target is {self.target}; it must be finite and above 0")
+
+
+def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:
+    """Raise `TypeError` if a function of the user cannot be called with some arguments."""
+    try:
+        takes = signature(function)
+    except (TypeError, ValueError):  # of a function in C, which has none
+        return
+    try:
+        takes.bind(*arguments.split(", "))
+    except TypeError:
+        called = getattr(function, "__name__", type(function).__name__)
+        raise TypeError(
+            f"Loss: the {name} {called}{takes} is called with ({arguments}); let it take these"
+        ) from None
 
 
 class View(NamedTuple):

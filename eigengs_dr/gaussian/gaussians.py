@@ -329,7 +329,7 @@ class Gaussians:
             If the file has another format or a newer version, is damaged, has fewer sections, or
             holds invalid values. One line names the file and the key.
         OSError
-            If the file cannot be opened.
+            If there is no such file, it is a folder, or it cannot be opened.
         """
         return cls.from_data(read(Path(path), sections), backend, dtype)
 

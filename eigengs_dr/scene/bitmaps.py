@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -149,8 +149,16 @@ def file_keys(props: Properties) -> list[str]:
     return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 
 
-def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
+def uses_of(
+    parsed: Parsed, key_of: Callable[[int, str], str | None]
+) -> tuple[list[Use], list[tuple[str, str]]]:
     """Find the bitmaps of a scene that may become Gaussians.
+
+    Parameters
+    ----------
+    parsed : Parsed
+    key_of : callable
+        Returns the name in `mitsuba.traverse` of what a slot of a node holds, if it has one.
 
     Returns
     -------
@@ -172,7 +180,9 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
         # A texture with an id is a child of the scene too, where it has no use.
         above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
         parent, slot = above[0] if above else (0, "")
-        name = label(props, nodes[parent].props, slot)
+        owner = nodes[parent].props
+        key = key_of(parent, slot) if above else None
+        name = label(props, key or f"{owner.id() or owner.plugin_name()}.{slot}")
         parents_of = [nodes[p].props.plugin_name() for p, _ in above]
         if reason := _reason(props, parents_of):
             left.append((name, reason))
@@ -194,12 +204,10 @@ def is_bitmap(node: mi.parser.SceneNode) -> bool:
     return node.type == texture_kind() and node.props.plugin_name() == "bitmap"
 
 
-def label(props: Properties, parent: Properties | None, slot: str) -> str:
+def label(props: Properties, place: str) -> str:
     """Name a bitmap by its file and where it is."""
     file = Path(str(props["filename"])).name if "filename" in props else "a bitmap in memory"
-    if parent is None:
-        return f"{file} (environment)"
-    return f"{file} ({parent.id() or parent.plugin_name()}.{slot})"
+    return f"{file} ({place})"
 
 
 def _reason(props: Properties, parents: list[str]) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -56,7 +57,8 @@ class ConvertedTexture(NamedTuple):
     Attributes
     ----------
     names : tuple of str
-        Its uses: the file, and in brackets what uses it.
+        Its uses: the file, and in brackets its name in `mitsuba.traverse`; under a shape without an
+        id, which has none that lasts, the plugin and the slot.
     file : str
         The new file, relative to the folder; "" if the bitmap stayed.
     width, height, channels : int
@@ -245,8 +247,8 @@ def _convert_into(
 ) -> ConvertedScene:
     """Write a scene and its files into a folder that becomes the target; `make` parses it."""
     again = make()
-    uses, left = uses_of(again)
     original = Original(make, settings.spp)
+    uses, left = uses_of(again, original.key_of)
     result = ConvertedScene(work / SCENE, [], [], left, [], [])
     made = dict[int, str]()
     groups: dict[tuple[str, bool, bool], list[Use]] = {}
@@ -280,7 +282,7 @@ def _convert_into(
     if sky is not None:
         progress("textures", len(groups), total)
         props = again.state.nodes[sky].props
-        name = label(props, None, "")
+        name = label(props, original.keys.get(original.scene.environment(), "environment"))
         path = str(props["filename"]) if "filename" in props else "sky"
         file = work / _file_name(path, False, {texture.file for texture in result.textures})
         add(_convert_sky(original, name, read_pixels(props), file, settings), {sky: name})
@@ -425,10 +427,19 @@ def _save_set(props: Properties, folder: Path, file: str) -> None:
 
 
 def _to_xml(parsed: Parsed) -> str:
+    """Write a parsed scene as XML.
+
+    Mitsuba writes what a dictionary calls "floor" as ``name="floor"``. Only of an ``id`` does
+    `mitsuba.traverse` make a name.
+    """
     try:
-        return str(mi.parser.write_string(parsed.state))
+        root = ElementTree.fromstring(mi.parser.write_string(parsed.state))
     except RuntimeError as error:
         reason = str(error).partition("] ")[2] or str(error)
         raise ValueError(
             f"the scene cannot be written as XML ({reason}); give meshes and volumes by files"
         ) from None
+    for child in root:
+        if "type" in child.attrib and "name" in child.attrib and "id" not in child.attrib:
+            child.set("id", child.attrib.pop("name"))
+    return ElementTree.tostring(root, encoding="unicode")

@@ -7,6 +7,7 @@ decide.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -30,6 +31,9 @@ CLOSER = (10.0, 15.0, 20.0)
 tried. Heights of waves and of smooth noise, 128 x 128 texels on 48 x 48 pixels, kept 41 and 43 dB
 between the renderings where they had 49 and 63 dB themselves, and those of tiles 34 where they had
 57: the slopes of a bitmap jump at its texels."""
+
+NUMBERED = re.compile(r"object_\d+")
+"""Name that Mitsuba gives to objects without an id."""
 
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)
 """Shares of the channels of a colour in a height, as Mitsuba has them."""
@@ -63,6 +67,22 @@ class Original:
     def pictures(self) -> list[NDArray[np.float32]]:
         """What each camera sees, in sRGB."""
         return pictures(self.scene, self.spp)
+
+    @cached_property
+    def keys(self) -> dict[mi.Object, str]:
+        """The names of objects in `mitsuba.traverse`.
+
+        Under shapes without an id there are none: Mitsuba numbers them anew at each loading.
+        """
+        owners = {
+            key.rpartition(".")[0]: owner
+            for key, (_, _, owner, _) in mi.traverse(self.scene).properties.items()
+        }
+        return {owner: key for key, owner in owners.items() if not NUMBERED.match(key)}
+
+    def key_of(self, node: int, slot: str) -> str | None:
+        """Return the name of an object in `mitsuba.traverse`, see `keys`."""
+        return self.keys.get(self.parsed.state.nodes[node].props[slot])
 
     def textures(self, uses: list[Use]) -> list[mi.Texture]:
         """Return the instances of bitmaps."""

@@ -288,6 +288,10 @@ def test_options_that_do_not_fit_are_refused(options, message):
             eg.Loss(squares, **arguments)
     with pytest.raises(TypeError, match="no function"):
         eg.Loss(3)
+    with pytest.raises(TypeError, match=r"<lambda>\(p\) is called with \(picture, step\)"):
+        eg.fit(IMAGE, 20, 10, loss=lambda p: squares(p))
+    with pytest.raises(TypeError, match=r"judge <lambda>\(p, step\) is called with \(picture\)"):
+        eg.Loss(squares, judge=lambda p, step: 0.0)
     with pytest.raises(TypeError, match="give an optimiser"):
         eg.Loss(squares, parameters={"gain": 1})
     with pytest.raises(TypeError, match="unknown option 'loss'"):

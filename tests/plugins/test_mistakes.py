@@ -18,6 +18,7 @@ class TestMistakes:
         [
             ({"filename": "nowhere.npz"}, "nowhere.npz"),
             ({"filename": __file__}, r"test_mistakes\.py"),
+            ({"filename": "a.png"}, "a.png: is an image, .* 'eigengs-dr fit', .* plugin bitmap"),
             ({}, "give one of filename"),
             ({"filename": "a.npz", "model": "b.npz"}, "give one of filename"),
         ],
@@ -25,6 +26,10 @@ class TestMistakes:
     def test_of_where_from(self, properties, message):
         with pytest.raises(RuntimeError, match=message):
             mi.load_dict({"type": "gaussian_texture", **properties})
+
+    def test_a_photo_as_environment(self):
+        with pytest.raises(RuntimeError, match=r"is an image, .* the plugin envmap"):
+            mi.load_dict({"type": "gaussian_environment", "filename": "sky.exr"})
 
     @pytest.mark.parametrize(
         ("properties", "message"),

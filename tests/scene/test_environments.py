@@ -42,7 +42,7 @@ def test_a_smooth_sky_takes_less_memory(sun, tmp_path, monkeypatch):
     given = {"filename": str(tmp_path / "sky.exr"), "scale": 0.7, "to_world": turn}
     found = eg.convert_scene(scene(**given), tmp_path / "new", 40, iterations=100, spp=64)
     [environment] = found.textures
-    assert environment.names == ("sky.exr (environment)",)
+    assert environment.names == ("sky.exr (sky)",)
     assert environment.file == "sky.npz"
     assert environment.psnr >= 40
     assert environment.gaussian_bytes < 0.5 * environment.bytes
@@ -65,7 +65,7 @@ def test_noise_stays(tmp_path):
     found = eg.convert_scene(scene(bitmap=mi.Bitmap(noise)), tmp_path / "new", **QUICK)
     assert found.textures == []
     [(name, reason)] = found.left
-    assert name == "a bitmap in memory (environment)"
+    assert name == "a bitmap in memory (sky)"
     assert reason.startswith("an environment map: ")
     assert "for a goal of 40 dB" in reason
     assert found.noise == []
