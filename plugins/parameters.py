@@ -95,7 +95,7 @@ def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians
     Raises
     ------
     ValueError
-        If the shapes of the tensors do not match.
+        If there is no tensor of this texture, or the shapes of the tensors do not match.
     """
     return from_tensors(_found(parameters, texture), like)
 
@@ -119,7 +119,13 @@ def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians
 
 def _found(parameters: Mapping[str, object], texture: str) -> Arrays:
     keys = {name: f"{texture}.{name}" for name in FIELDS}
-    return {name: parameters[key] for name, key in keys.items() if key in parameters}
+    found = {name: parameters[key] for name, key in keys.items() if key in parameters}
+    if not found:
+        raise ValueError(
+            f"the parameters have no {' and no '.join(keys.values())}; give the name of the "
+            "texture in mitsuba.traverse, such as 'poster.bsdf.reflectance'"
+        )
+    return found
 
 
 # ---------------------------------------------------------------------------------------------

@@ -368,8 +368,8 @@ def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any) -> None:
             "fit needs an image, or a loss and the size of its picture: "
             "fit(loss=f, size=(width, height))"
         )
-    if np.shape(size) != (2,):
-        raise ValueError(f"size is {size!r}; give (width, height)")
+    if np.shape(size) != (2,) or np.asarray(size).dtype.kind not in "iu":
+        raise ValueError(f"size is {size!r}; give (width, height) in whole pixels")
     if target_psnr is not None or np.ndim(gaussians) > 0:
         raise ValueError(
             "without an image there is no PSNR and there are no levels; give the loss a target"

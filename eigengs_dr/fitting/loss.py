@@ -89,6 +89,10 @@ class Loss:
     space: str | Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.function, Loss):
+            raise TypeError(
+                "Loss: the function is a Loss; change one by dataclasses.replace(loss, bounds=...)"
+            )
         if not callable(self.function):
             raise TypeError(f"Loss: {self.function!r} is no function of (picture, step)")
         _check_arguments("function", self.function, "picture, step")
@@ -171,18 +175,37 @@ AS_THEY_ARE = ("rgb", "linear", "radiance", "data")
 
 @dataclass
 class Calls:
-    """How often a loss was asked for its derivative, and what it has answered since `check`."""
+    """How often a loss was asked for its derivative, and what it has answered since `check`.
+
+    The step `broken` is the last that `check_slopes` looked at, if a derivative was not finite.
+    """
 
     step: int = 0
     checked: int = 0
     total: Any = 0.0
+    broken: int | None = None
 
-    def add(self, value: Any) -> None:
+    def add(self, value: Any, slopes: Sequence[Float]) -> None:
         """Count a call; the first value is checked at once."""
         self.step, self.total = self.step + 1, self.total + value
         dr.schedule(self.total)
         if self.step == 1 or self.step - self.checked >= CHECK_EVERY:
             self.check()
+        if self.step % CHECK_EVERY == 1:
+            self.check_slopes(slopes)
+
+    def check_slopes(self, slopes: Sequence[Float]) -> None:
+        """Raise ValueError if derivatives are not finite, as they were not at the last check.
+
+        The descent recovers from one such step, as of a noisy rendering, and not from all.
+        """
+        step, before = self.step - 1, self.broken
+        self.broken = step if not all(bool(dr.all(dr.isfinite(s))) for s in slopes) else None
+        if self.broken is not None and before is not None:
+            raise ValueError(
+                f"loss: its value is finite, but not its derivative at steps {before} and {step}; "
+                "dr.sqrt has none at 0: take dr.sqrt(x + 1e-8)"
+            )
 
     def check(self) -> None:
         """Raise ValueError if a value has not been finite."""
@@ -257,7 +280,7 @@ class LossObjective(Pixels):
         value, slopes = self.derivative(shown, parameters)
         if parameters is not None:
             parameters.step()
-        self.calls.add(value)
+        self.calls.add(value, slopes)
         return slopes
 
     def draw(

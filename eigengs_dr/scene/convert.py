@@ -181,6 +181,8 @@ def convert_scene(
     ValueError
         If no variant of Mitsuba is set, an argument is out of range, the folder has files in it, or
         the scene cannot be written as XML.
+    TypeError
+        If the scene is loaded already.
     RuntimeError
         Mitsuba's error, if the scene does not parse.
     OSError
@@ -200,6 +202,8 @@ def convert_scene(
     """
     if not mi.variant():
         raise ValueError("no variant is set; call mi.set_variant('llvm_ad_rgb') first")
+    if isinstance(scene, mi.Scene):
+        raise TypeError("convert_scene: scene is loaded; give its XML file or its dictionary")
     if not 0 < target_psnr < 60:
         raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
     refuse_url(output)
@@ -287,6 +291,7 @@ def _convert_into(
         file = work / _file_name(path, False, {texture.file for texture in result.textures})
         add(_convert_sky(original, name, read_pixels(props), file, settings), {sky: name})
     progress("textures", total, total)
+    _mark_integrator(original, again)
     _rewrite(again, made, work, target)
     result.scene.write_text(_to_xml(again), encoding="utf-8")
     if settings.spp != 0:
@@ -386,6 +391,14 @@ def _file_name(image: str, raw: bool, taken: set[str]) -> str:
 
 
 # --- The scene -----------------------------------------------------------------------------------
+
+
+def _mark_integrator(original: Original, parsed: Parsed) -> None:
+    """Give the integrator its type, which Mitsuba's writer does not know of one in Python: prb."""
+    instances, nodes = original.parsed.state.root.props, parsed.state.nodes
+    for slot in instances.keys():  # noqa: SIM118  it is no mapping
+        if isinstance(instances[slot], mi.Integrator):
+            nodes[parsed.state.root.props[slot].index()].type = mi.ObjectType.Integrator
 
 
 def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> None:

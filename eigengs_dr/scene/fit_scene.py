@@ -32,6 +32,7 @@ from ..image.color import to_coded, to_linear
 from ..image.io import check_data, check_image
 from ..image.metrics import psnr as psnr_of
 from ..plugins.cone import PIXEL
+from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
 from ..raster.render import render
 from .bitmaps import Unsuitable
@@ -141,6 +142,7 @@ def fit_for_scene(
         found = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
         poster = texture_of(found.gaussians)
     """
+    check_scene("fit_for_scene", scene)
     if space not in COLORS:
         raise ValueError(f"space {space!r} is unknown; textures hold {' or '.join(COLORS)}")
     if not 0 < target_psnr < 60:  # from 59 dB on, 8-bit values have no error

@@ -267,6 +267,20 @@ def test_pixels_in_memory(folder, tmp_path, kind):
         assert np.array(mi.render(again, spp=4)).mean() > 0.1
 
 
+def test_a_dictionary_with_an_integrator_in_python(folder, tmp_path):
+    photo = {"type": "bitmap", "filename": str(folder / "photo.png")}
+    scene = plain(mi, folder, photo, integrator={"type": "prb", "max_depth": 3})
+    found = eg.convert_scene(scene, tmp_path / "new", spp=0, **QUICK)
+    assert mi.load_file(str(found.scene)).integrator().max_depth == 3
+    with pytest.raises(TypeError, match="scene is loaded; give its XML file or its dictionary"):
+        eg.convert_scene(mi.load_dict(scene), tmp_path / "other")
+    for given in (scene, "room.xml"):
+        with pytest.raises(
+            TypeError, match=r"give a loaded one, by mi\.load_file or mi\.load_dict"
+        ):
+            eg.fit_for_scene(given, "cube.bsdf.reflectance", folder / "photo.png")
+
+
 def test_a_lamp_above_1_also_lights_by_what_is_hidden(folder, tmp_path):
     light = 6 * eg.sample("coffee")[:384:4, :384:4] ** 2
     mi.Bitmap(light).write(str(folder / "lamp.exr"))
