@@ -217,15 +217,15 @@ def coarse_picture(
     values.append(types.Float(np.tile(start, levels[-1].values // len(start))))
     dr.make_opaque(values)
     moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)
-    shown = objective.seen(sums)
+    pictures = objective.seen(sums)
     with freeze_program(advance) as take_step:
         for step in range(steps):
             if ended(step):
                 break
-            slopes = objective.step(shown)
+            slopes = objective.step(pictures)
             falling = 0.5 + 0.5 * math.cos(math.pi * step / steps)
             rate = coarse.rate * unit * (coarse.decay + (1 - coarse.decay) * falling)
             numbers = (dr.opaque(types.Float, number) for number in (rate, step + 1))
-            values, moments, sums, shown = take_step(values, moments, sums, slopes, *numbers)
+            values, moments, sums, pictures = take_step(values, moments, sums, slopes, *numbers)
     ended(steps)
     return sums

@@ -249,15 +249,15 @@ class Perturb:
         squares, images = state.squares, objective.grid.images
         if squares is None:
             squares = sum_by_image(squared_error(gaussians, objective), objective.grid)
-        own = range(state.total)
+        movable = range(state.total)
         if objective.part is not None:
-            own = own[objective.part.own]
+            movable = movable[objective.part.movable]
         curvature = objective.model.mean_curvature(objective.grid, objective.channels)
-        error = squares / (curvature * dr.opaque(type(squares), max(1, len(own))))
+        error = squares / (curvature * dr.opaque(type(squares), max(1, len(movable))))
         seed = int(np.random.SeedSequence([key, step]).generate_state(1)[0])
         color = [row + dr.zeros(type(squares), len(gaussians)) for row in gaussians.color]
         mean, factor = perturb(
-            gaussians.mean, gaussians.factor, color, own, error, strength, seed, images
+            gaussians.mean, gaussians.factor, color, movable, error, strength, seed, images
         )
         return state.replaced(replace(gaussians, mean=mean, factor=factor).bounded())
 
@@ -338,7 +338,7 @@ def perturb(
     mean: Rows,
     factor: Rows,
     color: list,
-    own: range,
+    movable: range,
     error: Float,
     strength: float,
     seed: int,
@@ -362,7 +362,7 @@ def perturb(
     factor : Array3f, shape (N, 3)
     color : list of Float, shape (N,)
         By channels.
-    own : range
+    movable : range
         The Gaussians of one image that move; the images of a batch have equal noise.
     error : Float, shape (images,)
         Squared error of each image divided by the number of its Gaussians.
@@ -386,7 +386,7 @@ def perturb(
     size = dr.opaque(types.Float, strength) * dr.sqrt(error / (dr.pi * amplitude))
     # The comparison is false where the amplitude is 0.
     size = dr.select(size < MAX_NOISE, size, types.Float(MAX_NOISE))
-    moves = among(lane, own)
+    moves = among(lane, movable)
     size = dr.select(moves, size, 0)
     normal, first = dr.rng(seed).normal(types.Float, 5 * count), dr.opaque(types.UInt, count)
     x, y, u, v, w = (dr.gather(types.Float, normal, lane + k * first) * size for k in range(5))

@@ -301,10 +301,10 @@ def _pull_back(
         dr.enable_grad(traced)
         decoded = coordinates.decode(fixed, traced, size)
         rows = [*kernel_shape(decoded), *decoded.color]
-        known = [(row, g) for row, g in zip(rows, gradient, strict=True) if dr.grad_enabled(row)]
-        for row, g in known:
+        pairs = [(row, g) for row, g in zip(rows, gradient, strict=True) if dr.grad_enabled(row)]
+        for row, g in pairs:
             dr.set_grad(row, g)
-        dr.enqueue(dr.ADMode.Backward, [row for row, _ in known])
+        dr.enqueue(dr.ADMode.Backward, [row for row, _ in pairs])
         dr.traverse(dr.ADMode.Backward)
         return {name: dr.grad(value) for name, value in traced.items()}
 
@@ -332,7 +332,7 @@ def rate_scale_of(color: Sequence[Float], exponent: float, images: int = 1) -> F
 
     The error depends most on bright Gaussians, so they move less. With the length of a colour |c|,
     the factor is ``(mean |c| / |c|)^exponent``, at most `MAX_RATE_SCALE` and at least its inverse.
-    The mean is that of the own image.
+    The mean is over the same image.
 
     Parameters
     ----------
@@ -351,8 +351,8 @@ def rate_scale_of(color: Sequence[Float], exponent: float, images: int = 1) -> F
     count = dr.width(length) // images
     mean = dr.sum(length)
     if images > 1:
-        own, _ = make_divisor(types, count).divmod(dr.arange(types.UInt, dr.width(length)))
-        mean = dr.gather(types.Float, dr.block_sum(length, count), own)
+        image, _ = make_divisor(types, count).divmod(dr.arange(types.UInt, dr.width(length)))
+        mean = dr.gather(types.Float, dr.block_sum(length, count), image)
     mean *= dr.opaque(types.Float, 1 / count)
     ratio = dr.select(mean > 0, mean / length, types.Float(1))
     bound = MAX_RATE_SCALE ** (1 / exponent)

@@ -73,8 +73,8 @@ class _Comparison:
         factors = self.model.curvatures(self.lists.grid)
         dr.eval(factors, slope)
         along, diagonal = weigh(self.shape, slope, channels, self.lists, self.cutoff, factors)
-        own = by_channel(diagonal[0], channels)
-        cost = sum(c * (c * o - 2 * a) for c, o, a in zip(color, own, along, strict=True))
+        squares = by_channel(diagonal[0], channels)
+        cost = sum(c * (c * s - 2 * a) for c, s, a in zip(color, squares, along, strict=True))
         return cost, diagonal
 
     def peaks(self, slope: Float, count: int) -> Peaks:
@@ -196,11 +196,11 @@ def exchange(
         scene, types = _compare(gaussians, objective, lists), types_of(gaussians.mean)
         grid, total, part = scene.lists.grid, len(gaussians), objective.part
         count = total // grid.images
-        own = range(count) if part is None else range(count)[part.own]
-        leaving, inside = max(int(share * len(own)), dropped), None
+        movable = range(count) if part is None else range(count)[part.movable]
+        leaving, inside = max(int(share * len(movable)), dropped), None
         if part is not None:
             inside = _core(objective, part)
-        cost, diagonal, squares = _value(scene, inside, own)
+        cost, diagonal, squares = _value(scene, inside, movable)
         keep, moved = dr.full(types.Float, 1, total), None
         if leaving:
             moved = _least(cost, leaving, grid.images)
@@ -252,15 +252,17 @@ def _core(objective: Pixels, part: Part) -> Float:
 
 
 @record
-def _value(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float, Unknowns, Float]:
-    """Return the removal costs, infinite for others than the own Gaussians.
+def _value(
+    scene: _Comparison, inside: Float | None, movable: range
+) -> tuple[Float, Unknowns, Float]:
+    """Return the removal costs, infinite for Gaussians that are not movable.
 
     Parameters
     ----------
     scene : _Comparison
     inside : Float, or None
         Factor of the errors that count, where not all do.
-    own : range
+    movable : range
         The Gaussians of each image that may leave.
 
     Returns
@@ -278,7 +280,7 @@ def _value(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float,
     dr.eval(slope, squares)
     cost, diagonal = scene.weigh(slope)
     if inside is not None:
-        cost = dr.select(among(dr.arange(types.UInt, dr.width(cost)), own), cost, dr.inf)
+        cost = dr.select(among(dr.arange(types.UInt, dr.width(cost)), movable), cost, dr.inf)
         h = scene.model.curvatures_of_values(scene.lists.grid, channels)
         error = dr.select(h > 0, slope / h, 0)
         squares = sum(channel_sums(slope * error * inside, channels, scene.lists.grid))
@@ -322,10 +324,10 @@ def _without_some(
     return colors, slope if inside is None else slope * inside
 
 
-def among(number: UInt, own: range) -> Bool:
+def among(number: UInt, numbers: range) -> Bool:
     """Return which numbers are in a range."""
     UInt = type(number)
-    return (number >= dr.opaque(UInt, own.start)) & (number < dr.opaque(UInt, own.stop))
+    return (number >= dr.opaque(UInt, numbers.start)) & (number < dr.opaque(UInt, numbers.stop))
 
 
 def _least(cost: Float, number: int, images: int) -> UInt:

@@ -293,10 +293,10 @@ def fit(
         return fit_maps(maps, options, factors, started, progress)
     source = os.path.basename(image) if isinstance(image, (str, os.PathLike)) else ""
     try:
-        [found] = fit_images([image], options, factors, progress)
+        [result] = fit_images([image], options, factors, progress)
     except FitInterrupted as stop:
         raise FitInterrupted(replace(stop.result, source=source)) from None
-    return replace(found, source=source)
+    return replace(result, source=source)
 
 
 def fit_images(
@@ -314,8 +314,8 @@ def fit_images(
     start = None if source is None else load_start(source, options.backend)
     if isinstance(start, Gaussians):
         one_image(start)
-    wanted = options.space or (set_in(start).space if start is not None else "ycbcr")
-    read = [read_pixels(image, wanted, weight, options.encoding) for image in images]
+    requested = options.space or (set_in(start).space if start is not None else "ycbcr")
+    read = [read_pixels(image, requested, weight, options.encoding) for image in images]
     pixels, space = [p for p, _ in read], read[0][1]
     height, width, channels = pixels[0].shape
     options.check_image(width, height, channels)
@@ -325,8 +325,8 @@ def fit_images(
     types, mean_image = types_for(start, options.backend), None
     with defer_interrupts() as interrupted:
         data = [data_of(p, space, weight) for p in pixels]
-        shown = picture(types, space, pixels, data, weight)
-        objective = replace(Pixels.of(data, space, types), pictures=(shown,))
+        display = picture(types, space, pixels, data, weight)
+        objective = replace(Pixels.of(data, space, types), pictures=(display,))
         begun = None
         if start is not None:
             if isinstance(start, Gaussians):
@@ -354,11 +354,11 @@ def fit_images(
             ]
 
         figure = target_key(space, options.goal.space) if options.goal else "margin"
-        found, seconds_init = _refined(
+        refinements, seconds_init = _refined(
             objective, options, begun, score, figure, started, progress, interrupted
         )
     affines = [d.affine for d in data]
-    return _finished(found, affines, mean_image, started, seconds_init)
+    return _finished(refinements, affines, mean_image, started, seconds_init)
 
 
 def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any) -> None:
@@ -406,9 +406,11 @@ def fit_loss(
         start = replace(start.scaled(width, height), cutoff=cutoff, maps=()).bounded()
     with defer_interrupts() as interrupted:
         problem = Problem(options.loss, size, views, types_for(start, options.backend), weight)
-        found, seconds_init = refine_loss(problem, options, start, started, progress, interrupted)
-    found = replace(found, gaussians=replace(found.gaussians, maps=maps))
-    [result] = _finished([found], [Affine()], None, started, seconds_init)
+        refinement, seconds_init = refine_loss(
+            problem, options, start, started, progress, interrupted
+        )
+    refinement = replace(refinement, gaussians=replace(refinement.gaussians, maps=maps))
+    [result] = _finished([refinement], [Affine()], None, started, seconds_init)
     return result
 
 
@@ -440,17 +442,19 @@ def fit_maps(
             seconds = time.perf_counter() - started
             return [{"seconds": seconds, **objective.judged(gaussians), **row}]
 
-        [found], seconds_init = _refined(
+        [refinement], seconds_init = _refined(
             objective, options, None, score, "margin", started, progress, interrupted
         )
     maps = tuple(image.map(factor) for image, factor in zip(images, factors, strict=True))
-    whole = scale_channels(found.gaussians, [1 / w for w in channel_weights(maps)])
+    whole = scale_channels(refinement.gaussians, [1 / w for w in channel_weights(maps)])
     offsets = [i.data.affine.offset for i in images for _ in range(i.pixels.shape[2])]
     background = type(whole.background)(
         [row + float(b) for row, b in zip(whole.background, offsets, strict=True)]
     )
     named = replace(whole, background=background, maps=maps)
-    [result] = _finished([replace(found, gaussians=named)], [Affine()], None, started, seconds_init)
+    [result] = _finished(
+        [replace(refinement, gaussians=named)], [Affine()], None, started, seconds_init
+    )
     return result
 
 
@@ -484,21 +488,21 @@ def _refined(
         begun = method.place_and_solve(objective, count, key)
     seconds_init = (time.perf_counter() - started) / objective.grid.images
     if options.searches:
-        most = options.most_for(width * height, channels)
+        max_count = options.max_count_for(width * height, channels)
         goal = options.goal.psnr if options.goal and figure != "margin" else 0.0
-        found = fewest(
+        refinement = fewest(
             objective,
             method,
             begun,
             score,
             (figure, goal),
-            most,
+            max_count,
             iterations,
             key,
             progress,
             interrupted,
         )
-        return [found], seconds_init
+        return [refinement], seconds_init
     state = begin(begun, objective.grid.images, chosen)
     refined = refine(objective, method, state, iterations, score, key, progress, interrupted)
     if counts:
@@ -508,7 +512,7 @@ def _refined(
 
 
 def _finished(
-    found: Sequence[Refinement],
+    refinements: Sequence[Refinement],
     affines: Sequence[Affine],
     mean_image: NDArray[np.float32] | None,
     started: float,
@@ -522,7 +526,7 @@ def _finished(
         If the refinement of a single image was interrupted.
     """
     results = []
-    for one, gaussians, affine in zip(found, sets_of(found), affines, strict=True):
+    for one, gaussians, affine in zip(refinements, sets_of(refinements), affines, strict=True):
         whole = restored(gaussians, affine)
         rendered = picture_of(whole)
         results.append(
@@ -541,8 +545,8 @@ def _finished(
                 maps=one.row.get("maps", {}),
             )
         )
-    seconds = (time.perf_counter() - started) / len(found)
+    seconds = (time.perf_counter() - started) / len(refinements)
     results = [replace(result, seconds=seconds) for result in results]
-    if found[0].stopped == "interrupted":
+    if refinements[0].stopped == "interrupted":
         raise FitInterrupted(results[0])
     return results

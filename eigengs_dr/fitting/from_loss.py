@@ -58,8 +58,8 @@ def views_of_spaces(spaces: Spaces) -> tuple[list[View], tuple[TextureMap, ...]]
         except BadValue as error:
             raise ValueError(str(error)) from None
     views = [
-        View(m.name, m.space, range(own.start, own.stop))
-        for m, own in zip(maps, slices(maps), strict=True)
+        View(m.name, m.space, range(channels.start, channels.stop))
+        for m, channels in zip(maps, slices(maps), strict=True)
     ]
     return views, maps if isinstance(spaces, Mapping) else ()
 
@@ -97,8 +97,8 @@ class Problem:
         width, height = self.size
         values = np.asarray(values, np.float32).reshape(height, width, self.channels)
         values = np.maximum(values, 0) if space in LIGHT else values
-        shown = to_coded(values) if space in LIGHT else values
-        pixels = Pixels.of(Data(values, shown, self.weight), space, self.types)
+        display = to_coded(values) if space in LIGHT else values
+        pixels = Pixels.of(Data(values, display, self.weight), space, self.types)
         return LossObjective.of_loss(self.loss, self.views, pixels)
 
     def grey(self) -> NDArray[np.floating]:
@@ -146,16 +146,16 @@ def refine_loss(
             show(step, timed({}))
         return stopped or interrupted()
 
-    taken, trace = 0, []
+    steps_taken, trace = 0, []
     if start is None:
         place = options.method.place
         coarse = place if isinstance(place, Coarse) else Coarse()
         steps = round(coarse.share * options.iterations)
         objective = _descend_texels(problem, coarse, steps, ended)
-        taken = objective.calls.step
+        steps_taken = objective.calls.step
         trace = [{"loss": objective.judge(objective.seen(_rows(objective)))}]
         start, numbers = _start(objective, options, coarse, ended)
-        trace = [timed({"iteration": taken, **row}) for row in trace + numbers]
+        trace = [timed({"iteration": steps_taken, **row}) for row in trace + numbers]
     else:
         objective = problem.near(np.zeros(problem.size[0] * problem.size[1] * problem.channels))
         sums = objective.picture(objective.draw_set(start)[0])
@@ -165,15 +165,15 @@ def refine_loss(
         objective,
         options.method,
         begin(start, chosen=True),
-        options.iterations - taken,
+        options.iterations - steps_taken,
         lambda gaussians: [timed(objective.judged(gaussians))],
         options.seed,
-        progress and (lambda step, steps, row: show(step + taken, row)),
+        progress and (lambda step, steps, row: show(step + steps_taken, row)),
         ended,
     )[0]
-    rows = [{**row, "iteration": row["iteration"] + taken} for row in refined.trace]
-    found = replace(refined, trace=trace + rows, iterations=refined.iterations + taken)
-    return found, seconds_init
+    rows = [{**row, "iteration": row["iteration"] + steps_taken} for row in refined.trace]
+    refinement = replace(refined, trace=trace + rows, iterations=refined.iterations + steps_taken)
+    return refinement, seconds_init
 
 
 def _rows(objective: LossObjective) -> Float:
@@ -211,9 +211,9 @@ def _start(
     loss, pixels = objective.loss, width * height
     if options.gaussians is not None or (loss.judge is None and loss.target is None):
         return fitted(options.count or max(1, pixels // PIXELS_PER_GAUSSIAN)), []
-    most, count = max_gaussians_for(pixels, objective.channels), pixels // FIRST_PIXELS
+    max_count, count = max_gaussians_for(pixels, objective.channels), pixels // FIRST_PIXELS
     best, rows = None, []
-    while count <= most and not (best is not None and ended()):
+    while count <= max_count and not (best is not None and ended()):
         gaussians = fitted(max(1, count))
         rows.append({"gaussians": len(gaussians), **objective.judged(gaussians)})
         if best is not None and rows[-1]["loss"] >= rows[-2]["loss"]:

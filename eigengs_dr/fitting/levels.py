@@ -70,7 +70,7 @@ def sort_levels(gaussians: Gaussians, objective: Pixels, counts: Sequence[int]) 
     order, before = [], 0
     for count in counts:
         value = removal_cost(gaussians[:count], objective)
-        own = np.arange(before, count)
-        order.append(own[np.argsort(-value[own], kind="stable")])
+        indices = np.arange(before, count)
+        order.append(indices[np.argsort(-value[indices], kind="stable")])
         before = count
     return gaussians[np.concatenate(order)]

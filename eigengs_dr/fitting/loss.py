@@ -225,15 +225,17 @@ class LossObjective(Pixels):
             def model_at(state: State) -> Slope:
                 assert state.moving is not None and state.fixed is not None
                 radius, background = kernel_radius(state.fixed.cutoff), state.fixed.background
-                sums, shown = draw(state.moving.packed, list(background), state.lists[-1], radius)
-                return Slope(to_slope(sums, self.step(shown)))
+                sums, pictures = draw(
+                    state.moving.packed, list(background), state.lists[-1], radius
+                )
+                return Slope(to_slope(sums, self.step(pictures)))
 
             yield model_at
 
-    def step(self, shown: Sequence[Float]) -> list[Float]:
+    def step(self, pictures: Sequence[Float]) -> list[Float]:
         """Return the derivatives by the pictures of a step; parameters of the user take theirs."""
         parameters = self.loss.parameters
-        value, slopes = self.derivative(shown, parameters)
+        value, slopes = self.derivative(pictures, parameters)
         if parameters is not None:
             parameters.step()
         self.calls.add(value)
@@ -257,10 +259,10 @@ class LossObjective(Pixels):
 
     def seen(self, sums: Float) -> list[Float]:
         """Return the pictures that the loss sees of sums, both as rows of pixels."""
-        shown = show(self.views, sums, self.channels)
+        pictures = show(self.views, sums, self.channels)
         if self.loss.bounds is None:
-            return shown
-        return [dr.clip(picture, *self.loss.bounds) for picture in shown]
+            return pictures
+        return [dr.clip(picture, *self.loss.bounds) for picture in pictures]
 
     def to_slope(self, sums: Float, slopes: list[Float]) -> Float:
         """Return the derivative by sums in tile layout, see `Slope`, from those by the pictures."""
@@ -273,10 +275,10 @@ class LossObjective(Pixels):
             traced = type(sums)(sums)
             dr.enable_grad(traced)
             rows = to_tensor(traced, self.grid, self.channels).array if in_tiles else traced
-            shown = show(self.views, rows, self.channels)
-            for picture, slope in zip(shown, slopes, strict=True):
+            pictures = show(self.views, rows, self.channels)
+            for picture, slope in zip(pictures, slopes, strict=True):
                 dr.set_grad(picture, self._bounded(dr.detach(picture), slope))
-            dr.enqueue(dr.ADMode.Backward, shown)
+            dr.enqueue(dr.ADMode.Backward, pictures)
             dr.traverse(dr.ADMode.Backward)
             return dr.grad(traced)
 
@@ -291,7 +293,7 @@ class LossObjective(Pixels):
         return dr.fma(pull, excess, inwards)
 
     def derivative(
-        self, shown: Sequence[Float], parameters: Any = None
+        self, pictures: Sequence[Float], parameters: Any = None
     ) -> tuple[Float, list[Float]]:
         """Return the value of the loss, and its derivatives by the pictures.
 
@@ -299,7 +301,7 @@ class LossObjective(Pixels):
         render: if the collector freed another scene meanwhile, the process might end.
         """
         with dr.resume_grad(), collector_off():
-            leaves = [self._tensor(k, rows) for k, rows in enumerate(shown)]
+            leaves = [self._tensor(k, rows) for k, rows in enumerate(pictures)]
             dr.enable_grad(leaves)
             value = self._number(self.loss.function(self._named(leaves), self.calls.step))
             if not dr.grad_enabled(value):
@@ -333,10 +335,10 @@ class LossObjective(Pixels):
             return float(row["iteration"])
         return -float(row["loss"])
 
-    def judge(self, shown: Sequence[Float]) -> float:
+    def judge(self, pictures: Sequence[Float]) -> float:
         """Return the value by which pictures, as rows of pixels, are compared."""
         with dr.suspend_grad():
-            picture = self._named([self._tensor(k, rows) for k, rows in enumerate(shown)])
+            picture = self._named([self._tensor(k, rows) for k, rows in enumerate(pictures)])
             judge = self.loss.judge
             value = self.loss.function(picture, 0) if judge is None else judge(picture)
             number = float(np.asarray(self._number(value)).reshape(-1)[0])
@@ -387,8 +389,8 @@ class LossObjective(Pixels):
         """
         grid, target = self.grid, self.model.target
         assert target is not None
-        sums, shown = self.draw_set(gaussians)
-        slope = self.pull_back(sums, self.derivative(shown)[1], in_tiles=True)
+        sums, pictures = self.draw_set(gaussians)
+        slope = self.pull_back(sums, self.derivative(pictures)[1], in_tiles=True)
         block, inside = grid.pixels * self.channels, pixels_inside(self.types, grid)
         each = dr.arange(self.types.UInt, dr.width(sums)) // self.channels
         error = (sums - target) * dr.gather(self.types.Float, inside, each)

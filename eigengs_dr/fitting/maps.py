@@ -100,8 +100,8 @@ def read_maps(
     images = [_read_map(name, m, goal, weight, encoding) for name, m in given.items()]
     sizes = {image.name: f"{image.pixels.shape[1]}x{image.pixels.shape[0]}" for image in images}
     if len(set(sizes.values())) > 1:
-        shown = ", ".join(f"{name} {size}" for name, size in sizes.items())
-        raise ImageError(f"maps differ in size: {shown}; scale them to one size")
+        listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        raise ImageError(f"maps differ in size: {listed}; scale them to one size")
     described = [image.map(1) for image in images]
     try:
         check_maps(described, sum(m.channels for m in described))
@@ -156,15 +156,15 @@ def combine(
     """
     parts = [image.data for image in images]
     values = _join([d.values for d in parts], factors)
-    shown = _join([d.shown for d in parts], factors)
+    placement_images = _join([d.placement_image for d in parts], factors)
     curvature = weight
     if any(d.curvature is not None for d in parts):
         layers = [np.ones_like(d.values) if d.curvature is None else d.curvature for d in parts]
         curvature = np.concatenate(layers, axis=2)
         if weight is not None:
             curvature *= np.atleast_3d(weight)
-    objective = Pixels.of(Data(values, shown, curvature), "data", types)
-    firsts = [own.start for own in slices([image.map(1) for image in images])]
+    objective = Pixels.of(Data(values, placement_images, curvature), "data", types)
+    firsts = [channels.start for channels in slices([image.map(1) for image in images])]
     pictures = [
         picture(types, image.space, [image.pixels], [image.data], weight, first, factor)
         for image, first, factor in zip(images, firsts, factors, strict=True)
@@ -176,8 +176,8 @@ def views_of(images: Sequence[MapImage], factors: Sequence[float]) -> list[View]
     """Return what the channels of `combine` show."""
     maps = [image.map(1) for image in images]
     return [
-        View(m.name, m.space, range(own.start, own.stop), a.scale / factor, a.offset)
-        for m, own, a, factor in zip(
+        View(m.name, m.space, range(channels.start, channels.stop), a.scale / factor, a.offset)
+        for m, channels, a, factor in zip(
             maps, slices(maps), (image.data.affine for image in images), factors, strict=True
         )
     ]

@@ -199,9 +199,9 @@ class Method:
 
         At another size or cutoff the exact colours of the model are not the best.
         """
-        found, native = replace(model.encode(pixels), cutoff=float(self.cutoff)), model.gaussians
+        encoded, native = replace(model.encode(pixels), cutoff=float(self.cutoff)), model.gaussians
         same = (native.width, native.height, native.cutoff) == (*objective.size, self.cutoff)
-        return objective, found if same else self.start_from(objective, found)
+        return objective, encoded if same else self.start_from(objective, encoded)
 
 
 DEFAULT = Method(

@@ -91,9 +91,9 @@ class Quadratic(NamedTuple):
         types = types_of(self.target)
         if self.curvature is None:
             return dr.full(types.Float, 1, grid.images)
-        own = dr.width(self.curvature) // (grid.tiles * grid.pixels)
-        sums = channel_sums(self.curvature, own, grid)
-        return sum(sums) * dr.opaque(types.Float, 1 / (own * grid.width * grid.height))
+        number = dr.width(self.curvature) // (grid.tiles * grid.pixels)
+        sums = channel_sums(self.curvature, number, grid)
+        return sum(sums) * dr.opaque(types.Float, 1 / (number * grid.width * grid.height))
 
 
 class Slope(NamedTuple):
@@ -153,13 +153,13 @@ class Part(NamedTuple):
 
     Attributes
     ----------
-    own : slice
+    movable : slice
         The Gaussians that may move.
     core : (slice, slice)
         The rows and columns to which they may move.
     """
 
-    own: slice
+    movable: slice
     core: tuple[slice, slice]
 
 
@@ -177,14 +177,14 @@ class Data(NamedTuple):
     ----------
     values : ndarray of float32, shape (H, W, C)
         As they are fitted.
-    shown : ndarray of float32, shape (H, W, C)
+    placement_image : ndarray of float32, shape (H, W, C)
         What places Gaussians: linear light would put too few of them into dark parts.
     curvature : ndarray of float32, shape (H, W) or (H, W, C), or None
     affine : Affine
     """
 
     values: Image
-    shown: Image
+    placement_image: Image
     curvature: Image | None = None
     affine: Affine = Affine()
 
@@ -203,10 +203,10 @@ class Pixels:
         Space of the sets; "data" for maps, whose own spaces their pictures know.
     model : Quadratic
         ``h (p - t)^2`` with the image t and the weight h.
-    shown : Float
+    placement_image : Float
         The image whose second derivatives place Gaussians, in tile layout.
     pictures : tuple of Picture
-        What people look at, for the PSNRs of a trace.
+        The images as displayed, for the PSNRs of a trace.
     levels : tuple of int
         Numbers n: the first n Gaussians shall form the image too.
     part : Part or None
@@ -217,7 +217,7 @@ class Pixels:
     channels: int
     space: str
     model: Quadratic
-    shown: Float
+    placement_image: Float
     pictures: tuple[Picture, ...] = ()
     levels: tuple[int, ...] = ()
     part: Part | None = None
@@ -241,8 +241,8 @@ class Pixels:
             return batch_to_tiles(types, stacked if stacked.ndim > 2 else stacked[..., None])
 
         values = upload([d.values for d in batch])
-        same = all(d.shown is d.values for d in batch)
-        shown = values if same else upload([d.shown for d in batch])
+        same = all(d.placement_image is d.values for d in batch)
+        placement_image = values if same else upload([d.placement_image for d in batch])
         curvature = None
         if batch[0].curvature is not None:
             # 2-D weights are one for all channels
@@ -250,7 +250,7 @@ class Pixels:
             assert len(layers) == len(batch)
             curvature = upload(layers)
         grid = Grid(width, height, images=len(batch))
-        return cls(grid, channels, space, Quadratic(values, curvature), shown)
+        return cls(grid, channels, space, Quadratic(values, curvature), placement_image)
 
     @classmethod
     def plain(cls, values: Image, gaussians: Gaussians) -> Pixels:
@@ -291,12 +291,12 @@ class Pixels:
         lists = bin_gaussians(gaussians, adjoint=False)
         packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
-        drawn = forward(packed, background, lists, radius)
-        pixel = dr.arange(self.types.UInt, dr.width(drawn)) // self.channels
+        rendering = forward(packed, background, lists, radius)
+        pixel = dr.arange(self.types.UInt, dr.width(rendering)) // self.channels
         inside = dr.gather(self.types.Float, pixels_inside(self.types, self.grid), pixel)
-        left = self.model.target - drawn * inside
+        left = self.model.target - rendering * inside
         dr.eval(left)
-        return replace(self, model=self.model._replace(target=left), shown=left)
+        return replace(self, model=self.model._replace(target=left), placement_image=left)
 
     def picture(self, values: Float) -> Tensor:
         """Return an image in tile layout as a tensor (H, W, C)."""
@@ -357,8 +357,10 @@ def data_of(
     if affine != Affine():
         values = (values - np.float32(affine.offset)) / np.float32(affine.scale)
     if space in LIGHT:
-        shown = pixels if affine == Affine() else by_strips(to_coded, values)
-        return Data(values, shown, _product(by_strips(dark_weight, values), weight), affine)
+        placement_image = pixels if affine == Affine() else by_strips(to_coded, values)
+        return Data(
+            values, placement_image, _product(by_strips(dark_weight, values), weight), affine
+        )
     return Data(values, values, weight, affine)
 
 
@@ -439,18 +441,18 @@ def picture(
     factor : float, optional
         Factor of the channels in the set.
     """
-    affines, shown, codes = [d.affine for d in data], list(pixels), True
+    affines, images, codes = [d.affine for d in data], list(pixels), True
     if space == "data":
-        shown = [d.values * np.float32(factor) for d in data]
+        images = [d.values * np.float32(factor) for d in data]
         codes = all(map(is_codes, pixels))
         if not codes:
             affines = [Affine(1.0, a.offset / a.scale) for a in affines]
-    exposures = [1.0] * len(shown)
+    exposures = [1.0] * len(images)
     if space in UNBOUNDED:
-        exposures = [exposure_of(p) for p in shown]
-        lit = zip(shown, exposures, strict=True)
-        shown = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
-    batch = np.stack(shown) if len(shown) > 1 else shown[0]
+        exposures = [exposure_of(p) for p in images]
+        lit = zip(images, exposures, strict=True)
+        images = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
+    batch = np.stack(images) if len(images) > 1 else images[0]
     weights = None
     if weight is not None:
         weights = batch_to_tiles(types, np.atleast_3d(weight).mean(axis=2, keepdims=True))

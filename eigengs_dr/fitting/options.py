@@ -48,22 +48,22 @@ Start: TypeAlias = "Gaussians | Model | str | os.PathLike[str]"
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def refuse_unknown(given: Collection[str], known: Collection[str]) -> None:
+def refuse_unknown(given: Collection[str], names: Collection[str]) -> None:
     """Raise TypeError for an option that is unknown, with the name that it resembles."""
     for name in given:
-        if name not in known:
-            [*close] = get_close_matches(name, known, 1)
-            advice = f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(known)}"
+        if name not in names:
+            [*close] = get_close_matches(name, names, 1)
+            advice = f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(names)}"
             raise TypeError(f"unknown option {name!r}; {advice}")
 
 
 def named_options(function: Function) -> Function:
     """Decorate a function whose unknown keywords `refuse_unknown` reports."""
-    known = list(signature(function).parameters)
+    names = list(signature(function).parameters)
 
     @wraps(function)
     def call(*arguments: Any, **options: Any) -> Any:
-        refuse_unknown(options, known)
+        refuse_unknown(options, names)
         return function(*arguments, **options)
 
     return call  # type: ignore[return-value]
@@ -215,14 +215,16 @@ class FitOptions:
         """Return the number of Gaussians for so many pixels, if the fit does not search it."""
         return self.count or default_count(pixels)
 
-    def most_for(self, pixels: int, channels: int) -> int:
+    def max_count_for(self, pixels: int, channels: int) -> int:
         """Return the largest number of Gaussians that a search tries."""
         limit = self.goal.max_gaussians if self.goal else None
         return limit or max_gaussians_for(pixels, channels)
 
     def first_try(self, pixels: int, channels: int) -> int:
         """Return the number of Gaussians with which a search starts."""
-        return min(self.most_for(pixels, channels), max(1, pixels // PIXELS_PER_FIRST_GAUSSIAN))
+        return min(
+            self.max_count_for(pixels, channels), max(1, pixels // PIXELS_PER_FIRST_GAUSSIAN)
+        )
 
 
 def default_count(pixels: int) -> int:
@@ -269,11 +271,11 @@ def level_counts(count: int, levels: Levels) -> list[int]:
         raise ValueError(f"count is {count}; it must be at least 1")
     if not isinstance(levels, (int, np.integer)):
         return _check_counts(count, levels)
-    most = 1
-    while count >= LEVEL_RATIO**most:
-        most += 1
-    if not 1 <= levels <= most:
-        raise ValueError(f"levels is {levels}; {count} Gaussians make 1 to {most}")
+    max_levels = 1
+    while count >= LEVEL_RATIO**max_levels:
+        max_levels += 1
+    if not 1 <= levels <= max_levels:
+        raise ValueError(f"levels is {levels}; {count} Gaussians make 1 to {max_levels}")
     return [count // LEVEL_RATIO**k for k in reversed(range(levels))]
 
 

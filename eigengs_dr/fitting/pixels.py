@@ -53,13 +53,13 @@ def read_pixels(
         If the image is unusable.
     """
     data = rendered_as(space) is None
-    found = read_image(image, data, encoding)
+    encoded = read_image(image, data, encoding)
     if weight is not None:
-        found = found._replace(pixels=_filled(found, weight))
+        encoded = encoded._replace(pixels=_filled(encoded, weight))
     if data:
-        return _read_data(found, space), space
-    pixels = check_image(found, copy=False)
-    if found.encoding == "linear" and pixels.max() > WHITE:
+        return _read_data(encoded, space), space
+    pixels = check_image(encoded, copy=False)
+    if encoded.encoding == "linear" and pixels.max() > WHITE:
         space = BRIGHT.get(space, space)
     return pixels, space
 

@@ -303,9 +303,9 @@ def weigh(
     F holds factors of the squares of errors, one for all channels or one for each. Cost: one pass
     over the lists.
     """
-    found = correlate(shape, delta, channels, lists, cutoff, factors)
-    diagonal = found[channels:]
-    return found[:channels], (diagonal, channel_sums(factors, len(diagonal), lists.grid))
+    products = correlate(shape, delta, channels, lists, cutoff, factors)
+    diagonal = products[channels:]
+    return products[:channels], (diagonal, channel_sums(factors, len(diagonal), lists.grid))
 
 
 def by_channel(values: list, channels: int) -> list:

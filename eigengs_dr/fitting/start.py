@@ -29,14 +29,14 @@ def load_start(start: Start | Fitted, backend: str | None) -> Gaussians | Model:
     """
     if isinstance(start, (str, os.PathLike)):
         return Gaussians.load(start, backend)
-    found = start if isinstance(start, Model) else dr.detach(set_of(start))
-    current = types_of(set_in(found).mean).backend
+    loaded = start if isinstance(start, Model) else dr.detach(set_of(start))
+    current = types_of(set_in(loaded).mean).backend
     if backend not in (None, current):
         raise ValueError(
             f"the start is on backend {current!r}, not on {backend!r}; load it with "
             f"backend={backend!r}, or leave the backend out"
         )
-    return found
+    return loaded
 
 
 def set_in(start: Gaussians | Model) -> Gaussians:

@@ -101,7 +101,7 @@ def place_adaptive(
         Neighbours in memory are close in space.
     """
     types, grid, channels = objective.types, objective.grid, objective.channels
-    mean, factor = _place(Canvas.of(types, grid), objective.shown, count, density)
+    mean, factor = _place(Canvas.of(types, grid), objective.placement_image, count, density)
     color = [dr.zeros(types.Float, grid.images * count) for _ in range(channels)]
     background = [dr.zeros(types.Float, grid.images) for _ in range(channels)]
     dr.make_opaque(color, background)
@@ -109,7 +109,9 @@ def place_adaptive(
     placed = Gaussians(mean, factor, *rows, *objective.size, objective.space, float(cutoff))
     placed = placed.bounded()
     dr.eval(placed)
-    release_memory(dr.width(objective.shown))  # nothing later asks for blocks of these sizes
+    release_memory(
+        dr.width(objective.placement_image)
+    )  # nothing later asks for blocks of these sizes
     return placed
 
 
@@ -191,16 +193,16 @@ def density_from_hessian(canvas: Canvas, image: Float, spacing: float) -> tuple[
 def normalize_density(canvas: Canvas, density: Float, count: int) -> Float:
     """Scale a density to a sum of about `count` an image, with at most one Gaussian per pixel."""
     types, grid = canvas.types, canvas.grid
-    wanted = dr.opaque(types.Float, count)
+    total = dr.opaque(types.Float, count)
     values = types.FloatX(gather_run(types, density, canvas.tile, PIXELS, True))
     image = canvas.sizes.image_of(canvas.tile)
 
     def scaled(factor: Float) -> Float:
         return dr.minimum(values * spread(factor, image), 1)
 
-    factor = wanted / sum_by_image(dr.sum(values, axis=0), grid)
+    factor = total / sum_by_image(dr.sum(values, axis=0), grid)
     for _ in range(4):  # each round moves the excess of full pixels to the others
-        factor *= wanted / sum_by_image(dr.sum(scaled(factor), axis=0), grid)
+        factor *= total / sum_by_image(dr.sum(scaled(factor), axis=0), grid)
     result = dr.empty(types.Float, dr.width(density))
     dr.scatter(result, scaled(factor), canvas.tile)
     dr.eval(result)

@@ -198,7 +198,7 @@ def scan(
         its first line; and whether there is such a tile.
     """
     types, side = canvas.types, canvas.sides()[axis]
-    own = types.Int(canvas.tile)
+    tile = types.Int(canvas.tile)
     here = canvas.corner(canvas.tile)[axis]
     step = (1, canvas.sizes.nx)[axis]
     length = SIDE * canvas.channels(source)
@@ -207,9 +207,9 @@ def scan(
     def look(distance: UInt, state: State) -> tuple[UInt, State]:
         first = here + distance * SIDE
         inside = (first >= 0) & (first < side)
-        start = (own + distance * step) * SIDE
+        start = (tile + distance * step) * SIDE
         lines = [
-            dr.gather(kind, source, types.UInt(start + k), inside, shape=(length, dr.width(own)))
+            dr.gather(kind, source, types.UInt(start + k), inside, shape=(length, dr.width(tile)))
             for k in range(SIDE)
         ]
         return distance + 1, visit(lines, distance * SIDE, first, inside, state)
@@ -305,11 +305,11 @@ def weighted_sums(canvas: Canvas, image: Float, weights: Weights, means: bool = 
                 weight.append(dr.select(dr.abs(away) <= radius, near, 0))
             for k in range(SIDE):
                 counts = inside & (first + k < end)
-                for own in range(SIDE):
-                    w = weight[k - own + SIDE - 1]
-                    sums[own] = dr.fma(w, lines[k], sums[own])
+                for row in range(SIDE):
+                    w = weight[k - row + SIDE - 1]
+                    sums[row] = dr.fma(w, lines[k], sums[row])
                     if means:
-                        totals[own] = totals[own] + dr.select(counts, w, 0)
+                        totals[row] = totals[row] + dr.select(counts, w, 0)
             return sums, totals
 
         zeros = [dr.zeros(types.FloatX, (length, 1)) for _ in range(SIDE)]
@@ -351,7 +351,7 @@ def squared_hessian(canvas: Canvas, image: Float, noise: float) -> tuple[Float, 
     row += inner
 
     def load(step: int) -> list:
-        """Return the values of 6 pixels: those of the row above, of the own or of that below."""
+        """Return the values of 6 pixels: those of its row, or of the row above or below."""
         source = types.Int(lane) + step
         if step:
             leaves = inner == (0 if step < 0 else SIDE - 1)
@@ -372,12 +372,12 @@ def squared_hessian(canvas: Canvas, image: Float, noise: float) -> tuple[Float, 
         return values
 
     FloatX = types.FloatX
-    own = load(0)
-    above = list(dr.select(row > 0, FloatX(load(-1)), FloatX(own)))
-    below = list(dr.select(row + 1 < height, FloatX(load(1)), FloatX(own)))
+    middle_row = load(0)
+    above = list(dr.select(row > 0, FloatX(load(-1)), FloatX(middle_row)))
+    below = list(dr.select(row + 1 < height, FloatX(load(1)), FloatX(middle_row)))
     (up_left, up, up_right), (left, middle, right), (down_left, down, down_right) = (
         [FloatX(v[k * channels : k * channels + length]) for k in range(3)]
-        for v in (above, own, below)
+        for v in (above, middle_row, below)
     )
     # Differences of neighbours first: those of close floats are exact.
     xx, yy = (right - middle) - (middle - left), (down - middle) - (middle - up)
@@ -392,8 +392,8 @@ def squared_hessian(canvas: Canvas, image: Float, noise: float) -> tuple[Float, 
         own_energy = [sums[0] + base, sums[1] + base, sums[2]]
         energy += [dr.select(inside, e, 0) for e in own_energy]
         trace.append(dr.select(inside, own_energy[0] + own_energy[1], 0))
-    found = [dr.empty(types.Float, dr.width(lane) * len(v)) for v in (energy, trace)]
-    for array, values in zip(found, (energy, trace), strict=True):
+    arrays = [dr.empty(types.Float, dr.width(lane) * len(v)) for v in (energy, trace)]
+    for array, values in zip(arrays, (energy, trace), strict=True):
         dr.scatter(array, FloatX(values), lane)
-    dr.eval(found)
-    return found[0], found[1]
+    dr.eval(arrays)
+    return arrays[0], arrays[1]

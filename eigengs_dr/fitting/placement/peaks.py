@@ -106,12 +106,12 @@ def _maxima(canvas: Canvas, slope: Float, curvature: Float) -> tuple[Float, Floa
     colors = [dr.select(h > 0, b / h, 0) for b, h in zip(blurred, factors, strict=True)]
     terms = [c * b for c, b in zip(colors, blurred, strict=True)]
     gains = [sum(terms[n * channels : (n + 1) * channels]) for n in range(PIXELS)]
-    found = canvas.store(colors), canvas.store(gains)
-    dr.eval(found)
-    rows = neighbourhood(canvas, found[1], 1)
+    arrays = canvas.store(colors), canvas.store(gains)
+    dr.eval(arrays)
+    rows = neighbourhood(canvas, arrays[1], 1)
     maxima = canvas.store([_if_maximum(rows, n % SIDE + 1, n // SIDE + 1) for n in range(PIXELS)])
     dr.eval(maxima)
-    return found[0], maxima
+    return arrays[0], maxima
 
 
 def _blurred(rows: list, channels: int) -> list:
@@ -132,12 +132,12 @@ def _blurred(rows: list, channels: int) -> list:
 
 def _if_maximum(rows: list, x: int, y: int) -> Float:
     """Return a value if it is the largest of 3x3, of equal ones the first; 0 otherwise."""
-    own, largest = rows[y][x], True
+    center, largest = rows[y][x], True
     for k in range(9):
         other = rows[y + k // 3 - 1][x + k % 3 - 1]
         if k != 4:
-            largest &= own > other if k < 4 else own >= other
-    return dr.select(largest, own, 0)
+            largest &= center > other if k < 4 else center >= other
+    return dr.select(largest, center, 0)
 
 
 def _ranked(place: UInt, gain: Float, canvas: Canvas, count: int) -> tuple[UInt, UInt, UInt]:

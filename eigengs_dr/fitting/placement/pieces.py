@@ -126,13 +126,13 @@ def stratify_along_hilbert(canvas: Canvas, density: Float, count: int) -> tuple[
     rank, state = curve_of(canvas)
     values = gather_run(types, density, canvas.tile, PIXELS, True)
     mass = fixed(sum(values))
-    own = [mass]
+    tile_moments = [mass]
     lines = [values[k::SIDE] for k in range(SIDE)], [values[k : k + SIDE] for k in (0, 4, 8, 12)]
     for edge, axis in zip(canvas.corner(canvas.tile), lines, strict=True):
         moment = sum(sum(line) * (k + 0.5) for k, line in enumerate(axis))
-        own.append(fixed(moment) + UInt64(edge) * mass)
-    sums = [dr.empty(UInt64, grid.tiles) for _ in own]
-    for array, value in zip(sums, own, strict=True):
+        tile_moments.append(fixed(moment) + UInt64(edge) * mass)
+    sums = [dr.empty(UInt64, grid.tiles) for _ in tile_moments]
+    for array, value in zip(sums, tile_moments, strict=True):
         dr.scatter(array, value, rank)
     where = dr.empty(types.UInt, grid.tiles)
     dr.scatter(where, canvas.tile * 4 + state, rank)
@@ -212,9 +212,9 @@ def _moments_in_tile(
     columns, rows = along(lambda x, y: x + 0.5), along(lambda x, y: y + 0.5)
     moments = types.Float(0), types.Float(0)
     for value, column, row in zip(masses, columns, rows, strict=True):
-        taken = dr.minimum(mass, value)
-        mass -= taken
-        moments = dr.fma(taken, column, moments[0]), dr.fma(taken, row, moments[1])
+        part = dr.minimum(mass, value)
+        mass -= part
+        moments = dr.fma(part, column, moments[0]), dr.fma(part, row, moments[1])
     return moments
 
 
@@ -281,14 +281,14 @@ def lloyd_step(
     # The centroids
     x, y, first, _ = canvas.pixels()
     away = [((keys >> shift) & (2 * HALF - 1)) - HALF for shift in (0, BITS)]
-    found = (keys < NONE) & (density > 0)
-    owner = dr.gather(UInt, last, canvas.place(first, x + away[0], y + away[1]), found) - 1
+    counts = (keys < NONE) & (density > 0)
+    owner = dr.gather(UInt, last, canvas.place(first, x + away[0], y + away[1]), counts) - 1
     sums = [dr.zeros(UInt64, count) for _ in range(3)]
     dr.make_opaque(sums)
     mass = UInt64(density * dr.opaque(types.Float, 2.0**FRACTION))
     terms = mass, mass * UInt64(HALF - away[0]), mass * UInt64(HALF - away[1])
     for array, term in zip(sums, terms, strict=True):
-        dr.scatter_reduce(dr.ReduceOp.Add, array, term, owner, found, mode=LOCAL)
+        dr.scatter_reduce(dr.ReduceOp.Add, array, term, owner, counts, mode=LOCAL)
     dr.eval(sums)
     x, y = (
         dr.select(
@@ -310,8 +310,10 @@ def _nearest_along(canvas: Canvas, keys: UInt, tiles: UInt, axis: int) -> UInt:
             for k in (distance + offset for offset in range(1 - SIDE, SIDE))
         ]
         return [
-            reduce(dr.minimum, (lines[k] + cost[k - own + SIDE - 1] for k in range(SIDE)), nearest)
-            for own, nearest in enumerate(state)
+            reduce(
+                dr.minimum, (lines[k] + cost[k - target + SIDE - 1] for k in range(SIDE)), nearest
+            )
+            for target, nearest in enumerate(state)
         ]
 
     start = [dr.full(IntX, NONE, (SIDE, 1)) for _ in range(SIDE)]
