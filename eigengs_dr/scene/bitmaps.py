@@ -121,10 +121,10 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
 def _own_resolver() -> Iterator[mi.FileResolver]:
     """Use a copy of Mitsuba's file resolver in a block."""
     before = mi.file_resolver()
-    own = mi.FileResolver(before)
-    mi.set_file_resolver(own)
+    resolver = mi.FileResolver(before)
+    mi.set_file_resolver(resolver)
     try:
-        yield own
+        yield resolver
     finally:
         mi.set_file_resolver(before)
 
@@ -249,8 +249,8 @@ def space_of(pixels: NDArray[np.float32], data: bool) -> str:
         raise Unsuitable(f"values from {low:g} to {high:g}, beyond 0 and 1")
     if high > 1.001:
         return "radiance"
-    shown = pixels if data else to_coded(pixels)
-    extreme = float(((shown <= 0.02) | (shown >= 0.98)).all(axis=2).mean())
-    if extreme >= TWO_VALUES and np.ptp(shown) > 0.5:
+    display = pixels if data else to_coded(pixels)
+    extreme = float(((display <= 0.02) | (display >= 0.98)).all(axis=2).mean())
+    if extreme >= TWO_VALUES and np.ptp(display) > 0.5:
         raise Unsuitable("a mask of two values: Gaussians would soften its edges")
     return "data" if data else "linear"

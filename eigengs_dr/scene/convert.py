@@ -248,26 +248,26 @@ def _convert_into(
     uses, left = uses_of(again)
     original = Original(make, settings.spp)
     result = ConvertedScene(work / SCENE, [], [], left, [], [])
-    made = dict[int, str]()
+    replacements = dict[int, str]()
     groups: dict[tuple[str, bool, bool], list[Use]] = {}
     on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
-        if any(original.textures([use])[0] in found for found in on_shapes):
+        if any(original.textures([use])[0] in hierarchy for hierarchy in on_shapes):
             groups.setdefault((use.file, use.raw, use.is_height), []).append(use)
         else:
             left.append((use.name, NO_SHAPE))
     sky = environment_of(again)
     total = len(groups) + (sky is not None)
 
-    def add(found: ConvertedTexture | str, nodes: dict[int, str]) -> None:
+    def add(outcome: ConvertedTexture | str, nodes: dict[int, str]) -> None:
         """Add what has become of an image, whose nodes have names."""
-        if isinstance(found, str):
-            left.extend((name, found) for name in nodes.values())
-        elif not found.file:
-            result.better.append(found)
+        if isinstance(outcome, str):
+            left.extend((name, outcome) for name in nodes.values())
+        elif not outcome.file:
+            result.better.append(outcome)
         else:
-            result.textures.append(found)
-            made.update(dict.fromkeys(nodes, found.file))
+            result.textures.append(outcome)
+            replacements.update(dict.fromkeys(nodes, outcome.file))
 
     for number, group in enumerate(groups.values()):
         progress("textures", number, total)
@@ -275,8 +275,8 @@ def _convert_into(
             group[0].file, group[0].raw, {texture.file for texture in result.textures}
         )
         pixels = read_pixels(again.state.nodes[group[0].node].props)
-        found = _convert(original, group, pixels, file, settings)
-        add(found, {use.node: use.name for use in group})
+        outcome = _convert(original, group, pixels, file, settings)
+        add(outcome, {use.node: use.name for use in group})
     if sky is not None:
         progress("textures", len(groups), total)
         props = again.state.nodes[sky].props
@@ -285,14 +285,14 @@ def _convert_into(
         file = work / _file_name(path, False, {texture.file for texture in result.textures})
         add(_convert_sky(original, name, read_pixels(props), file, settings), {sky: name})
     progress("textures", total, total)
-    _rewrite(again, made, work, target)
+    _rewrite(again, replacements, work, target)
     result.scene.write_text(_to_xml(again), encoding="utf-8")
     if settings.spp != 0:
         progress("renderings", 0, 2)
         after = pictures(mi.load_file(str(result.scene)), settings.spp)
         progress("renderings", 1, 2)
         result.psnr.extend(compare(original.pictures, after, work))
-        if sky in made:
+        if sky in replacements:
             others = pictures(original.scene, settings.spp, seed=1 << 16)
             result.noise.extend(map(psnr, original.pictures, others))
         progress("renderings", 2, 2)
@@ -376,26 +376,26 @@ def _chosen(
     )
 
 
-def _file_name(image: str, raw: bool, taken: set[str]) -> str:
+def _file_name(image: str, raw: bool, used: set[str]) -> str:
     """Name the file of a set by its image."""
     stem = Path(image).stem
     names = [f"{stem}.npz", f"{stem}-data.npz", *(f"{stem}-{k}.npz" for k in range(2, 1000))]
-    return next(name for name in names[raw and f"{stem}.npz" in taken :] if name not in taken)
+    return next(name for name in names[raw and f"{stem}.npz" in used :] if name not in used)
 
 
 # --- The scene -----------------------------------------------------------------------------------
 
 
-def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> None:
+def _rewrite(parsed: Parsed, replacements: dict[int, str], work: Path, target: Path) -> None:
     """Put the sets in the place of the bitmaps, and name other files relative to the folder.
 
-    `made` holds the new file for the index of each node that was a bitmap. Bitmaps that stay, and
-    sets that were there, become files too if they are in memory.
+    `replacements` holds the new file for the index of each node that was a bitmap. Bitmaps that
+    stay, and sets that were there already, become files too if they are in memory.
     """
     for index, node in enumerate(parsed.state.nodes):
         props = node.props
-        if index in made:
-            replace_bitmap(props, made[index])
+        if index in replacements:
+            replace_bitmap(props, replacements[index])
             continue
         if props.plugin_name() == GAUSSIANS and "to_uv" in props:
             props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML lacks

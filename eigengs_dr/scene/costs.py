@@ -67,8 +67,8 @@ def costs_of(kinds: Sequence[Sequence[Any]], look: Callable[[Any, Interaction], 
     points = _grid()
     fastest = [float("inf")] * len(kinds)
     for _ in range(1 + ROUNDS):  # the first round compiles
-        taken = [_time(look, plugin, points) for plugin in firsts]
-        fastest = [min(pair) for pair in zip(fastest, taken, strict=True)]
+        seconds = [_time(look, plugin, points) for plugin in firsts]
+        fastest = [min(pair) for pair in zip(fastest, seconds, strict=True)]
     held = [sum(map(resident_bytes, plugins)) for plugins in kinds]
     return [Cost(b, 1e9 * t / SIDE**2) for b, t in zip(held, fastest, strict=True)]
 

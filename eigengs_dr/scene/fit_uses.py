@@ -111,7 +111,7 @@ def fit_picture(
     # Raw colours are colours all the same; pixels in memory are raw as a rule.
     plugin = original.parsed.state.nodes[use.parent].props.plugin_name()
     is_data = pixels.shape[2] == 1 or plugin == "normalmap"
-    found = fit_for_scene(
+    result = fit_for_scene(
         original.scene,
         original.textures(group),
         pixels,
@@ -121,7 +121,7 @@ def fit_picture(
         wrap_mode=[use.wrap for use in group],
         encoding="linear",
     )
-    return found.gaussians, min(found.psnr)
+    return result.gaussians, min(result.psnr)
 
 
 def fit_heights(
@@ -147,7 +147,7 @@ def fit_heights(
         If no set keeps the PSNR between the renderings, or nothing shall be rendered.
     """
     if original.spp == 0:
-        raise Unsuitable("heights of a bump map: renderings decide, and none is wanted")
+        raise Unsuitable("heights of a bump map: renderings decide, and none was asked for")
     heights = pixels if pixels.shape[2] == 1 else (pixels @ LUMINANCE)[..., None]
     space_of(heights, True)  # it raises where Gaussians cannot hold them
     height, width, _ = heights.shape
@@ -156,7 +156,7 @@ def fit_heights(
     heights, weight = (halved(v, seen) for v in (heights, np.float32(seen.seen)[..., None]))
     reached = list[str]()
     for more in CLOSER:
-        found = fit(
+        result = fit(
             heights,
             target_psnr=min(target_psnr + more, 99.0),
             iterations=iterations,
@@ -164,7 +164,7 @@ def fit_heights(
             weight=weight[..., 0],
             progress=False,
         )
-        gaussians = found.gaussians.scaled(width, height)
+        gaussians = result.gaussians.scaled(width, height)
         gaussians.save(file)
         kept = original.psnr_with(file, group)
         if kept >= target_psnr:

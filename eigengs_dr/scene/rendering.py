@@ -46,8 +46,8 @@ class Rendering(NamedTuple):
 
         A depth is no alpha: a channel counts by its name, not by its place.
         """
-        wanted = [*names] if "R" in self.channels else ["Y", *names[3:]]
-        kept = [self.channels.index(name) for name in wanted if name in self.channels]
+        colors = [*names] if "R" in self.channels else ["Y", *names[3:]]
+        kept = [self.channels.index(name) for name in colors if name in self.channels]
         return np.ascontiguousarray(self.pixels[..., kept])
 
 
@@ -88,11 +88,11 @@ def render_in_passes(
             emitter.set_scene(scene)
     width, height = sensor.film().crop_size()
     total = spp or sensor.sampler().sample_count()
-    most = max(1, SAMPLES_PER_PASS // (width * height))
+    max_count = max(1, SAMPLES_PER_PASS // (width * height))
     pixels: NDArray[np.float64] = np.zeros(())
     done = 0
     while done < total:
-        count = min(most, total - done)
+        count = min(max_count, total - done)
         part = mi.render(scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done)
         pixels = pixels + count * np.array(part, np.float64)
         done += count
@@ -115,8 +115,8 @@ def _channels(film: mi.Film, integrator: mi.Integrator, count: int) -> list[str]
     inside = {name[:-2]: None for name in aovs if name.endswith(".A")}
     layers = [f"{layer}.{name}" for layer in inside for name in plain]
     others = [name for name in aovs if name[:-2] not in inside]
-    found = [*(plain if inside else []), *layers[len(plain) :], *others]
-    return found if len(found) == count else [f"channel.{k}" for k in range(count)]
+    channels = [*(plain if inside else []), *layers[len(plain) :], *others]
+    return channels if len(channels) == count else [f"channel.{k}" for k in range(count)]
 
 
 LOUDER = 8.0

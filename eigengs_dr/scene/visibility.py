@@ -330,8 +330,10 @@ def _find(scene: mi.Scene, texture: str | Texture) -> tuple[Texture, list]:
         nodes = {key.rpartition(".")[0]: entry[2] for key, entry in entries}
         nodes = {key: n for key, n in nodes.items() if isinstance(n, texture_class())}
         if texture not in nodes:
-            known = ", ".join(name for name, t in nodes.items() if t.is_spatially_varying())
-            raise ValueError(f"texture {texture!r} is not in the scene; it has {known or 'none'}")
+            textures = ", ".join(name for name, t in nodes.items() if t.is_spatially_varying())
+            raise ValueError(
+                f"texture {texture!r} is not in the scene; it has {textures or 'none'}"
+            )
         node = nodes[texture]
     shapes = [shape for shape in scene.shapes() if node in mi.traverse(shape).hierarchy]
     if not shapes:

@@ -128,7 +128,7 @@ def filtered_terms(packed: Packed, footprint: list) -> Terms:
     `eigengs_dr.raster.evaluate.widen` for D.
     """
     fxx, fxy, fyy = kernel_covariance(footprint)
-    own = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
+    determinant = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
     limit = packed.radius * packed.radius
 
     def terms(shape: list, color: list, x: Float, y: Float) -> list:
@@ -137,7 +137,7 @@ def filtered_terms(packed: Packed, footprint: list) -> Terms:
         xy, yy = dr.fma(t, r, fxy), dr.fma(r, r, fyy)
         across = dr.fma(r * r, fxx, t * dr.fma(t, fyy, -2 * r * fxy))
         pp = p * p
-        scale = rsqrt(dr.fma(pp, yy, own + dr.maximum(across, 0)))
+        scale = rsqrt(dr.fma(pp, yy, determinant + dr.maximum(across, 0)))
         along = dr.fma(yy, dx, -xy * dy) * scale
         w = falloff(dr.fma(along, along, dy * dy) * rcp(yy), limit) * scale
         return [w * c for c in color]

@@ -89,8 +89,8 @@ def _shortest_list(
     begin, end = types.UInt(0), types.UInt(0)
     for spread, cells in zip(sizes.spreads, sizes.cells.levels, strict=True):
         small = active & (widest <= spread)
-        found = sizes.cells.range_at(cells, dr.detach(x), dr.detach(y), small)
-        begin, end = dr.select(small, found[0], begin), dr.select(small, found[1], end)
+        bounds = sizes.cells.range_at(cells, dr.detach(x), dr.detach(y), small)
+        begin, end = dr.select(small, bounds[0], begin), dr.select(small, bounds[1], end)
         active = active & ~small
     return begin, end
 
@@ -276,12 +276,12 @@ def _sum_copies(
         px, py, factors = _local(sizes, i, j, x, y)
         seen = [f * k for f, k in zip(scaled, factors, strict=True)]
         # Of a clamped image, the whole footprint decides how much of it lies in each part.
-        own, center = (scaled, (x, y)) if sizes.wrap == "clamp" else (seen, (px, py))
+        metric, center = (scaled, (x, y)) if sizes.wrap == "clamp" else (seen, (px, py))
         shape, amplitude = widen_inverted(shape, seen)
         (w,) = weights(shape, px, py, (1, 1), packed.radius)
         (part,) = where_any(
             crosses,
-            lambda: [_share(sizes, shape, own, (i, j), (px, py), center)],
+            lambda: [_share(sizes, shape, metric, (i, j), (px, py), center)],
             packed,
             [types.Float(1)],
         )
