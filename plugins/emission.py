@@ -133,19 +133,19 @@ def _light_at(texture: Texture, uv: mi.Point2f, cells: CellLists, packed: Packed
 def _smallest_deviation(shape: list, color: list) -> float:
     """Return the smallest standard deviation of drawn Gaussians, in texels."""
     a, b, c, *values = (np.asarray(row.numpy(), np.float64) for row in [*shape[2:], *color])
-    drawn = (a > 0) & (c > 0) & (np.abs(values).sum(axis=0) > 0)
+    visible = (a > 0) & (c > 0) & (np.abs(values).sum(axis=0) > 0)
     with np.errstate(all="ignore"):  # the axes have the product 1 / (a c)
         deviation = EXP2_SCALE / (a * c * max_deviation(a, b, c))
-    return float(deviation[drawn & np.isfinite(deviation)].min(initial=1e6))
+    return float(deviation[visible & np.isfinite(deviation)].min(initial=1e6))
 
 
 def _grid(texture: Texture, smallest: float, spacing: Spacing) -> tuple[int, int, float]:
     """Return the number of columns and rows of points, and their spacing in texels."""
     spans, multiple = np.minimum(texture.spans(), 1e9), spacing.multiple
-    wanted = spans / min(max(smallest / spacing.resolved, spacing.finest), spacing.coarsest)
-    wanted *= min(1.0, math.sqrt(MOST / wanted.prod()))
+    counts = spans / min(max(smallest / spacing.resolved, spacing.finest), spacing.coarsest)
+    counts *= min(1.0, math.sqrt(MOST / counts.prod()))
     columns, rows = (
-        multiple * math.ceil(max(FEWEST, n) / multiple) for n in np.minimum(wanted, MOST / FEWEST)
+        multiple * math.ceil(max(FEWEST, n) / multiple) for n in np.minimum(counts, MOST / FEWEST)
     )
     return columns, rows, float((spans / (columns, rows)).max())
 

@@ -198,7 +198,7 @@ def gaussian_environment() -> type:
             column, row, inside = self.point(uv)
             where = inside & active
             sums = self.sums_at(column, row, where, self._footprint(uv))
-            color = [dr.select(where, self.scale * c, 0) for c in self.shown(sums)]
+            color = [dr.select(where, self.scale * c, 0) for c in self.display(sums)]
             if mi.is_monochromatic:
                 return mi.UnpolarizedSpectrum(luminance(color))
             rgb = mi.Color3f(*color)

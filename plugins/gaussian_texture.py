@@ -155,7 +155,7 @@ def gaussian_texture() -> type:
             inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
             sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))
             _, _, inside = self.point(si.uv)
-            return [dr.select(inside & active, s, 0) for s in self.shown(sums)]
+            return [dr.select(inside & active, s, 0) for s in self.display(sums)]
 
         def _look_up(self, si: Interaction) -> list:
             """Sum all channels of the table, in all lanes."""

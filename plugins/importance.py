@@ -165,11 +165,11 @@ def _roots(squares: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         In each block.
     """
     squares = squares.reshape(-1, *squares.shape[2:])
-    found = [np.sqrt(squares).reshape(len(squares), -1)]
+    roots = [np.sqrt(squares).reshape(len(squares), -1)]
     while (side := squares.shape[1] // 2) > 0:
         squares = squares.reshape(-1, side, 2, side, 2).mean(axis=(2, 4))
-        found.insert(0, np.sqrt(squares).reshape(len(squares), -1))
-    return found
+        roots.insert(0, np.sqrt(squares).reshape(len(squares), -1))
+    return roots
 
 
 def _levels(roots: list, price: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -48,11 +48,11 @@ def resident_bytes(texture: Texture) -> int:
         return tables + sum(_texel_bytes(value) for _, value in mi.traverse(texture))
     arrays: dict[tuple, int] = {}
     sampled = 0
-    for found in _walk(vars(texture), {}):
-        if isinstance(found, Emission):
-            sampled += found.bytes
+    for value in _walk(vars(texture), {}):
+        if isinstance(value, Emission):
+            sampled += value.bytes
             continue
-        for array in (found, dr.grad(found)) if dr.grad_enabled(found) else (found,):
+        for array in (value, dr.grad(value)) if dr.grad_enabled(value) else (value,):
             arrays[indices_of([dr.detach(array)])] = dr.width(array) * dr.itemsize_v(array)
     return sum(arrays.values()) + sampled
 

@@ -135,7 +135,7 @@ def plugin_of_sums(base: type) -> Any:
                 return sum_here(self.table, x, y, inside)
             return sum_over_footprint(self.table, column, row, inside, seen)
 
-        def shown(self, sums: list) -> list:
+        def display(self, sums: list) -> list:
             """Return the channels, decoded and clamped unless `raw`, of sums without background."""
             background = self.table.background[self.part]
             return show_all(self, [s + b for s, b in zip(sums[self.part], background, strict=True)])

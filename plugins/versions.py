@@ -34,8 +34,8 @@ def _renamed(holder: Any, before: str, after: str) -> Any:
 
 def texture_class() -> type:
     """Return the base class of textures."""
-    found: type = _renamed(mi, "Texture", "Field")
-    return found
+    texture: type = _renamed(mi, "Texture", "Field")
+    return texture
 
 
 def texture_kind() -> object:
