@@ -87,8 +87,8 @@ def _saturated() -> Image:
 
 
 def _noise() -> Image:
-    drawn = np.random.default_rng(0).normal(0, 0.3, (SIDE, SIDE, 3))
-    return np.clip(photo() + drawn, 0, 1).astype(np.float32)
+    noise = np.random.default_rng(0).normal(0, 0.3, (SIDE, SIDE, 3))
+    return np.clip(photo() + noise, 0, 1).astype(np.float32)
 
 
 def _foreign() -> Image:

@@ -141,7 +141,7 @@ def tables() -> None:
 
 @question("pictures")
 @data_argument
-@several("--picture", "wanted", PICTURES, "What to draw, by default what DATA is enough for")
+@several("--picture", "pictures", PICTURES, "What to draw, by default what DATA is enough for")
 @number("--images", "Test images a set, for curves and radii.", 8, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def pictures() -> None:

@@ -61,8 +61,8 @@ def start(image: Image, options: FitOptions) -> Run:
     height, width = pixels.shape[:2]
     data = data_of(pixels, space)
     types = types_for(source, options.backend)
-    shown = picture(types, space, [pixels], [data])
-    objective = replace(Pixels.of(data, space, types), pictures=(shown,))
+    display = picture(types, space, [pixels], [data])
+    objective = replace(Pixels.of(data, space, types), pictures=(display,))
     if source is None:
         count = options.count_for(width * height)
         placed = method.place_and_solve(objective, count, options.seed)
@@ -120,8 +120,8 @@ def decibels(picture: Image, image: Image, space: str) -> float:
 
 def judge(picture: Image, image: Image) -> dict[str, float]:
     """Return psnr_ycbcr, psnr_rgb, ssim and ms_ssim of a picture."""
-    found = {f"psnr_{space}": decibels(picture, image, space) for space in ("ycbcr", "rgb")}
-    return {**found, "ssim": eg.ssim(picture, image), "ms_ssim": eg.ms_ssim(picture, image)}
+    psnr = {f"psnr_{space}": decibels(picture, image, space) for space in ("ycbcr", "rgb")}
+    return {**psnr, "ssim": eg.ssim(picture, image), "ms_ssim": eg.ms_ssim(picture, image)}
 
 
 def score(moment: Moment, image: Image) -> dict[str, Any]:

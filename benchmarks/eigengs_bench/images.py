@@ -25,13 +25,13 @@ def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str
     count, sides = task.images if count is None else count, SETS[name][1:3]
     if name == SAMPLES:
         return [(photo, center_crop(eg.sample(photo), *sides)) for photo in SAMPLE_NAMES[:count]]
-    folder, found = Path(task.data or "") / SETS[name].folder, []
+    folder, pictures = Path(task.data or "") / SETS[name].folder, []
     for file in image_files(folder / "test" if (folder / "test").is_dir() else folder)[:count]:
         picture = eg.load_image(file)
         upright = picture.shape[0] > picture.shape[1]
         size = (min(sides), max(sides)) if upright else sides
-        found.append((file.name, center_crop(picture, *size)))
-    return found
+        pictures.append((file.name, center_crop(picture, *size)))
+    return pictures
 
 
 def is_present(task: Task, name: str) -> bool:

@@ -64,7 +64,7 @@ class Unknown(NamedTuple):
     textures: dict[str, dict[str, Any]]
     start: dict[str, Any]
     rates: dict[str, float]
-    shown: Callable[[Any], dict[str, Any]] = dict
+    parameters_of: Callable[[Any], dict[str, Any]] = dict
     bound: Callable[[Any], None] = lambda values: None
 
 
@@ -84,7 +84,7 @@ def pyramid(mi: Any, kind: str) -> Unknown:
             start[f"{name}{side}"] = mi.TensorXf(np.zeros((side, side, channels), np.float32))
         start[f"{name}{sides[-1]}"] += float(grey(name)[0, 0, 0])
 
-    def shown(values: Any) -> dict[str, Any]:
+    def parameters_of(values: Any) -> dict[str, Any]:
         result = {}
         for name, key in NAMES[kind].items():
             total = values[f"{name}{sides[-1]}"]
@@ -95,7 +95,7 @@ def pyramid(mi: Any, kind: str) -> Unknown:
             result[f"{key}.data"] = total
         return result
 
-    return Unknown(texels(mi, kind).textures, start, dict.fromkeys(start, 0.004), shown)
+    return Unknown(texels(mi, kind).textures, start, dict.fromkeys(start, 0.004), parameters_of)
 
 
 def lookups(mi: Any, kind: str) -> Unknown:
@@ -103,15 +103,15 @@ def lookups(mi: Any, kind: str) -> Unknown:
     from eigengs_dr.plugins import keep_in_bounds, texture_of
 
     [(name, key)] = NAMES[kind].items()
-    found = eg.lattices((TEXELS, TEXELS), SIDES, [GREY] * 3, space="linear")
+    lattices = eg.lattices((TEXELS, TEXELS), SIDES, [GREY] * 3, space="linear")
     rates = {"mean": 0.2, "factor": 0.02, "color": 0.01, "background": 0.005}
-    texture = texture_of(found, cutoff=CUTOFF)
+    texture = texture_of(lattices, cutoff=CUTOFF)
     tensors = mi.traverse(mi.load_dict(texture))
     start = {f"{key}.{field}": mi.TensorXf(tensors[field]) for field in rates}
     named = dict(zip(start, rates.values(), strict=True))
 
     def bound(values: Any) -> None:
-        keep_in_bounds(values, key, found)
+        keep_in_bounds(values, key, lattices)
 
     return Unknown({name: texture}, start, named, bound=bound)
 
@@ -128,10 +128,10 @@ def coefficients(mi: Any, kind: str) -> Unknown:
     start = {"z": dr.zeros(mi.TensorXf, deviation.shape)}
     texture["model"] = str(SHIPPED["natural"])
 
-    def shown(values: Any) -> dict[str, Any]:
+    def parameters_of(values: Any) -> dict[str, Any]:
         return {f"{key}.coefficients": values["z"] * scale}
 
-    return Unknown({name: texture}, start, {"z": 0.3}, shown)
+    return Unknown({name: texture}, start, {"z": 0.3}, parameters_of)
 
 
 def fit(mi: Any, scene: Scene, steps: int) -> Row:
@@ -147,15 +147,15 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
         size = (TEXELS, TEXELS)
         result = eg.fit(loss=loss, size=size, space=spaces, iterations=steps, progress=False)
         dr.sync_thread()
-    drawn = eg.render(result.gaussians).numpy()
+    rendering = eg.render(result.gaussians).numpy()
     ends = np.cumsum([grey(name).shape[2] for name in names])[:-1]
-    found = dict(zip(names, np.split(drawn, ends, axis=2), strict=True))
+    maps = dict(zip(names, np.split(rendering, ends, axis=2), strict=True))
     count = sum(array.size for array in result.gaussians.to_arrays().values())
     return {
         "seconds": result.seconds,
         "parameters": count,
         "gaussians": len(result.gaussians),
-        **judge(mi, scene, {name: np.clip(picture, 0, 1) for name, picture in found.items()}),
+        **judge(mi, scene, {name: np.clip(picture, 0, 1) for name, picture in maps.items()}),
     }
 
 
@@ -216,10 +216,10 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
     names = NAMES[scene.kind]
     replayed = photo_loss(loaded, names, photos, spp=scene.spp).function if frozen else None
 
-    def error(shown: Mapping[str, Any], step: int) -> Any:
+    def error(tensors: Mapping[str, Any], step: int) -> Any:
         if replayed:
-            return replayed({name: shown[f"{key}.data"] for name, key in names.items()}, step)
-        parameters.update(shown)
+            return replayed({name: tensors[f"{key}.data"] for name, key in names.items()}, step)
+        parameters.update(tensors)
         camera = step % scene.cameras
         rendered = mi.render(loaded, parameters, sensor=camera, spp=scene.spp, seed=step)
         return dr.mean(dr.square(rendered - photos[camera]), axis=None)
@@ -228,7 +228,7 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
     for step in range(steps):
         rate = LAST_RATE + (1 - LAST_RATE) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
         values.set_learning_rate({key: rate * r for key, r in unknown.rates.items()})
-        dr.backward(error(unknown.shown(values), step))
+        dr.backward(error(unknown.parameters_of(values), step))
         values.step()
         unknown.bound(values)
         if not step:
@@ -236,31 +236,31 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
             started = time.perf_counter()
     dr.sync_thread()
     seconds = time.perf_counter() - started
-    last = unknown.shown(values)
+    last = unknown.parameters_of(values)
     parameters.update(last)
     row = {"seconds": seconds, "parameters": sum(dr.width(v) for v in unknown.start.values())}
     row["psnr_rgb"] = _psnr(_photos(mi, loaded, scene.cameras), scene.photos[scene.cameras :])
     if len(scene.maps) > 1:
-        found = {n: last[f"{key}.data"].numpy() for n, key in NAMES[scene.kind].items()}
-        row |= _judge_maps(scene, found)
+        maps = {n: last[f"{key}.data"].numpy() for n, key in NAMES[scene.kind].items()}
+        row |= _judge_maps(scene, maps)
     return row
 
 
-def judge(mi: Any, scene: Scene, found: Maps) -> Row:
+def judge(mi: Any, scene: Scene, maps: Maps) -> Row:
     """Return psnr_rgb of the cameras that took no photo, and the PSNRs of several maps."""
-    loaded = scene_of(mi, scene.kind, _bitmaps(mi, found), scene.cameras)
+    loaded = scene_of(mi, scene.kind, _bitmaps(mi, maps), scene.cameras)
     views = _photos(mi, loaded, scene.cameras)
     row = {"psnr_rgb": _psnr(views, scene.photos[scene.cameras :])}
-    return row | (_judge_maps(scene, found) if len(scene.maps) > 1 else {})
+    return row | (_judge_maps(scene, maps) if len(scene.maps) > 1 else {})
 
 
-def _judge_maps(scene: Scene, found: Maps) -> Row:
+def _judge_maps(scene: Scene, maps: Maps) -> Row:
     """Return the PSNRs of maps where they are seen, and of the best constant in place of each."""
     row = {}
     for name, true in scene.maps.items():
         mean = np.average(true.reshape(-1, true.shape[2]), axis=0, weights=scene.seen.ravel())
         constant = np.broadcast_to(mean, true.shape)
-        for key, picture in ((name, found[name]), (f"{name}_constant", constant)):
+        for key, picture in ((name, maps[name]), (f"{name}_constant", constant)):
             pair = [np.clip(values, 0, 1) for values in (picture, true)]
             if SPACES[name] == "linear":
                 pair = [to_coded(values) for values in pair]

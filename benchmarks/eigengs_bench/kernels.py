@@ -178,8 +178,8 @@ def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time a refinement, its steps alone, and a round of relocation."""
     photo, method = center_crop(eg.sample("astronaut"), SIDE, SIDE), eg.DEFAULT
     data = data_of(photo, "ycbcr")
-    shown = picture(types, "ycbcr", [photo], [data])
-    objective = replace(Pixels.of(data, "ycbcr", types), pictures=(shown,))
+    display = picture(types, "ycbcr", [photo], [data])
+    objective = replace(Pixels.of(data, "ycbcr", types), pictures=(display,))
     start = method.place_and_solve(objective, COUNT)
     bare = replace(method, controls=())
     moves = [c for c in method.controls if isinstance(c, (Relocate, Perturb))]

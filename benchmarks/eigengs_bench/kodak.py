@@ -70,14 +70,14 @@ def _jobs(
 
 
 def _measure(image: Image, count: int, iterations: int, options: Row) -> Row:
-    found = eg.fit(image, count, iterations, **options)
+    result = eg.fit(image, count, iterations, **options)
     return {
-        "psnr_float": decibels(np.clip(found.image, 0, 1), image, "data"),
-        "psnr_rgb": decibels(found.image, image, "rgb"),
-        "psnr_ycbcr": decibels(found.image, image, "ycbcr"),
-        "ms_ssim": eg.ms_ssim(found.image, image),
-        "seconds": found.seconds,
-        "taken": found.iterations,
+        "psnr_float": decibels(np.clip(result.image, 0, 1), image, "data"),
+        "psnr_rgb": decibels(result.image, image, "rgb"),
+        "psnr_ycbcr": decibels(result.image, image, "ycbcr"),
+        "ms_ssim": eg.ms_ssim(result.image, image),
+        "seconds": result.seconds,
+        "taken": result.iterations,
     }
 
 
@@ -88,13 +88,13 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     """
     usual = {"solve_steps": SOLVE_STEPS}  # rows of fits with the default do not name it
     fits = fr.frame_of([{**row, "job": {**usual, **row["job"]}} for row in rows])
-    photos, known = fits.drop_duplicates([*FIT, "image"]), published()
+    photos, others = fits.drop_duplicates([*FIT, "image"]), published()
     means = photos.groupby(FIT)[["psnr_float", "psnr_rgb", "ms_ssim"]].mean()
     means["seconds"] = fits[fits.timed].groupby(FIT).seconds.median()
     means["photos"] = photos.groupby(FIT).image.nunique()
     ours = means.reset_index().rename(columns={"iterations": "steps"})
     ours["method"], ours["source"] = ours.solve_steps.map(_name), "measured"
-    both = pd.concat([ours, known.assign(photos=24)]).sort_values("gaussians", kind="stable")
+    both = pd.concat([ours, others.assign(photos=24)]).sort_values("gaussians", kind="stable")
     both["where"] = (" (" + both.machine + ")").fillna("")
     lines = [
         (
@@ -111,8 +111,8 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         for line in both.itertuples()
     ]
     table = fr.table(CAPTION, COLUMNS, lines, "all")
-    charts = {"kodak-gaussians": _over_gaussians(photos, known)}
-    return fr.Section([table, _by_counts(both)], charts, _figures(ours, known))
+    charts = {"kodak-gaussians": _over_gaussians(photos, others)}
+    return fr.Section([table, _by_counts(both)], charts, _figures(ours, others))
 
 
 def _by_counts(both: pd.DataFrame) -> fr.Table:
@@ -135,10 +135,12 @@ def _by_counts(both: pd.DataFrame) -> fr.Table:
     return fr.table(caption, ("method", *(f"{n:,}" for n in KODAK_COUNTS)), lines, "quality")
 
 
-def _figures(ours: pd.DataFrame, known: pd.DataFrame) -> dict[str, str]:
+def _figures(ours: pd.DataFrame, others: pd.DataFrame) -> dict[str, str]:
     """Write PSNR and seconds of fits of 1,000 steps, beside the best published of Gaussians."""
     usual = ours[(ours.steps == 1000) & (ours.solve_steps == SOLVE_STEPS)].set_index("gaussians")
-    best = known[~known.method.str.contains("not Gaussians")].groupby("gaussians").psnr_float.max()
+    best = (
+        others[~others.method.str.contains("not Gaussians")].groupby("gaussians").psnr_float.max()
+    )
     figures = {}
     for count in sorted(set(usual.index) & set(best.index)):
         figures[f"psnr_{count}"] = f"{fr.number(usual.psnr_float[count])} dB"
@@ -157,7 +159,7 @@ def _name(depth: int) -> str:
     return "default" if depth == SOLVE_STEPS else f"default, solve_steps={depth}"
 
 
-def _over_gaussians(photos: pd.DataFrame, known: pd.DataFrame) -> Figure:
+def _over_gaussians(photos: pd.DataFrame, others: pd.DataFrame) -> Figure:
     """Draw PSNR over the number of Gaussians: a line a number of steps, a line a method."""
     figure = fr.new_figure(8, 4.6, f"Kodak, {fr.counted(photos.image)}: quality over numbers")
     axis = figure.subplots()
@@ -166,7 +168,7 @@ def _over_gaussians(photos: pd.DataFrame, known: pd.DataFrame) -> Figure:
         points, label = part.groupby("gaussians").psnr_float.mean(), _name(depth)
         label += f", {steps:,} steps"
         axis.plot(points, "o-", ms=5, color=fr.BLUE, alpha=alpha, label=label)
-    styles = zip(OTHERS, MARKERS, known.groupby("method", sort=False), strict=False)
+    styles = zip(OTHERS, MARKERS, others.groupby("method", sort=False), strict=False)
     for color, marker, (name, part) in styles:
         label = name.partition(" (")[0]
         axis.plot(part.gaussians, part.psnr_float, f"{marker}--", ms=5, color=color, label=label)

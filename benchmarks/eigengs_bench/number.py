@@ -31,13 +31,13 @@ def _search(task: Task, image: Image, target: float) -> Row:
     goal = eg.Goal(target, space="ycbcr")
     search = partial(eg.fit, image, target_psnr=goal, backend=task.backend)
     search(iterations=min(WARM_STEPS, task.iterations))  # untimed, to compile
-    found = search(iterations=task.iterations)
-    count = len(found.gaussians)
+    result = search(iterations=task.iterations)
+    count = len(result.gaussians)
     usual = eg.fit(image, count, task.iterations, backend=task.backend)
     return {
         "gaussians": count,
-        **{key: getattr(found, key) for key in ("stopped", "iterations", "seconds")},
-        **{f"psnr_{space}": decibels(found.image, image, space) for space in ("ycbcr", "rgb")},
+        **{key: getattr(result, key) for key in ("stopped", "iterations", "seconds")},
+        **{f"psnr_{space}": decibels(result.image, image, space) for space in ("ycbcr", "rgb")},
         "fit_seconds": usual.seconds,
         "fit_psnr": decibels(usual.image, image, "ycbcr"),
     }

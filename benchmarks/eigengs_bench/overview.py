@@ -80,9 +80,9 @@ def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
             words = f"{count:,} Gaussians" if count == points.index.min() else f"{count:,}"
             at = (point.seconds, point.psnr_float)
             axis.annotate(words, at, (-6, 3), textcoords="offset points", fontsize=7, ha="right")
-    known = published().dropna(subset="seconds")
+    others = published().dropna(subset="seconds")
     marks = zip(
-        known.groupby("method", sort=False), (fr.RED, fr.ORANGE, fr.GREY), "*XP", strict=False
+        others.groupby("method", sort=False), (fr.RED, fr.ORANGE, fr.GREY), "*XP", strict=False
     )
     for (name, part), color, marker in marks:
         method, counts = str(name).partition(" (")[0], ", ".join(f"{n:,}" for n in part.gaussians)

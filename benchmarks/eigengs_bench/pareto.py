@@ -51,8 +51,10 @@ def variants(task: Task, name: str) -> list[Variant]:
 
     The basis is that of the set, which is trained if it is missing, or else the one that ships.
     """
-    count, own = SETS[name].gaussians, is_trained(task, name)
-    basis = model_for(task, name, name, 300) if own else eg.EigenGS.load("natural", task.backend)
+    count, trained = SETS[name].gaussians, is_trained(task, name)
+    basis = (
+        model_for(task, name, name, 300) if trained else eg.EigenGS.load("natural", task.backend)
+    )
     return [
         Variant("preset", "default", count),
         Variant("preset", "gaussianimage", count, METHODS["gaussianimage"]),
@@ -85,9 +87,9 @@ def trace(task: Task, fit: Variant, image: Image) -> Row:
     falls = fit.method.decay < 1
     marks = sorted({n for n in (HORIZONS if falls else MARKS) if n < iterations} | {iterations})
     runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
-    moments = [m for steps, shown in runs for m in descent(image, steps, shown, **options)]
-    found = [score(moment, image) for moment in moments]
-    return {"gaussians": len(moments[-1].gaussians), "trace": found}
+    moments = [m for steps, kept in runs for m in descent(image, steps, kept, **options)]
+    scores = [score(moment, image) for moment in moments]
+    return {"gaussians": len(moments[-1].gaussians), "trace": scores}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -142,8 +144,8 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     From the fastest to the best; of equal points one; no point with NaN is on a front.
     """
     best, kept = -math.inf, []
-    known = [point for point in points if not any(map(math.isnan, point))]
-    for seconds, reached in sorted(known, key=lambda point: (point[0], -point[1])):
+    finite = [point for point in points if not any(map(math.isnan, point))]
+    for seconds, reached in sorted(finite, key=lambda point: (point[0], -point[1])):
         if reached > best:
             best = reached
             kept.append((seconds, reached))

@@ -31,7 +31,7 @@ from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, judge
 from eigengs_bench.images import images_of
 from eigengs_bench.names import PEERS
-from eigengs_bench.rate import BUDGET, CODECS, WARM_UP
+from eigengs_bench.rate import CODECS, WARM_UP, fit_and_pack
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.image.io import save_image, to_8bit
 
@@ -97,24 +97,19 @@ def memory_of(count: int) -> int:
 
 
 def _fit(task: Task, image: Image, count: int, steps: int) -> Row:
-    made = partial(eg.fit, image, count, backend=task.backend)
-    made(iterations=min(WARM_UP, steps))
-    result = made(iterations=steps)
+    fit = partial(eg.fit, image, count, backend=task.backend)
+    fit(iterations=min(WARM_UP, steps))
+    result = fit(iterations=steps)
     memory = {"memory": memory_of(count), "number": count}
     return {"seconds": result.seconds, **memory, **judge(result.image, image)}
 
 
 def _packed(task: Task, image: Image, count: int) -> Row:
-    made = partial(eg.fit, image, count, backend=task.backend)
-    made(iterations=min(WARM_UP, task.iterations))
-    started = time.perf_counter()
-    result = made(iterations=task.iterations)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "fit.egs"
-        size = eg.pack(result.gaussians, path, image, BUDGET).bytes
-        seconds = time.perf_counter() - started
-        shown = eg.picture_of(eg.Gaussians.load(path, task.backend))
-    return {"seconds": seconds, "bytes": size, "number": count, **judge(shown, image)}
+        size, seconds = fit_and_pack(task, image, count, path)
+        picture = eg.picture_of(eg.Gaussians.load(path, task.backend))
+    return {"seconds": seconds, "bytes": size, "number": count, **judge(picture, image)}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -128,8 +123,8 @@ def environment(folder: Path, requirements: Sequence[str]) -> Path:
     `ValueError` with the last words of pip if a package cannot be installed.
     """
     programs, done = folder / ("Scripts" if os.name == "nt" else "bin"), folder / "packages.txt"
-    wanted = "\n".join(requirements)
-    if not done.exists() or done.read_text() != wanted:
+    listed = "\n".join(requirements)
+    if not done.exists() or done.read_text() != listed:
         EnvBuilder(clear=True, with_pip=True).create(folder)
         python = str(programs / "python")
         command = [python, "-m", "pip", "install", "--quiet", *requirements]
@@ -137,7 +132,7 @@ def environment(folder: Path, requirements: Sequence[str]) -> Path:
         if process.returncode:
             words = (process.stderr.strip() or "pip failed").splitlines()[-1]
             raise ValueError(f"{folder}: {' '.join(requirements)} cannot be installed: {words}")
-        done.write_text(wanted)
+        done.write_text(listed)
     return programs
 
 
@@ -160,12 +155,12 @@ def _splatthis(folder: Path, image: Image, count: int, stages: str) -> Row:
         if process.returncode:
             raise ValueError(f"splatthis failed: {(process.stderr or '?').splitlines()[-1]}")
         log = json.loads((here / "log" / "run_manifest.json").read_text())
-        shown = _pixels(preview)
+        picture = _pixels(preview)
         size = drawing.stat().st_size
     figures = {"seconds": log["total_time_sec"], "number": log["final_splat_count"], "bytes": size}
     # What its optimiser sees, before the splats are drawn as those of SVG.
     figures["own_psnr_rgb"] = log["final_metrics"]["psnr_srgb"]
-    return {**figures, "requirements": list(REQUIREMENTS), **judge(shown, image)}
+    return {**figures, "requirements": list(REQUIREMENTS), **judge(picture, image)}
 
 
 def _texels(image: Image, count: int) -> Row:
@@ -185,9 +180,9 @@ def _texels(image: Image, count: int) -> Row:
     texels = np.einsum("ry,yxc,kx->rkc", inverse[0], image, inverse[1], optimize=True)
     texels = np.round(255 * np.clip(texels, 0, 1)) / 255
     seconds = time.perf_counter() - started
-    shown = np.einsum("yr,rkc,xk->yxc", up, texels, across, optimize=True).astype(np.float32)
+    picture = np.einsum("yr,rkc,xk->yxc", up, texels, across, optimize=True).astype(np.float32)
     memory = {"memory": 4 * rows * columns, "number": rows * columns}
-    return {"seconds": seconds, **memory, **judge(shown, image)}
+    return {"seconds": seconds, **memory, **judge(picture, image)}
 
 
 def bilinear(size: int, count: int) -> NDArray[np.float64]:
@@ -217,8 +212,8 @@ def _coded_as_small(packed: Callable[[], Row], image: Image, title: str) -> Row:
     started = time.perf_counter()
     content = encoded(low)
     seconds = time.perf_counter() - started
-    shown = _pixels(io.BytesIO(content))
-    return {"seconds": seconds, "bytes": len(content), "quality": low, **judge(shown, image)}
+    picture = _pixels(io.BytesIO(content))
+    return {"seconds": seconds, "bytes": len(content), "quality": low, **judge(picture, image)}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -232,8 +227,8 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     for name, part in points.groupby("set", sort=False):
         tables.append(_table(str(name), part))
     better = fr.table("What a peer does better", ("peer", "better"), BETTER.items(), "better")
-    known = pd.read_csv(str(files("eigengs_bench") / "published_peers.csv"), dtype=str)
-    gpu = fr.Table("Packages that need a CUDA GPU, by what they publish", known, "published")
+    published = pd.read_csv(str(files("eigengs_bench") / "published_peers.csv"), dtype=str)
+    gpu = fr.Table("Packages that need a CUDA GPU, by what they publish", published, "published")
     return fr.Section([*tables, better._replace(rows=()), gpu._replace(rows=())])
 
 

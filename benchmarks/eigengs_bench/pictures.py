@@ -46,9 +46,9 @@ CELL, LETTERS = 1.8, 0.42  # sides of a picture, and height of the lines around 
 Cell = tuple[str, NDArray[Any]]  # the line below a picture, and the picture: RGB, not clamped
 
 
-def run(task: Task, wanted: Sequence[str]) -> list[Row]:
+def run(task: Task, pictures: Sequence[str]) -> list[Row]:
     """Draw pictures into the folder; by default those whose sets of images are there."""
-    chosen = wanted or [p for p in PICTURES if all(is_present(task, s) for s in NEEDS.get(p, []))]
+    chosen = pictures or [p for p in PICTURES if all(is_present(task, s) for s in NEEDS.get(p, []))]
     functions = (_iterations, _colors, _curves, _tiles, _radii, _split, _cross)
     makers = dict(zip(PICTURES, functions, strict=True))
     return [row for name in chosen for row in makers[name](task)]
@@ -133,11 +133,11 @@ def _radii(task: Task) -> list[Row]:
     """Measure how large Gaussians are, with and without the split by frequency."""
 
     def work(split: bool) -> Row:
-        model, found = model_for(task, CATS, CATS, COMPONENTS, split=split), []
+        model, radii = model_for(task, CATS, CATS, COMPONENTS, split=split), []
         for _, image in images_of(task, CATS):
             *_, last = preset_descent(task, image, model, "eigengs", [task.iterations])
-            found.append(radii_of(last.gaussians).round(3))
-        return {"radii": np.stack(found), "low": model.low}
+            radii.append(radii_of(last.gaussians).round(3))
+        return {"radii": np.stack(radii), "low": model.low}
 
     jobs: list[Job] = [
         (
@@ -180,7 +180,7 @@ def _radii_chart(rows: Sequence[Row]) -> Figure:
 # ---------------------------------------------------------------------------------------------
 
 
-def _drawn(
+def _draw_rows(
     task: Task, file: str, caption: str, make: Callable[[], list[tuple[str, Sequence[Cell]]]]
 ) -> list[Row]:
     """Draw rows of pictures into a file, once; cats have a line of credit."""
@@ -213,7 +213,7 @@ def _iterations(task: Task) -> list[Row]:
         return rows
 
     caption = f"Iterations of every method: {words}, {_size(model)}; PSNR in YCbCr"
-    return _drawn(task, file, caption, make)
+    return _draw_rows(task, file, caption, make)
 
 
 def _colors(task: Task) -> list[Row]:
@@ -235,7 +235,7 @@ def _colors(task: Task) -> list[Row]:
         return rows
 
     caption = f"A photo fitted in YCbCr and in RGB by the method default: {_size(model)}"
-    return _drawn(task, "colors.jpg", caption, make)
+    return _draw_rows(task, "colors.jpg", caption, make)
 
 
 def _tiles(task: Task) -> list[Row]:
@@ -245,15 +245,15 @@ def _tiles(task: Task) -> list[Row]:
         case = CASES["smooth"]._replace(iterations=task.iterations)
         image = case.image()
         middle = (slice(len(image) // 3, 2 * len(image) // 3),) * 2
-        shown, errors = [], []
+        cells, errors = [], []
         for preset in HEADINGS:
             picture = fit_case(case, image, preset, task.backend).image
-            shown.append((f"{preset}: {psnr(picture, image, 'ycbcr'):.1f} dB", picture[middle]))
+            cells.append((f"{preset}: {psnr(picture, image, 'ycbcr'):.1f} dB", picture[middle]))
             errors.append(("", (0.5 + STRETCHED * (picture - image))[middle]))
-        return [("", shown), (f"their errors times {STRETCHED}", errors)]
+        return [("", cells), (f"their errors times {STRETCHED}", errors)]
 
     caption = f"The middle of a slow gradient after {task.iterations:,} steps; PSNR in YCbCr"
-    return _drawn(task, "tiles.png", caption, make)
+    return _draw_rows(task, "tiles.png", caption, make)
 
 
 def _split(task: Task) -> list[Row]:
@@ -278,7 +278,7 @@ def _split(task: Task) -> list[Row]:
         return [("", top), ("", bottom)]
 
     caption = "A cat encoded by a model with the frequency-aware split, and outlines of Gaussians"
-    return _drawn(task, "cats-split.png", caption, make)
+    return _draw_rows(task, "cats-split.png", caption, make)
 
 
 def _cross(task: Task) -> list[Row]:
@@ -294,13 +294,13 @@ def _cross(task: Task) -> list[Row]:
         for _, image in images_of(task, CATS, 3):
             cells: list[Cell] = [("photo", image)]
             for words, model in bases.items():
-                shown = picture_of(model.encode(image, "projected"))
-                cells.append((f"{words}: {psnr(shown, image, 'ycbcr'):.1f} dB", shown))
+                projected = picture_of(model.encode(image, "projected"))
+                cells.append((f"{words}: {psnr(projected, image, 'ycbcr'):.1f} dB", projected))
             rows.append(("", cells))
         return rows
 
     caption = "Cats at iteration 0: projected on bases of cats, of ImageNet, and the one that ships"
-    return _drawn(task, "cats-cross.png", caption, make)
+    return _draw_rows(task, "cats-cross.png", caption, make)
 
 
 def _cell_of(moment: Moment, image: Image) -> Cell:
@@ -324,8 +324,8 @@ def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.
 
 def strip(rows: Sequence[tuple[str, Sequence[Cell]]], credit: str = "") -> Figure:
     """Put rows of pictures below each other, each below its heading."""
-    most = max(len(cells) for _, cells in rows)
-    figure = fr.new_figure(CELL * most, (CELL + LETTERS) * len(rows))
+    columns = max(len(cells) for _, cells in rows)
+    figure = fr.new_figure(CELL * columns, (CELL + LETTERS) * len(rows))
     figure.supxlabel(credit, fontsize=7)
     parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, (heading, cells) in zip(parts, rows, strict=True):

@@ -101,30 +101,30 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
     inside = 1.0 * (picture(mi, {"type": "rgb", "value": SKY / 2})[..., 0] < 0.75 * SKY)
 
     def psnr(texture: dict[str, Any]) -> float:
-        shown = picture(mi, texture)
+        rendering = picture(mi, texture)
         if poster.space == "data":
-            return eg.psnr(shown, goal, "data", weight=inside)
-        return eg.psnr(to_coded(shown), to_coded(goal), "rgb", weight=inside)
+            return eg.psnr(rendering, goal, "data", weight=inside)
+        return eg.psnr(to_coded(rendering), to_coded(goal), "rgb", weight=inside)
 
     side = _smallest_side(lambda n: psnr(bitmap(mi, resample(poster.image, n, n))) >= poster.goal)
     small = bitmap(mi, resample(poster.image, side, side))
-    found: Row = {"kind": poster.kind, "side": side, "psnr_bitmap": psnr(small)}
+    row: Row = {"kind": poster.kind, "side": side, "psnr_bitmap": psnr(small)}
     small = bitmap(mi, resample(poster.image, side, side))
-    found["bitmap_bytes"] = resident_bytes(mi.load_dict(small))
-    scene, wanted = scene_of(mi, bitmap(mi, poster.image)), poster.goal
+    row["bitmap_bytes"] = resident_bytes(mi.load_dict(small))
+    scene, target_psnr = scene_of(mi, bitmap(mi, poster.image)), poster.goal
     with TemporaryDirectory() as folder:
         file = {"type": "gaussian_texture", "filename": f"{folder}/poster.npz"}
         for _ in range(TRIES):
-            fit = eg.fit_for_scene(scene, SLOT, poster.image, wanted, poster.space)
+            fit = eg.fit_for_scene(scene, SLOT, poster.image, target_psnr, poster.space)
             fit.gaussians.save(file["filename"])
-            found |= {"gaussians": len(fit.gaussians), "psnr": psnr(file)}
-            if found["psnr"] >= poster.goal:
+            row |= {"gaussians": len(fit.gaussians), "psnr": psnr(file)}
+            if row["psnr"] >= poster.goal:
                 break
-            wanted += poster.goal - found["psnr"] + 0.05
-        found["bytes"] = resident_bytes(mi.load_dict(file))
-        found["filtered_bytes"] = resident_bytes(mi.load_dict(file | {"prefilter": 1e-3}))
-    found["ratio"] = found["bytes"] / found["bitmap_bytes"]
-    return found | {"ratio_floats": found["ratio"] / 4}
+            target_psnr += poster.goal - row["psnr"] + 0.05
+        row["bytes"] = resident_bytes(mi.load_dict(file))
+        row["filtered_bytes"] = resident_bytes(mi.load_dict(file | {"prefilter": 1e-3}))
+    row["ratio"] = row["bytes"] / row["bitmap_bytes"]
+    return row | {"ratio_floats": row["ratio"] / 4}
 
 
 def _smallest_side(suffices: Callable[[int], bool]) -> int:

@@ -94,20 +94,25 @@ def _jobs(task: Task, name: str, images: list[tuple[str, Image]]) -> Iterator[Jo
             yield {**about, "codec": title}, partial(_coded, image, codec)
 
 
-def _packed(task: Task, image: Image, count: int) -> Row:
-    made = partial(eg.fit, image, count, backend=task.backend)
-    made(iterations=min(WARM_UP, task.iterations))
+def fit_and_pack(task: Task, image: Image, count: int, path: Path) -> tuple[int, float]:
+    """Write a packed fit; return its bytes and the seconds, after a short fit that compiles."""
+    fit = partial(eg.fit, image, count, backend=task.backend)
+    fit(iterations=min(WARM_UP, task.iterations))
     started = time.perf_counter()
-    fitted = made(iterations=task.iterations)
+    result = fit(iterations=task.iterations)
+    size = eg.pack(result.gaussians, path, image, BUDGET).bytes
+    return size, time.perf_counter() - started
+
+
+def _packed(task: Task, image: Image, count: int) -> Row:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "fit.egs"
-        receipt = eg.pack(fitted.gaussians, path, image, BUDGET)
-        seconds = {"seconds": time.perf_counter() - started}
+        size, seconds = fit_and_pack(task, image, count, path)
         eg.picture_of(eg.Gaussians.load(path, task.backend))  # compiles
-        loaded = time.perf_counter()
-        shown = eg.picture_of(eg.Gaussians.load(path, task.backend))
-        seconds["decode_seconds"] = time.perf_counter() - loaded
-    return {"points": [_point(count, receipt.bytes, shown, image) | seconds]}
+        started = time.perf_counter()
+        picture = eg.picture_of(eg.Gaussians.load(path, task.backend))
+        times = {"seconds": seconds, "decode_seconds": time.perf_counter() - started}
+    return {"points": [_point(count, size, picture, image) | times]}
 
 
 def _coded(image: Image, codec: Codec) -> Row:
@@ -119,14 +124,14 @@ def _coded(image: Image, codec: Codec) -> Row:
         coded = time.perf_counter()
         pixels = np.asarray(pillow.open(file).convert("RGB"))
         seconds = {"seconds": coded - started, "decode_seconds": time.perf_counter() - coded}
-        shown = pixels.astype(np.float32) / 255
-        points.append(_point(setting, len(file.getvalue()), shown, image) | seconds)
+        picture = pixels.astype(np.float32) / 255
+        points.append(_point(setting, len(file.getvalue()), picture, image) | seconds)
     return {"points": points}
 
 
-def _point(setting: int, size: int, shown: NDArray[Any], image: Image) -> Row:
+def _point(setting: int, size: int, picture: NDArray[Any], image: Image) -> Row:
     bits = 8 * size / (image.shape[0] * image.shape[1])
-    return {"setting": setting, "bytes": size, "bits_per_pixel": bits, **judge(shown, image)}
+    return {"setting": setting, "bytes": size, "bits_per_pixel": bits, **judge(picture, image)}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -147,26 +152,26 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 
 def rates(points: pd.DataFrame, level: float) -> pd.DataFrame:
     """Interpolate bits a pixel at a PSNR: a line an image that all codecs reach it on."""
-    found = {
+    bits = {
         key: fr.smallest(dict(zip(part.bits_per_pixel, part.psnr_rgb, strict=True)), level)
         for key, part in points.groupby(["image", "codec"], sort=False)
     }
-    return pd.Series(found).unstack().dropna()
+    return pd.Series(bits).unstack().dropna()
 
 
 def _table(name: str, points: pd.DataFrame) -> fr.Table:
-    found = [rates(points, level) for level in LEVELS]
+    by_level = [rates(points, level) for level in LEVELS]
     lines = [
         (
             codec,
-            *(fr.mean(sizes[codec], 2) for sizes in found),
+            *(fr.mean(sizes[codec], 2) for sizes in by_level),
             _saved(points, codec),
             fr.median(part.seconds),
             fr.median(part.decode_seconds, 3),
         )
         for codec, part in points.groupby("codec", sort=False)
     ]
-    reached = (str(len(sizes)) for sizes in found)
+    reached = (str(len(sizes)) for sizes in by_level)
     lines.append(("images that all reach", *reached, *[fr.MISSING] * 3))
     caption = (
         f"{name}, {fr.counted(points.image)}: bits a pixel for a PSNR in 8-bit RGB, interpolated; "
@@ -232,7 +237,7 @@ def at_equal_slope(points: pd.DataFrame) -> pd.DataFrame:
 
 def _published(points: pd.DataFrame) -> fr.Table:
     """Lay out the BD-rate of the means of ours and of the codecs against published means."""
-    known = pd.read_csv(str(files("eigengs_bench") / "published_rate.csv"))
+    published = pd.read_csv(str(files("eigengs_bench") / "published_rate.csv"))
     here = {"source": "measured here, at equal slope"}
     measured = {
         name: at_equal_slope(part).assign(**here)
@@ -240,7 +245,7 @@ def _published(points: pd.DataFrame) -> fr.Table:
     }
     lines = [
         (name, f"{100 * bd_rate(measured[OURS], part):+.0f} %", part.source.iloc[0])
-        for name, part in [*known.groupby("method", sort=False), *measured.items()]
+        for name, part in [*published.groupby("method", sort=False), *measured.items()]
         if name != OURS
     ]
     caption = (

@@ -204,7 +204,7 @@ STYLE: Any = {
 }
 
 
-def drawn(figure: Figure, kind: str = "svg") -> bytes:
+def chart_file(figure: Figure, kind: str = "svg") -> bytes:
     """Return the file of a chart, "svg", "png" or "pdf"; letters of an SVG file stay text."""
     undated: Any = {"Date": None} if kind == "svg" else None
     with rc_context(STYLE), BytesIO() as file:
@@ -221,7 +221,7 @@ def _short(tag: re.Match[bytes]) -> bytes:
 
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a chart as .svg, .png or .pdf, whole or not at all."""
-    content = drawn(figure, path.suffix[1:])
+    content = chart_file(figure, path.suffix[1:])
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
 

@@ -48,24 +48,24 @@ class Task(NamedTuple):
         `ValueError` if the file of rows is damaged, or of another machine or other versions.
         """
         path = self.folder / FILE
-        known = {_key(row["bench"], row["job"]): row for row in read(path)}
-        for row in known.values():
+        measured = {_key(row["bench"], row["job"]): row for row in read(path)}
+        for row in measured.values():
             if _machine(row["run"]) != _machine(self.run):
                 raise ValueError(
                     f"{path}: was measured on another machine or with other versions "
                     f"({row['run'].get('cpu')}); write to another folder, or delete the file"
                 )
-        wanted, rows = list(jobs), []
-        for done, (name, work) in enumerate(wanted):
-            self.progress(label or bench, done, len(wanted))
+        named, rows = list(jobs), []
+        for done, (name, work) in enumerate(named):
+            self.progress(label or bench, done, len(named))
             key = _key(bench, name)
-            if key not in known:
+            if key not in measured:
                 now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
                 row = {"bench": bench, "job": name, **work(), "run": {"date": now, **self.run}}
-                known[key] = plain(row)
-                _append(path, known[key])
-            rows.append(known[key])
-        self.progress(label or bench, len(wanted), len(wanted))
+                measured[key] = plain(row)
+                _append(path, measured[key])
+            rows.append(measured[key])
+        self.progress(label or bench, len(named), len(named))
         return rows
 
 
@@ -74,7 +74,7 @@ def read(path: Path, bench: str = "") -> list[Row]:
 
     An incomplete last line does not count.
     """
-    found = []
+    rows = []
     lines = path.read_text("utf-8", "replace").split("\n")[:-1] if path.exists() else []
     for number, line in enumerate(lines, 1):
         try:
@@ -82,11 +82,11 @@ def read(path: Path, bench: str = "") -> list[Row]:
             if not isinstance(row["job"], dict) or not isinstance(row["run"], dict):
                 raise TypeError
             if bench in ("", row["bench"]):
-                found.append(row)
+                rows.append(row)
         except (ValueError, KeyError, TypeError):
             message = f"{path}: line {number} is not a measurement; delete that line"
             raise ValueError(message) from None
-    return found
+    return rows
 
 
 def record(path: Path, rows: Iterable[Row]) -> None:
@@ -94,15 +94,15 @@ def record(path: Path, rows: Iterable[Row]) -> None:
 
     A measurement that is made anew each time, "at" some second, has one row there.
     """
-    known = {_key(row["bench"], row["job"]): row for row in read(path)}
+    kept_rows = {_key(row["bench"], row["job"]): row for row in read(path)}
     for row in rows:
         job = {k: v for k, v in row["job"].items() if k != "at"}
         kept = {k: v for k, v in row["run"]["versions"].items() if v and not k.endswith("_path")}
         run = {k: row["run"][k] for k in RECORDED} | {"versions": kept}
         text = json.dumps(row | {"run": run})
         rounded = json.loads(text, parse_float=lambda number: float(f"{float(number):.5g}"))
-        known[_key(row["bench"], job)] = rounded | {"job": job}
-    lines = map(json.dumps, known.values())
+        kept_rows[_key(row["bench"], job)] = rounded | {"job": job}
+    lines = map(json.dumps, kept_rows.values())
     with atomic_write(path) as temporary:
         temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 

@@ -77,10 +77,10 @@ def _jobs(task: Task, parts: Sequence[str], max_side: int) -> Iterator[Job]:
     for part in parts:
         for case in CASES[part]:
             if max(case.width, case.height) <= max_side:
-                most = min(
+                max_steps = min(
                     MORE_STEPS * task.iterations, PIXELS_IN_ALL // (case.width * case.height)
                 )
-                steps = FIT_STEPS if part == "small" else max(task.iterations, most)
+                steps = FIT_STEPS if part == "small" else max(task.iterations, max_steps)
                 work = measure_fits if part == "small" else measure_descent
                 title = f"{case.width}x{case.height}, {case.gaussians:,} Gaussians"
                 job = {"part": part, **case._asdict(), "iterations": steps}
@@ -217,15 +217,15 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     tables, charts = [], {}
     for name, part in frame.groupby("part", sort=False):
         caption = CAPTIONS[str(name)]
-        shown = RATES if name == "small" else FIGURES
+        figures = RATES if name == "small" else FIGURES
         if name != "small":
             x = "pixels" if name == "pixels" else "gaussians"
             line = "equal density of Gaussians" if name == "pixels" else part["size"]
             part = part.assign(line=line)
             charts[f"scaling-{name}"] = _chart(part, x)
-        columns = {title: (column, fr.median) for title, column in shown.items()}
-        found = fr.grouped(caption, part, ["size", "Gaussians"], columns)
-        tables.append(found._replace(name=str(name)))
+        columns = {title: (column, fr.median) for title, column in figures.items()}
+        grouped = fr.grouped(caption, part, ["size", "Gaussians"], columns)
+        tables.append(grouped._replace(name=str(name)))
     return fr.Section(tables, charts)
 
 

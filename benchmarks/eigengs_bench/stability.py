@@ -31,8 +31,8 @@ def _jobs(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> Iterator
     for case, name in product(cases, presets):
         job = {"case": case.name, "preset": name, "iterations": case.iterations}
         for seed in case.seeds:
-            shown = {"seed": seed} if len(case.seeds) > 1 else {}
-            yield {**job, **shown}, partial(measure_cell, case, name, task.backend, seed)
+            seeded = {"seed": seed} if len(case.seeds) > 1 else {}
+            yield {**job, **seeded}, partial(measure_cell, case, name, task.backend, seed)
 
 
 def measure_cell(case: Case, name: str, backend: str | None, seed: int = 0) -> Row:
@@ -45,13 +45,13 @@ def measure_cell(case: Case, name: str, backend: str | None, seed: int = 0) -> R
     image = case.image()
     if needs := _needs(case, image, name, backend):
         return {"needs": needs}
-    found = fit_case(case, image, name, backend, seed)
-    reached = [row["psnr_ycbcr"] for row in found.trace]
-    values = [found.image, *found.gaussians.to_arrays().values()]
+    result = fit_case(case, image, name, backend, seed)
+    reached = [row["psnr_ycbcr"] for row in result.trace]
+    values = [result.image, *result.gaussians.to_arrays().values()]
     return {
         "finite": not np.isnan(reached).any() and all(np.isfinite(v).all() for v in values),
-        "gaussians": len(found.gaussians),
-        "seconds": found.seconds,
+        "gaussians": len(result.gaussians),
+        "seconds": result.seconds,
         "start_ycbcr": min(reached[0], MAX_PSNR),
         "end_ycbcr": min(reached[-1], MAX_PSNR),
     }
@@ -63,9 +63,9 @@ def _needs(case: Case, image: Image, name: str, backend: str | None) -> str:
         return ""
     if case.place is not None or case.space is not None:
         return "a basis of the case"
-    most = image.shape[0] * image.shape[1]
-    fits = len(eg.EigenGS.load(BASIS, backend).gaussians) <= most
-    return "" if fits else f"a basis with at most {most} Gaussians"
+    pixels = image.shape[0] * image.shape[1]
+    fits = len(eg.EigenGS.load(BASIS, backend).gaussians) <= pixels
+    return "" if fits else f"a basis with at most {pixels} Gaussians"
 
 
 def fit_case(
@@ -175,8 +175,8 @@ def _ends(rows: list[Row]) -> str:
 
 
 def _seconds(rows: list[Row]) -> str:
-    known = [row["seconds"] for row in rows if "seconds" in row]
-    return fr.number(float(np.median(known)) if known else None)
+    seconds = [row["seconds"] for row in rows if "seconds" in row]
+    return fr.number(float(np.median(seconds)) if seconds else None)
 
 
 def _decibels(value: float) -> str:

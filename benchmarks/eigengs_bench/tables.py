@@ -40,28 +40,28 @@ class Method(NamedTuple):
 
 def methods(name: str, table: str, sources: Sequence[str]) -> list[Method]:
     """List the methods that a table compares on a set; `sources` are the sets with a basis."""
-    own = [name] if name in sources else []
+    trained = [name] if name in sources else []
     lent = [LENT[name]] if LENT.get(name) in sources else []
     universal = [NATURAL] if NATURAL in sources and name != NATURAL else []
     plain, count = [Method("gaussianimage")], COMPONENTS[0]
     if table == "ablation":
         pairs = [(color, split) for color in ("ycbcr", "rgb") for split in ("split", "whole")]
-        return [Method("eigengs", name, count, *pair) for _ in own for pair in pairs]
+        return [Method("eigengs", name, count, *pair) for _ in trained for pair in pairs]
     if table == "cross":
         others = [Method("eigengs", source, count) for source in lent + universal]
         return plain + others if others else []
-    bases = [Method("eigengs", source, k) for source in own + universal for k in COMPONENTS]
+    bases = [Method("eigengs", source, k) for source in trained + universal for k in COMPONENTS]
     return [*plain, Method("default"), *bases]
 
 
 def run(task: Task, names: Sequence[str], tables: Sequence[str]) -> list[Row]:
     """Measure what tables need on sets, image by image, the methods in turn."""
-    found, sources = list[Row](), [name for name in SETS if is_trained(task, name)]
+    rows, sources = list[Row](), [name for name in SETS if is_trained(task, name)]
     for name in names:
-        wanted = [m for table in tables or TABLES for m in methods(name, table, sources)]
-        jobs = list(_jobs(task, name, list(dict.fromkeys(wanted))))
-        found += task.measure("tables", jobs, name)
-    return found
+        compared = [m for table in tables or TABLES for m in methods(name, table, sources)]
+        jobs = list(_jobs(task, name, list(dict.fromkeys(compared))))
+        rows += task.measure("tables", jobs, name)
+    return rows
 
 
 def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:

@@ -283,7 +283,7 @@ def _change(mi: Any, texture: Any, name: str) -> Any:
 
 def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None) -> Row:
     """Measure what textures of files hold in memory, and how long their first lookup takes."""
-    found: Row = {}
+    row: Row = {}
     for done, count in enumerate(HELD):
         side = round(math.sqrt(PIXELS * count))
         picture = resample(eg.sample("coffee")[:400, 100:500], side, side)
@@ -293,11 +293,11 @@ def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None)
             for name, given in ((str(count), 0.0), (f"filtered_{count}", angle)):
                 firsts = [_first_lookup(mi, path, given) for _ in range(4)]
                 bytes_held = firsts[0][0]
-                found[f"bytes_{name}"] = bytes_held
-                found[f"held_{name}"] = bytes_held / sum(sizes_of(path).values())
-                found[f"first_{name}_ms"] = 1e3 * median(s for _, s in firsts[1:])  # compiled
+                row[f"bytes_{name}"] = bytes_held
+                row[f"held_{name}"] = bytes_held / sum(sizes_of(path).values())
+                row[f"first_{name}_ms"] = 1e3 * median(s for _, s in firsts[1:])  # compiled
         progress("files", done + 1, len(HELD))
-    return found
+    return row
 
 
 def _first_lookup(mi: Any, path: Path, angle: float) -> tuple[int, float]:
