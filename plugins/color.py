@@ -220,12 +220,12 @@ def slope_of(texture: Texture, value: Float) -> Float:
 
 
 def luminance(color: list) -> Float:
-    """Return the luminance of three channels, or the one channel there is."""
+    """Return the luminance of three channels, or the single channel."""
     return color[0] if len(color) == 1 else mi.luminance(mi.Color3f(*color))
 
 
 def brightness(texture: Texture, color: list) -> Float:
-    """Return what the texture reflects or emits in the mean: of wavelengths, where it has spectra.
+    """Return the mean that the texture reflects or emits: over wavelengths, where it has spectra.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """The footprint of a pixel on a texture: the cone of the pixel, cut by the surface.
 
-Mitsuba 3.10 finds the footprints of what the camera sees directly; else the angle of a pixel does.
+Mitsuba 3.10 gives footprints where the camera sees directly; elsewhere the angle of a pixel does.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def footprint_inputs() -> tuple[str, ...]:
 
 
 def seen_metric(si: Interaction, inverse: tuple, angle: Float | None) -> tuple[list, Bool]:
-    """Return the metric of the renderer's footprint, or where there is none, of the cone's.
+    """Return the metric of the renderer's footprint, or of the cone's where there is none.
 
     Parameters
     ----------

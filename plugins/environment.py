@@ -46,7 +46,7 @@ def environment_of(gaussians: Gaussians | Fitted, **properties: object) -> Recor
 
 
 def texels_of(parameters: mi.SceneParameters, key: str, picture: Tensor) -> Tensor:
-    """Return a picture as the texels of a parameter: those of an ``envmap`` have more columns.
+    """Return a picture as the texels of a parameter; an ``envmap`` has extra columns.
 
     Parameters
     ----------
@@ -58,7 +58,8 @@ def texels_of(parameters: mi.SceneParameters, key: str, picture: Tensor) -> Tens
     Returns
     -------
     TensorXf
-        Differentiable. Of an ``envmap``, light from 0, and the columns beyond the seam.
+        Differentiable. For an ``envmap``, light is clamped at 0, and columns beyond the seam are
+        added.
     """
     node = parameters.properties[key][2]
     if not isinstance(node, mi.Emitter):

@@ -1,6 +1,6 @@
 """What lookups of ``gaussian_texture`` read, and the lookups: at a point, or over a footprint.
 
-A material that asks twice about a point pays once. A BSDF looks its textures up in its evaluation
+A material that looks a point up twice pays once. A BSDF looks its textures up in its evaluation
 and again in its sampling, often in one recorded program. Dr.Jit merges equal gathers of a bitmap,
 but not equal loops. Textures of the maps of one file share a table, so they share lookups too:
 the weights of the Gaussians are summed once for all channels.
@@ -50,7 +50,7 @@ class Lists:
     sizes : SizeClasses or None
         The Gaussians near every footprint; None without a prefilter.
     finest : TileLists or None
-        Those of the finest level of the pyramid; None where nobody has changed parameters.
+        Those of the finest level of the pyramid; None while no parameter has changed.
     """
 
     cells: CellLists
@@ -265,7 +265,7 @@ def sum_over_footprint(
     unit, blind = bound_covariance(inverse)
     squares = (sx * sx, sx * sy, sy * sy)
     footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, squares, strict=True)]
-    # Of a clamped image, the mean is nowhere seen: the largest footprint has its border too.
+    # A clamped image never shows its mean: the largest footprint includes its border too.
     blind &= valid & (sizes.wrap != "clamp")
     distant = is_minified(pyramid, footprint)
     near, wide = active & ~distant, active & distant & ~blind

@@ -229,7 +229,7 @@ class TextureParameters:
     Attributes
     ----------
     start : Gaussians
-        Those of a model at its mean, or a set like that of the texture, from `without_arrays`.
+        The set of a model at its mean, or a set like that of the texture, from `without_arrays`.
     read : dict of str to TensorXf
         The parameters at the start.
     tensors : dict of str to TensorXf
@@ -248,7 +248,7 @@ class TextureParameters:
     part: slice = field(default_factory=lambda: slice(None))
 
     def __post_init__(self) -> None:
-        # Own objects, so that each texture has its own gradient, of one memory.
+        # Separate objects on shared memory, so that each texture has its own gradient.
         self.tensors = {name: type(t)(t) for name, t in self.read.items()}
 
     @property
@@ -257,7 +257,7 @@ class TextureParameters:
         return int(self.tensors["mean"].shape[0]) if "mean" in self.tensors else len(self.start)
 
     def is_that_of_file(self) -> bool:
-        """Return whether the parameters have the memory of the file: nobody has changed them."""
+        """Return whether the parameters share the memory of the file: they have not changed."""
         unchanged = (t.array.index == self.read[k].array.index for k, t in self.tensors.items())
         return not dr.grad_enabled(self.tensors) and all(unchanged)
 
@@ -341,7 +341,7 @@ def derived(inputs: Arrays, compute: Callable[[Arrays], Arrays]) -> Arrays:
 
 
 class _Derived(dr.CustomOp):
-    """The operation of `derived`: it keeps the graph of its own and walks it in both modes."""
+    """The operation of `derived`: it keeps its own graph and walks it in both modes."""
 
     def eval(self, inputs: Arrays, compute: Callable[[Arrays], Arrays]) -> Arrays:
         """Compute the arrays; `inputs` come without their derivatives."""

@@ -94,7 +94,7 @@ def plugin_of_sums(base: type) -> Any:
             else:
                 lists = self.table.lists
             table = make_table(lists, self.cutoff, source.tensors, source.decode)
-            # Who has changed parameters once may change colours next, and needs all lists again.
+            # A texture that has changed may change its colours next, and needs all lists again.
             self.table = table if self.changed else replace(table, lists=lists)
             self.part = slice(None)
 
@@ -119,7 +119,7 @@ def plugin_of_sums(base: type) -> Any:
             return self.follows or self.sensor is not None or self.angle > 0
 
         def pixel(self) -> Float | None:
-            """Return the angle of a pixel; None if rays alone know it."""
+            """Return the angle of a pixel; None if only rays know it."""
             if self.sensor is not None:
                 return current_angle(self.sensor)
             return self.prefilter if self.angle else None

@@ -1,8 +1,8 @@
-"""What recovers textures from photos: texels, a pyramid of texels, Gaussians, coefficients.
+"""Recovery of textures from photos by texels, a pyramid of texels, Gaussians or coefficients.
 
-A step renders one camera by a few samples a pixel. PSNRs are of pictures by cameras that took no
-photo, and of the maps of a material. The parameters of a pyramid are differences of texels to the
-next coarser level (Weier et al. 2025, doi 10.1145/3730855), so coarse ones move many texels.
+A step renders one camera with a few samples per pixel. PSNRs are those of pictures by cameras that
+took no photo, and of the maps of a material. The parameters of a pyramid are differences of texels
+to the next coarser level (Weier et al. 2025, doi 10.1145/3730855), so coarse ones move many texels.
 """
 
 import gc
@@ -48,7 +48,7 @@ Maps = Mapping[str, Image]
 
 
 class Scene(NamedTuple):
-    """What is to be recovered: maps in linear light or data, by photos of some cameras."""
+    """What is to be recovered: maps of linear light or data, from photos of some cameras."""
 
     kind: str
     cameras: int
@@ -59,7 +59,7 @@ class Scene(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Textures; values to optimise, by their rates; the parameters of a scene that they make."""
+    """Textures, the values to optimise with their rates, and the parameters they set in a scene."""
 
     textures: dict[str, dict[str, Any]]
     start: dict[str, Any]
@@ -135,7 +135,7 @@ def coefficients(mi: Any, kind: str) -> Unknown:
 
 
 def fit(mi: Any, scene: Scene, steps: int) -> Row:
-    """Recover maps by `eg.fit` of a `photo_loss`; the second of two runs has compiled kernels."""
+    """Recover maps by `eg.fit` of a `photo_loss`; the second run counts, after compilation."""
     from eigengs_dr.plugins import photo_loss
 
     names = NAMES[scene.kind]
@@ -207,7 +207,7 @@ def recover(mi: Any, scene: Scene, method: str, steps: int) -> Row:
 
 
 def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = False) -> Row:
-    """Descend by Adam; the seconds are without the first steps, which compile and record."""
+    """Descend by Adam; the seconds leave out the first step, which compiles and records."""
     from eigengs_dr.plugins import photo_loss
 
     loaded = scene_of(mi, scene.kind, unknown.textures, scene.cameras)
@@ -275,7 +275,7 @@ def _psnr(pictures: Sequence[Image], photos: Sequence[Image]) -> float:
 
 
 def maps_of(kind: str) -> Maps:
-    """Return the maps of a scene: photos in linear light; of one, the grey as roughness."""
+    """Return the maps of a scene: photos in linear light, and the grey of one as roughness."""
     maps = {}
     for name, photo in PHOTOS[kind].items():
         codes = np.clip(center_crop(eg.sample(photo), TEXELS, TEXELS), 0, 1)
@@ -317,7 +317,7 @@ def _bitmaps(mi: Any, maps: Maps) -> dict[str, dict[str, Any]]:
 
 
 def scene_of(mi: Any, kind: str, textures: Mapping[str, dict[str, Any]], count: int) -> Any:
-    """Load a poster or a ball over a floor, under a lamp and the sky; judges look from between."""
+    """Load a poster or a ball on a floor, under a lamp and the sky; judges are between cameras."""
     at, box = mi.ScalarTransform4f(), {"type": "box"}
     film = {"type": "hdrfilm", "pixel_format": "rgb", "width": SIDE, "height": SIDE, "rfilter": box}
     scene = {"type": "scene", "integrator": {"type": "prb", "max_depth": 3}}
@@ -392,8 +392,8 @@ def gain(
 ) -> list[float]:
     """Return the decibels of each fit above a pyramid at equal seconds.
 
-    Between two descents of the pyramid, its PSNR is linear in the logarithm of the seconds; outside
-    of them it is that of the nearest.
+    Between two descents of the pyramid, its PSNR is linear in the logarithm of the seconds; beyond
+    them it is that of the nearest.
     """
     curve = sorted((row["seconds"], row[key]) for row in methods[rival].values())
     seconds, psnr = zip(*curve, strict=True)
@@ -404,7 +404,7 @@ def gain(
 
 
 def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
-    """Put the gains of a scene and its cameras on one line a pyramid, a column a descent."""
+    """Lay out the gains of a scene and its cameras: a line per pyramid, a column per descent."""
     descents = [*((steps, SPP) for steps in STEPS), *((NOISY_STEPS, spp) for spp in NOISES)]
     cells: dict[tuple[str, int, str], dict[tuple[int, int], str]] = {}
     for (scene, cameras, spp), methods in curves.items():
@@ -447,7 +447,7 @@ def _materials(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table
 
 
 def _chart(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Figure:
-    """Draw PSNR over seconds, a part for each scene and number of cameras."""
+    """Draw PSNR over seconds, a panel for each scene and number of cameras."""
     cases = [case for case in curves if len(next(iter(curves[case].values()))) > 1]
     lines = max(1, math.ceil(len(cases) / 2))
     figure = fr.new_figure(8, 1 + 2.1 * lines, "Textures recovered from photos")

@@ -15,7 +15,7 @@ from eigengs_bench.rows import Job, Row, Task
 
 
 def run(task: Task, names: Sequence[str], targets: Sequence[float]) -> list[Row]:
-    """Search on every image of some sets for the number of Gaussians of every target."""
+    """Search for the number of Gaussians for every target, on every image of some sets."""
     return task.measure("number", list(_jobs(task, names, targets)))
 
 
@@ -54,7 +54,7 @@ COLUMNS = {
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out how many Gaussians a PSNR takes: a table a set."""
+    """Lay out how many Gaussians a PSNR takes: a table per set."""
     tables, points = [], fr.frame_of(rows)
     points["met"] = points.stopped == "met"
     points["ratio"] = points.seconds / points.fit_seconds

@@ -9,8 +9,8 @@ A page has marks, which are comments of HTML and do not show::
 In a sentence it is ``<!-- figure: kernels.peak -->6.3<!-- end -->``, not at the start of a line. A
 page shows a chart as a picture in ``docs/images/measured/``.
 
-Rows of "once" hold tables that no question of today makes: their caption, columns and lines. If
-nobody wrote down the commit of a run, theirs is the one with which the figures came into a page.
+Rows of "once" hold tables that no current question produces: their caption, columns and lines.
+Where the commit of a run was not recorded, it is the one that brought the figures into a page.
 """
 
 import re
@@ -39,9 +39,9 @@ def pages_of(checkout: Path) -> list[Path]:
 
 
 def outdated(checkout: Path) -> dict[Path, bytes]:
-    """Return the pages and charts that differ from what the rows give, with what they should hold.
+    """Return the pages and charts that are out of date, with what they should hold.
 
-    A chart that another version of matplotlib has drawn counts as right. `ValueError` if a page
+    A chart drawn by another version of matplotlib counts as up to date. `ValueError` if a page
     names a table, a figure or a chart that no row holds.
     """
     parts, charts = contents(checkout / ROWS)
@@ -65,7 +65,7 @@ def _is_right(path: Path, content: bytes) -> bool:
 
 
 def write(checkout: Path) -> list[Path]:
-    """Write the pages and charts that differ from what the rows give, and return their paths."""
+    """Write the pages and charts that are out of date, and return their paths."""
     changed = outdated(checkout)
     (checkout / CHARTS).mkdir(parents=True, exist_ok=True)
     for path, content in changed.items():
@@ -94,7 +94,7 @@ def filled(text: str, parts: Mapping[str, str], name: str) -> str:
 
 
 def contents(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Return what a page can name, in Markdown, by its mark; and the charts by their names."""
+    """Return the Markdown for each mark that a page can hold, and the charts by their names."""
     rows: dict[str, list[Row]] = {}
     for row in read(path):
         rows.setdefault(row["bench"], []).append(row)
@@ -111,7 +111,7 @@ def contents(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
 
 
 def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
-    """Lay out the rows of "once"; rows of one table are parts of it, of several runs."""
+    """Lay out the rows of "once"; the rows of one table are its parts, from several runs."""
     groups: dict[str, list[Row]] = {}
     for row in measured:
         groups.setdefault(row["job"]["table"], []).append(row)
@@ -125,7 +125,7 @@ def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
 
 
 def _with_source(measured: Table, rows: Sequence[Row]) -> str:
-    """Lay a table out for a page: its caption below it, and folded how its rows were made."""
+    """Lay out a table for a page: the caption below it, and its sources folded away."""
     cells = as_text(measured, "pipe").removeprefix(measured.caption).strip()
     sources = sources_of(rows if measured.rows is None else measured.rows)
     if not sources:

@@ -1,7 +1,7 @@
 """The paper's curves, histograms and rows of pictures, with our fits, and tiles side by side.
 
 All pictures but the tiles have the size of the model, 256x256 pixels, and its number of Gaussians.
-The row of a curve has "psnr_ycbcr" every `EVERY` steps; that of a set of pictures says its file.
+The row of a curve has "psnr_ycbcr" every `EVERY` steps; that of a set of pictures names its file.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +27,7 @@ from eigengs_dr.image.resize import center_crop
 from eigengs_dr.raster.render import picture_of
 from eigengs_dr.viewer.pictures import overlay
 
-COMPONENTS = 300  # a channel of the models that are trained, as in the paper's comparisons
+COMPONENTS = 300  # per channel of the models that are trained, as in the paper's comparisons
 PHOTO = "coffee"  # photo of scikit-image that the basis "natural" was not trained on
 # What stands above the pictures of a method.
 HEADINGS = {
@@ -40,14 +40,16 @@ NEEDS = {"radii": [CATS], "split": [CATS], "cross": [CATS, NATURAL]}
 CREDIT = "Images: AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
 EVERY = 50  # iterations between two points of a curve
 MAGNIFIED, STRETCHED = 8, 20  # factors of errors before they are added to mid-grey
-BORDER = 0.08  # around the middle of a picture, in its sides: Gaussians there reach into it
+BORDER = (
+    0.08  # around the middle of a picture, relative to its sides: Gaussians there reach into it
+)
 CELL, LETTERS = 1.8, 0.42  # sides of a picture, and height of the lines around it, in inches
 
-Cell = tuple[str, NDArray[Any]]  # the line below a picture, and the picture: RGB, not clamped
+Cell = tuple[str, NDArray[Any]]  # the caption of a picture, and the picture: RGB, not clamped
 
 
 def run(task: Task, pictures: Sequence[str]) -> list[Row]:
-    """Draw pictures into the folder; by default those whose sets of images are there."""
+    """Draw pictures into the folder, by default those whose sets of images exist."""
     chosen = pictures or [p for p in PICTURES if all(is_present(task, s) for s in NEEDS.get(p, []))]
     functions = (_iterations, _colors, _curves, _tiles, _radii, _split, _cross)
     makers = dict(zip(PICTURES, functions, strict=True))
@@ -69,7 +71,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 def preset_descent(
     task: Task, image: Image, model: EigenGS, preset: str, marks: Sequence[int], **options: Any
 ) -> Iterator[Moment]:
-    """Fit by a method with the number of Gaussians of a model; "eigengs" starts from it."""
+    """Fit by a method with as many Gaussians as a model has; "eigengs" starts from the model."""
     method, count = METHODS[preset], len(model.gaussians)
     start = model if method.needs_model else None
     shared = {"gaussians": count, "backend": task.backend, "method": method, "start": start}
@@ -77,7 +79,7 @@ def preset_descent(
 
 
 def to_size(image: Image, model: EigenGS) -> Image:
-    """Bring the largest centred part of an image to the size of a model."""
+    """Resize the largest centred part of an image to the size of a model."""
     return center_crop(image, model.gaussians.width, model.gaussians.height)
 
 
@@ -109,7 +111,7 @@ def _curve_jobs(task: Task, name: str) -> Iterator[Job]:
 
 
 def _curves_chart(rows: Sequence[Row]) -> Figure:
-    """Draw lines in the colours of the methods, one panel a set: means over its images."""
+    """Draw lines in the colours of the methods, one panel per set: means over its images."""
     names = list(dict.fromkeys(row["job"]["set"] for row in rows))
     columns = min(3, len(names))
     lines = -(-len(names) // columns)
@@ -150,7 +152,7 @@ def _radii(task: Task) -> list[Row]:
 
 
 def radii_of(gaussians: Gaussians) -> NDArray[np.float64]:
-    """Geometric mean of the standard deviations of every Gaussian, in pixels, shape (N,)."""
+    """Return the geometric mean of the standard deviations of every Gaussian, in pixels, (N,)."""
     factor = gaussians.to_arrays()["factor"].astype(np.float64)
     return 1 / np.sqrt(factor[:, 0] * factor[:, 2])  # det F = a c
 
@@ -183,7 +185,7 @@ def _radii_chart(rows: Sequence[Row]) -> Figure:
 def _draw_rows(
     task: Task, file: str, caption: str, make: Callable[[], list[tuple[str, Sequence[Cell]]]]
 ) -> list[Row]:
-    """Draw rows of pictures into a file, once; cats have a line of credit."""
+    """Draw rows of pictures into a file, once; pictures of cats carry a line of credit."""
 
     def work() -> Row:
         rows = make()
@@ -314,7 +316,7 @@ def _size(model: EigenGS) -> str:
 
 
 def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Outlines over the middle quarter of a picture, which has room for all of them."""
+    """Draw outlines over the middle quarter of a picture, enlarged to make room for them."""
     height, width = picture.shape[:2]
     away = np.abs(gaussians.to_arrays()["mean"] / (width, height) - 0.5)
     near = gaussians[(away < 0.25 + BORDER).all(axis=1)]
@@ -323,7 +325,7 @@ def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.
 
 
 def strip(rows: Sequence[tuple[str, Sequence[Cell]]], credit: str = "") -> Figure:
-    """Put rows of pictures below each other, each below its heading."""
+    """Stack rows of pictures, each below its heading."""
     columns = max(len(cells) for _, cells in rows)
     figure = fr.new_figure(CELL * columns, (CELL + LETTERS) * len(rows))
     figure.supxlabel(credit, fontsize=7)

@@ -1,9 +1,9 @@
-"""What textures take that look alike: bitmaps and Gaussians on a poster that a camera sees aslant.
+"""Memory of textures that look alike: bitmaps and Gaussians on a poster seen at a slant.
 
-A poster of `TEXELS` x `TEXELS` texels fills the width of a film of half as many pixels. Of smaller
-bitmaps, and of Gaussians, the smallest is found whose picture differs from that of the poster by
-40 dB, of a text by 30: in 8 bits of sRGB, or of values for maps of one channel. Pixels beside the
-poster do not count. The light is even, so that pictures have no noise.
+A poster of `TEXELS` x `TEXELS` texels fills the width of a film of half as many pixels. The
+smallest bitmap and the smallest set of Gaussians are searched whose pictures reach 40 dB against
+that of the poster, or 30 dB for a text: in 8 bits of sRGB, or of values for maps of one channel.
+Pixels beside the poster do not count. The light is even, so that pictures have no noise.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ SLOT = "poster.bsdf.reflectance"
 
 
 class Poster(NamedTuple):
-    """What is on the poster, `TEXELS` x `TEXELS`; the space of its Gaussians; the PSNR in dB."""
+    """The image of a poster, `TEXELS` x `TEXELS`; the space of its Gaussians; the PSNR in dB."""
 
     kind: str
     image: Image
@@ -43,7 +43,7 @@ class Poster(NamedTuple):
 
 
 def posters(data: Path | None) -> Iterator[tuple[str, Callable[[], Poster]]]:
-    """Yield the names of the posters, and what loads them: photos, materials, and a text."""
+    """Yield the names of the posters and functions that load them: photos, materials, a text."""
     for name in PHOTOS:
         yield name, partial(_poster, "photo", partial(eg.sample, name), "linear")
     for name in MAPS:
@@ -55,7 +55,7 @@ def posters(data: Path | None) -> Iterator[tuple[str, Callable[[], Poster]]]:
 
 
 def _poster(kind: str, load: Callable[[], Image], space: str) -> Poster:
-    """Load an image for a poster, of maps the first channel."""
+    """Load an image for a poster; of maps, the first channel."""
     image = center_crop(load(), TEXELS, TEXELS).clip(0, 1)
     return Poster(kind, image[..., :1] if space == "data" else image, space, GOAL)
 
@@ -74,7 +74,7 @@ def letters(side: int) -> Image:
 
 
 def jobs(variant: str, data: Path | None) -> Iterator[Job]:
-    """Yield what measures each poster."""
+    """Yield the measurement of each poster."""
     for name, load in posters(data):
         yield {"variant": variant, "poster": name}, partial(compare, variant, load)
 
@@ -137,7 +137,7 @@ def _smallest_side(suffices: Callable[[int], bool]) -> int:
 
 
 def bitmap(mi: Any, image: Image) -> dict[str, Any]:
-    """Return an image as a bitmap of 8 bits: sRGB, or values of one channel."""
+    """Return an image as an 8-bit bitmap: sRGB, or values of one channel."""
     codes = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
     return {"type": "bitmap", "bitmap": mi.Bitmap(codes), "raw": image.shape[2] == 1}
 

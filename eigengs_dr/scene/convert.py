@@ -51,7 +51,7 @@ NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directl
 
 
 class ConvertedTexture(NamedTuple):
-    """An image, as bitmaps and as Gaussians.
+    """An image as bitmaps and as Gaussians.
 
     Attributes
     ----------
@@ -102,12 +102,12 @@ class ConvertedScene(NamedTuple):
     better : list of ConvertedTexture
         Bitmaps that stayed, since they take less memory or time than Gaussians.
     left : list of (str, str)
-        What else stayed as it was, and why.
+        What else stayed, and why.
     psnr : list of float
         psnr_rgb in dB between the renderings of each camera; both have the same random numbers.
     noise : list of float
-        psnr_rgb between two renderings of the scene as it was, with other random numbers. Empty if
-        its environment map stays: the directions of another one are others.
+        psnr_rgb between two renderings of the original scene with different random numbers. Empty
+        if its environment map stays, since only a new one is sampled differently.
     """
 
     scene: Path
@@ -127,7 +127,7 @@ class ConvertedScene(NamedTuple):
 
 
 NOISE = 0.5
-"""Decibels by which renderings of other random numbers may differ more than others do."""
+"""Decibels by which renderings with other random numbers may vary."""
 
 
 @shows_progress
@@ -165,7 +165,7 @@ def convert_scene(
     parameters : mapping of str to str, optional
         Values for the defaults of an XML file.
     replace_all : bool, optional
-        Whether better bitmaps are replaced too: Gaussians are differentiable, and have no texels.
+        Whether to replace better bitmaps too: Gaussians are differentiable, and have no texels.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(label, done, total)``.
@@ -187,7 +187,7 @@ def convert_scene(
     Warns
     -----
     UserWarning
-        If a rendering after misses `target_psnr` against the one before.
+        If a rendering after the conversion misses `target_psnr` against the one before.
 
     Examples
     --------
@@ -227,7 +227,7 @@ class Settings(NamedTuple):
 
 
 def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
-    """Raise ValueError if there is something in a folder to write."""
+    """Raise ValueError if the output folder is not empty."""
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{output}: exists and is not empty; choose another folder")
 
@@ -260,7 +260,7 @@ def _convert_into(
     total = len(groups) + (sky is not None)
 
     def add(outcome: ConvertedTexture | str, nodes: dict[int, str]) -> None:
-        """Add what has become of an image, whose nodes have names."""
+        """Record the outcome for an image, with the names of its nodes."""
         if isinstance(outcome, str):
             left.extend((name, outcome) for name in nodes.values())
         elif not outcome.file:
@@ -311,7 +311,7 @@ def _convert(
 ) -> ConvertedTexture | str:
     """Fit the image of some uses and save the set, or return why it must stay.
 
-    Where the bitmap is better, there is no file.
+    If the bitmap is better, there is no file.
     """
     use, asked = group[0], (settings.target_psnr, settings.iterations)
     try:
@@ -377,7 +377,7 @@ def _chosen(
 
 
 def _file_name(image: str, raw: bool, used: set[str]) -> str:
-    """Name the file of a set by its image."""
+    """Name the file of a set after its image."""
     stem = Path(image).stem
     names = [f"{stem}.npz", f"{stem}-data.npz", *(f"{stem}-{k}.npz" for k in range(2, 1000))]
     return next(name for name in names[raw and f"{stem}.npz" in used :] if name not in used)
@@ -398,7 +398,7 @@ def _rewrite(parsed: Parsed, replacements: dict[int, str], work: Path, target: P
             replace_bitmap(props, replacements[index])
             continue
         if props.plugin_name() == GAUSSIANS and "to_uv" in props:
-            props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML lacks
+            props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML cannot hold
         is_set = props.plugin_name() in (GAUSSIANS, SKY)
         if is_set and ("mean" in props or "coefficients" in props):
             _save_set(props, work, f"gaussians-{index}.npz")

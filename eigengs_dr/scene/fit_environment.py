@@ -1,8 +1,8 @@
 """Gaussians for an environment map: as cameras see it, and as it lights a scene.
 
-A renderer picks other directions of a set than of a bitmap, so renderings of few samples differ by
-their noise, and cannot judge. The pictures are compared instead, twice: as 8-bit sRGB, which is how
-cameras and mirrors see them, and as the light that white surfaces get, for all their normals.
+A renderer samples other directions from a set than from a bitmap, so renderings with few samples
+differ by their noise and cannot judge. Instead the pictures are compared, twice: as 8-bit sRGB,
+which is how cameras and mirrors see them, and as the light on white surfaces, for all normals.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ the fit. Without points between, a set of 5,000 Gaussians in logarithms had 1.6 
 its bitmap: nothing saw them beside the texels."""
 
 CLOSER = (-6.0, 0.0, 8.0)
-"""PSNR of the fit above the goal, in dB: one after the other is tried, since the fit compares light
-with another weight than cameras do."""
+"""PSNR of the fit above the goal, in dB, tried in turn, since the fit weighs light differently from
+cameras."""
 
 BYTES = 100
 """Fewest bytes of a Gaussian in memory; they limit a set to the memory of its bitmap."""
@@ -49,7 +49,7 @@ def fit_environment(
     iterations: int,
     max_bytes: int,
 ) -> tuple[Gaussians, float]:
-    """Find as few Gaussians as show an environment map at a PSNR.
+    """Find the fewest Gaussians that show an environment map at a PSNR.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def fit_environment(
     gaussians : Gaussians
         Of the size of the map.
     psnr : float
-        The lower one of the two, in dB.
+        The lower of the two, in dB.
 
     Raises
     ------

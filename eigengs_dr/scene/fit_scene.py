@@ -48,11 +48,11 @@ ENOUGH = 2.0
 """Smallest number of texels per pixel without an enlargement. With fewer texels the image is
 interpolated bilinearly, as bitmaps are; else no sample would show the Gaussians between texels.
 With twice as many and more it is halved, again and again: the cameras see the same, and the fit
-takes a quarter of the time. 1,024 x 1,024 texels at 6 texels a pixel and more: 1,390 instead of
+takes a quarter of the time. 1,024 x 1,024 texels at 6 and more texels per pixel: 1,390 instead of
 1,515 Gaussians for 40 dB, and 46.81 instead of 46.87 dB between the renderings."""
 
 DETAIL = 64
-"""Fewest seen texels a Gaussian in a fit. A target with four times as many is halved, again and
+"""Fewest seen texels per Gaussian in a fit. A target with four times as many is halved, again and
 again: 200 Gaussians show no more of an enlarged image, and a step takes the time of its texels."""
 
 FINER = 3
@@ -138,8 +138,8 @@ def fit_for_scene(
     A scene whose poster has any texture; `examples/fit_for_scene.py` is a complete example::
 
         room = mi.load_file("room.xml")
-        found = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
-        poster = texture_of(found.gaussians)
+        result = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
+        poster = texture_of(result.gaussians)
     """
     if space not in COLORS:
         raise ValueError(f"space {space!r} is unknown; textures hold {' or '.join(COLORS)}")
@@ -213,7 +213,7 @@ def fit_for_scene(
 def _objective(
     target: Image, weight: Image, seen: NDArray[np.bool_], count: int, space: str
 ) -> Pixels:
-    """Return the objective of a fit, at `DETAIL` texels a Gaussian; cameras judge all texels."""
+    """Return the objective of a fit, at `DETAIL` texels per Gaussian; cameras judge all texels."""
     times = 2 ** max(0, int(math.log2(max(1.0, seen.sum() / (DETAIL * count))) / 2))
     target, weight = shrunk(target, times), shrunk(weight, times)
     placement_image = to_coded(target) if space == "linear" else target
@@ -228,7 +228,7 @@ def halved(values: Image, view: Visibility) -> Image:
 
 
 def shrunk(values: Image, times: int) -> Image:
-    """Return means over so many texels along both sides."""
+    """Return means over blocks of so many texels along both sides."""
     if times == 1:
         return values
     small = tuple(-(-side // times) for side in values.shape[:2])

@@ -116,7 +116,7 @@ def _blur_by(deviation: NDArray[np.floating]) -> Callable[[Image], Image]:
 
     The blur interpolates between uniform blurs whose standard deviations differ by sqrt(2). Images
     that are blurred by `COARSE` texels are halved, so that the cost does not grow with the
-    deviation. To halve adds the variance 1/4, and to interpolate 3/16 of a coarser texel. Texels
+    deviation. Halving adds the variance 1/4, and interpolating 3/16 of a coarser texel. Texels
     with an infinite deviation get the largest finite one.
     """
     finite = np.isfinite(deviation)
@@ -177,7 +177,7 @@ def seen_by(texels: Image, rows: csr_array, space: str, peak: float = 1.0) -> ND
     space : {"linear", "data"}
         Whether means of light are coded as sRGB.
     peak : float, optional
-        If it is above 1, light counts as it is and divided by the peak: it lights what cameras see.
+        If it is above 1, light counts as it is and divided by the peak: it also lights the scene.
 
     Returns
     -------

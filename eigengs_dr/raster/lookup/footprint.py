@@ -14,7 +14,7 @@ from .points import Packed, Terms
 
 MAX_FOOTPRINT = 0.4
 """Largest standard deviation of a footprint, in widths and heights of the texture. A footprint that
-has it in all directions gets the mean of a texture that repeats: it would keep at most
+has it in all directions sees the mean of a texture that repeats: it would keep at most
 ``exp(-(2 pi MAX_FOOTPRINT)^2 / 2)`` = 4 % of the coarsest wave of a repeating texture."""
 
 

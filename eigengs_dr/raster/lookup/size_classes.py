@@ -106,7 +106,9 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
         # Means beyond this margin are farther from the image than the cutoff.
         origin = -cutoff * largest
         area = (width - 2 * origin) * (height - 2 * origin)
-        length = max(largest, math.sqrt(area / (2 * len(indices))))  # at most two cells a Gaussian
+        length = max(
+            largest, math.sqrt(area / (2 * len(indices)))
+        )  # at most two cells per Gaussian
         columns, rows = (math.ceil((s - 2 * origin) / length) for s in (width, height))
         column, row = ((v[indices] - origin) // length for v in (x, y))
         near = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
