@@ -38,8 +38,8 @@ TRY_SHARE, FIT_SHARE, POLISH_SHARE = 0.1, 1.0, 0.15
 """Steps of a try, of the fit and of a polish, as fractions of the iterations."""
 
 MAX_LENGTH = 2
-"""Steps of the search, at most, as a multiple of the iterations, if these exceed some ten and
-one fit suffices; else up to a quarter as much again."""
+"""Largest number of steps of the search, as a multiple of the iterations, if these exceed about
+ten and one fit suffices; otherwise up to a quarter more."""
 
 MAX_TRIES = 4
 """Largest number of tries. One alone takes 2 % more Gaussians with 1,000 iterations and 5 %
@@ -50,8 +50,8 @@ MAX_POLISHES = 7
 """Number of polishes after which a search ends if a set meets the goal."""
 
 SURE_POLISHES, SURE_DROPS = 3, 5
-"""Number of polishes that a search may take whatever its steps were before; and if the fit met
-the goal, so that they drop Gaussians."""
+"""Number of polishes that a search may take regardless of its steps so far; and the number if the
+fit met the goal, so that they drop Gaussians."""
 
 DB_PER_DOUBLING = 4.0
 """Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
@@ -75,11 +75,11 @@ MAX_OCTAVES = 4.0
 
 TRY_TOLERANCE, FIT_TOLERANCE = 0.1, 0.6
 """Largest relative difference from the estimated number for the last try, and largest relative
-lack of Gaussians for the fit; a surplus is for the polishes."""
+lack of Gaussians for the fit; the polishes handle a surplus."""
 
 MAX_DROP, DROP_PER_DB, LARGEST_DROP = 0.15, 0.1, 0.3
-"""Largest fraction of the Gaussians that one polish drops near the goal, for each decibel above
-it, and at all. A short search overshoots by decibels: 200 steps of a material fitted 11,122
+"""Largest fraction of the Gaussians that one polish drops: near the goal, for each decibel above
+it, and overall. A short search overshoots by decibels: 200 steps of a material fitted 11,122
 Gaussians with 35.6 dB for 32 dB; a second fit of fewer, in the steps that were left, missed the
 goal."""
 
@@ -91,8 +91,8 @@ POLISH_GAIN, GAIN_DECAY = 0.1, 0.5
 the last; training images gained 0.2 dB."""
 
 FAR = 1.5
-"""Gaussians of the best set over those of a polish that misses the goal, from which on the polish
-adds as if there were no such set: a try may meet the goal with twice the number."""
+"""Ratio of the Gaussians of the best set to those of a polish that misses the goal, above which
+the polish ignores that set: a try may meet the goal with twice the number."""
 
 ENOUGH = 0.02
 """Decibels above the goal that do not justify another polish."""
@@ -120,7 +120,7 @@ def fewest(
         A first guess by the placement `Adaptive`, which can be redistributed.
     score : Score
     goal : (str, float)
-        Key of the value in the rows of `score` that shall reach the goal, and the goal in dB.
+        Key of the value in the rows of `score` that must reach the goal, and the goal in dB.
     max_count : int
         Largest number of Gaussians.
     iterations : int, optional
@@ -188,7 +188,7 @@ class _Run:
     def descend(
         self, gaussians: Gaussians, steps: int, share: float = 1.0, surplus: int = 0
     ) -> _Trial:
-        """Take some steps at a fraction of the learning rates, and score what is left then."""
+        """Take some steps at a fraction of the learning rates, and score the pruned set."""
         method = self.method.at_rates(share).without(Surplus, Redistribute)
         if share < 1:  # a polish moves Gaussians by itself
             method = method.without(Relocate, Perturb)
@@ -217,7 +217,8 @@ class _Run:
         [figures] = self.measure(gaussians)
         row = {"iteration": self.step, "gaussians": len(gaussians), **figures}
         self.trace.append(row)
-        # The PSNR of a set without error is infinite, and differences of two such are no numbers.
+        # The PSNR of a set without error is infinite, and the difference of two such is not a
+        # number.
         trial = _Trial(gaussians, goal - min(figures[figure], MAX_PSNR), row)
         if len(self.trace) == 1 or _better(trial, self.best):
             self.best = trial
@@ -233,12 +234,12 @@ class _Run:
                 self.stopped = True
 
     def ended(self) -> bool:
-        """Return whether somebody has ended the search."""
+        """Return whether the search was ended from outside."""
         return self.stopped or self.interrupted()
 
 
 def _better(a: _Trial, b: _Trial) -> bool:
-    """Return whether a meets the goal with fewer Gaussians than b, or comes nearer to it.
+    """Return whether a meets the goal with fewer Gaussians than b, or comes closer to it.
 
     Of two sets of one size that meet it, the one with the higher PSNR is better.
     """

@@ -1,4 +1,4 @@
-"""A fit of a loss without an image: texels first, then the number of Gaussians, then these."""
+"""A fit of a loss without an image: texels, then the number of Gaussians, then the Gaussians."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ Spaces: TypeAlias = "str | Mapping[str, str] | None"
 """The space of a picture, or those of several maps by name; data have one channel."""
 
 PIXELS_PER_GAUSSIAN = 16
-"""Pixels of the picture for each Gaussian, if nothing says how many the scene needs. On the scenes
+"""Pixels of the picture per Gaussian, if nothing indicates how many the scene needs. On the scenes
 of ``bench inverse`` with the photo "coffee", it ends within 0.4 dB of the best number."""
 
 FIRST_PIXELS = 128
-"""Pixels of the picture for each Gaussian of the smallest number that a judge tries."""
+"""Pixels of the picture per Gaussian, for the smallest number that a judge tries."""
 
 
 def views_of_spaces(spaces: Spaces) -> tuple[list[View], tuple[TextureMap, ...]]:
@@ -43,7 +43,7 @@ def views_of_spaces(spaces: Spaces) -> tuple[list[View], tuple[TextureMap, ...]]
     Raises
     ------
     ValueError
-        If a space or a name is none.
+        If a space or a name is invalid.
     """
     named = spaces if isinstance(spaces, Mapping) else {"": spaces or "ycbcr"}
     for space in named.values():
@@ -66,7 +66,7 @@ def views_of_spaces(spaces: Spaces) -> tuple[list[View], tuple[TextureMap, ...]]
 
 @dataclass(frozen=True)
 class Problem:
-    """A loss for a picture of which nothing is known yet.
+    """A loss for a picture that is still unknown.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Problem:
         return LossObjective.of_loss(self.loss, self.views, pixels)
 
     def grey(self) -> NDArray[np.floating]:
-        """Return the sums of a pixel of which nothing is known, shape (C,)."""
+        """Return the sums of a pixel that is still unknown, shape (C,)."""
         low, high = self.loss.bounds or (0.0, 1.0)
         parts = []
         for view in self.views:
@@ -121,10 +121,11 @@ def refine_loss(
     progress: FitProgress | None,
     interrupted: Callable[[], bool],
 ) -> tuple[Refinement, float]:
-    """Descend on a loss from nothing, or from a set; return the seconds before Gaussians move too.
+    """Descend on a loss from nothing or from a set; also return the seconds before Gaussians move.
 
     A pyramid of texels takes the first steps, see `Coarse`. Gaussians are fitted to its picture: a
-    given number, or numbers that double while the loss gains from it. They take the other steps.
+    given number, or numbers that double while the loss gains from it. They take the remaining
+    steps.
     """
     stopped = False
 
@@ -198,7 +199,7 @@ def _start(
     coarse: Coarse,
     ended: Callable[[], bool],
 ) -> tuple[Gaussians, list[Row]]:
-    """Fit Gaussians to the image of an objective; return rows of the numbers that were tried."""
+    """Fit Gaussians to the image of an objective; also return rows for the numbers tried."""
     width, height = objective.size
     image = objective.image()
     method = replace(DEFAULT, cutoff=options.method.cutoff)

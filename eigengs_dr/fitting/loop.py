@@ -37,7 +37,7 @@ def descend(
     state : State
         See `begin`.
     iterations : int
-        Number of steps of the whole descent, by which rates fall and controls act.
+        Number of steps of the whole descent, which sets rates and controls.
     key : int, optional
         All random numbers depend on it and on the step.
     part : range, optional
@@ -157,7 +157,7 @@ class Best:
     ----------
     objective : Pixels
     state : State
-        Before the first step.
+        The state before the first step.
     iterations : int
     score : Score
     progress : callable, optional
@@ -190,7 +190,7 @@ class Best:
         return all(one.stopped == "exact" for one in self.refinements)
 
     def judge(self, step: int, gaussians: Gaussians) -> None:
-        """Measure a set. One with more Gaussians than requested does not compare."""
+        """Measure a set. A set with more Gaussians than requested is not compared."""
         rows = self.score(gaussians)
         self.row = {"iteration": step, **rows[0]}
         if len(gaussians) > len(self.refinements) * self.state.count:

@@ -35,7 +35,7 @@ MIN_MSE = (1 / 255) ** 2 / 12
 
 @dataclass(frozen=True)
 class Map:
-    """A map of a mapping of images, if it needs more than its pixels.
+    """A map in a mapping of images that needs more than pixels.
 
     Attributes
     ----------
@@ -44,9 +44,9 @@ class Map:
         By default "linear" for albedo, color and the like, "normal" for normals, and "data" for
         other names, see `eigengs_dr.gaussian.channels.usual_space`.
     weight : float
-        Factor of its errors, above 0. It multiplies the one that `eigengs_dr.fit` finds.
+        Factor of its errors, above 0. It multiplies the factor that `eigengs_dr.fit` finds.
     goal : float or None
-        The PSNR in dB that it shall reach; by default that of the fit.
+        The PSNR in dB that it must reach; by default that of the fit.
     """
 
     image: Any
@@ -66,11 +66,11 @@ class MapImage(NamedTuple):
     pixels : ndarray of float32, shape (H, W, C)
         sRGB, normals or data.
     data : Data
-        The same as it would be fitted alone.
+        The image as it would be fitted alone.
     factor : float
         The user's factor of its errors.
     goal : float or None
-        The PSNR in dB that it shall reach.
+        The PSNR in dB that it must reach.
     """
 
     name: str
@@ -137,7 +137,7 @@ def _read_map(
 
 
 def _without_copies(pixels: Image) -> Image:
-    """Return one channel of data whose three are equal: JPEG files of grey often have three."""
+    """Reduce data with three equal channels to one: grey JPEG files often have three."""
     first = pixels[..., :1]
     if pixels.shape[2] == 3 and (pixels == first).all():
         return np.ascontiguousarray(first)
@@ -173,7 +173,7 @@ def combine(
 
 
 def views_of(images: Sequence[MapImage], factors: Sequence[float]) -> list[View]:
-    """Return what the channels of `combine` show."""
+    """Return the views of the channels of `combine`."""
     maps = [image.map(1) for image in images]
     return [
         View(m.name, m.space, range(channels.start, channels.stop), a.scale / factor, a.offset)
@@ -239,13 +239,13 @@ def _first_errors(
 def score_maps(
     gaussians: Gaussians, objective: Pixels, images: Sequence[MapImage], space: str = "rgb"
 ) -> Row:
-    """Measure a set of all channels, each times the factor of its map.
+    """Measure a set of all channels, each multiplied by the factor of its map.
 
     Returns
     -------
     dict
         psnr_ycbcr and psnr_rgb, means over the maps that have them; maps, with both of each map;
-        and with goals, margin: how far the map that is farthest from its goal is above it, in dB.
+        and with goals, margin: the decibels of the worst map above its goal.
     """
     figures = psnrs(gaussians, objective.pictures)[..., 0]
     by_name = {

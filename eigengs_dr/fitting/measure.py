@@ -1,7 +1,7 @@
 """The rows of a trace: PSNRs of a set of Gaussians, from sums in one kernel.
 
-A lane converts some pixels of a rendering to what people look at, and compares them with the image.
-A few bytes go to the host.
+A lane converts some pixels of a rendering to display values (sRGB), and compares them with the
+image. Only a few bytes go to the host.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Row: TypeAlias = Record
 
 
 def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float64]:
-    """Compute the PSNRs of a set, as `eigengs_dr.psnr` does of its picture.
+    """Compute the PSNRs of a set, as `eigengs_dr.psnr` does for its picture.
 
     Cost: tile lists, and a rendering.
 
@@ -114,7 +114,7 @@ def _squared_errors(
         for k, seen in enumerate(read(image)):
             sums = pixels[k][first : first + len(seen)]
             if rendered_as(space) is None and space != "normal":
-                # Differences of the values as they are fitted keep their digits.
+                # Differences of the fitted values keep their digits.
                 error = sum(dr.square((s - v) * a) for s, v in zip(sums, seen, strict=True))
                 rendering, seen = ([dr.fma(v, a, b) for v in pixel] for pixel in (sums, seen))
             else:

@@ -38,7 +38,7 @@ Levels = int | Sequence[int]
 """A number of levels of detail, or the number of Gaussians up to each level in ascending order."""
 
 LEVEL_RATIO = 4
-"""Ratio of the numbers of Gaussians up to a level and up to the level before it; 4 halves their
+"""Ratio of the numbers of Gaussians up to a level and up to the previous level; 4 halves their
 spacing."""
 
 Start: TypeAlias = "Gaussians | Model | str | os.PathLike[str]"
@@ -49,7 +49,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def refuse_unknown(given: Collection[str], names: Collection[str]) -> None:
-    """Raise TypeError for an option that is unknown, with the name that it resembles."""
+    """Raise TypeError for an unknown option, and name the option that it resembles."""
     for name in given:
         if name not in names:
             [*close] = get_close_matches(name, names, 1)
@@ -79,7 +79,7 @@ class Goal:
         In dB, above 0 and at most 100.
     space : {"rgb", "ycbcr"}
         Whether it is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light above 1 have
-        one PSNR alone, see `eigengs_dr.image.metrics.float_space`.
+        only one PSNR, see `eigengs_dr.image.metrics.float_space`.
     max_gaussians : int or None
         Largest number of Gaussians. By default they have at most as many parameters as the image
         has numbers: 3 Gaussians for 8 pixels in colour.
@@ -158,7 +158,7 @@ class FitOptions:
         self._check_nested()
 
     def _check_nested(self) -> None:
-        """Raise ValueError where a search or levels need what the other options take away."""
+        """Raise ValueError if other options exclude what a search or levels need."""
         places = self.method.place == Adaptive() and self.start is None
         if self.levels and not (places and not self.method.needs_model):
             raise ValueError("levels need the placement Adaptive and no start; leave them out")
@@ -187,7 +187,7 @@ class FitOptions:
 
     @property
     def searches(self) -> bool:
-        """Whether the number of Gaussians is the smallest that reaches something."""
+        """Whether the number of Gaussians is searched: the smallest that reaches a target."""
         return self.goal is not None or (self.loss is not None and self.loss.target is not None)
 
     @property
@@ -208,11 +208,11 @@ class FitOptions:
 
     @property
     def count(self) -> int | None:
-        """Number of Gaussians, if the user gives one; of all levels."""
+        """Number of Gaussians, if the user gives one; with levels, of all."""
         return self.levels[-1] if self.levels else self.gaussians  # type: ignore[return-value]
 
     def count_for(self, pixels: int) -> int:
-        """Return the number of Gaussians for so many pixels, if the fit does not search it."""
+        """Return the number of Gaussians for so many pixels, if the fit does not search for it."""
         return self.count or default_count(pixels)
 
     def max_count_for(self, pixels: int, channels: int) -> int:

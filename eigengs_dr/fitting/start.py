@@ -1,4 +1,4 @@
-"""What a fit starts from: a set of the user, the file of one, or a model."""
+"""What a fit starts from: a set of the user, the file of a set, or a model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def load_start(start: Start | Fitted, backend: str | None) -> Gaussians | Model:
     Raises
     ------
     ValueError
-        If the set is on another backend, or its file is none.
+        If the set is on another backend, or its file holds no set.
     TypeError
         If the start is something else.
     """
@@ -92,7 +92,7 @@ def start_from(
     objective : Pixels
     method : Method
     pixels : ndarray of float32, shape (H, W, C)
-        What a model encodes.
+        The image that a model encodes.
     moves : bool
         Whether a descent follows, which needs means inside of the image.
     """

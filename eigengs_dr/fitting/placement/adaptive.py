@@ -15,12 +15,12 @@ So the density and the error of one fit give the best density:
 
     rho' ~ k^(1 / (q + 1)) = rho s^(1 / (q + 1)).
 
-Only a fit can tell parts that are hard to fit from parts that just have large second derivatives.
+Only a fit can tell parts that are hard to fit from parts that merely have large second derivatives.
 Neighbouring Gaussians share their errors, see `eigengs_dr.fitting.placement.density.Owners`; in
 what a Gaussian owns, the density follows the second derivatives. The constants were chosen on
 training images of ImageNet classes and of cats, by the error after 1,000 steps.
 
-Images are in tile layout, and all of it runs on the device. A batch of images takes one launch of
+Images are in tile layout, and everything runs on the device. A batch of images takes one launch of
 each kernel; no sum of one depends on another.
 """
 
@@ -82,7 +82,7 @@ def place_adaptive(
 ) -> Gaussians:
     """Place and shape Gaussians by the second derivatives of an image, with the colour 0.
 
-    All of it runs on the device, without a copy to the host.
+    Everything runs on the device, without a copy to the host.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def place_adaptive(
     count : int
         Number of Gaussians of an image, from 1 to W H.
     cutoff : float, optional
-        That of the set, see `eigengs_dr.Gaussians`.
+        Cutoff of the set, see `eigengs_dr.Gaussians`.
     density : callable, optional
         See `Density`.
 
@@ -118,7 +118,7 @@ def place_adaptive(
 def _place(
     canvas: Canvas, image: Float, count: int, density: Density | None, times: int = 1
 ) -> tuple[Rows, Rows]:
-    """Return the means and the factors of `place_adaptive`, of an image that was shrunk before."""
+    """Return the means and the factors of `place_adaptive`, for an image after shrinking."""
     types, grid = canvas.types, canvas.grid
     spacing = math.sqrt(grid.width * grid.height / count)
     smaller = int(spacing / WORKING_SPACING)
@@ -191,7 +191,7 @@ def density_from_hessian(canvas: Canvas, image: Float, spacing: float) -> tuple[
 
 
 def normalize_density(canvas: Canvas, density: Float, count: int) -> Float:
-    """Scale a density to a sum of about `count` an image, with at most one Gaussian per pixel."""
+    """Scale a density to a sum of about `count` per image, with at most one Gaussian per pixel."""
     types, grid = canvas.types, canvas.grid
     total = dr.opaque(types.Float, count)
     values = types.FloatX(gather_run(types, density, canvas.tile, PIXELS, True))

@@ -30,7 +30,7 @@ Number = TypeVar("Number", Float, UInt, covariant=True)
 
 
 class Line(Protocol[Number]):
-    """The rows of an array of several, of floats or of integers."""
+    """The rows of an array, of floats or of integers."""
 
     def __len__(self) -> int: ...
     def __getitem__(self, row: int, /) -> Number: ...
@@ -45,7 +45,7 @@ class Canvas:
     types : ArrayTypes
     grid : Grid
     sizes : GridArrays
-        Those of `grid`: each costs some microseconds, and many kernels need them.
+        Sizes of `grid`: computing them takes microseconds, and many kernels need them.
     """
 
     types: ArrayTypes
@@ -87,9 +87,9 @@ class Canvas:
         return tile * PIXELS + self.types.UInt((y & 3) * SIDE + (x & 3))
 
     def pixels(self, index: UInt | None = None) -> tuple[UInt, UInt, UInt, Bool]:
-        """Return column, row, first tile of the image, and whether it is inside, of pixels.
+        """Return column, row, first tile of the image, and whether it is inside, for pixels.
 
-        They are those of an index in tile layout, by default all: a lane owns a pixel.
+        The pixels have an index in tile layout, by default all: a lane owns a pixel.
         """
         if index is None:
             index = dr.arange(self.types.UInt, self.grid.tiles * PIXELS)
@@ -102,7 +102,7 @@ class Canvas:
         return column, row, self.first_tile(self.sizes.image_of(tile)), inside
 
     def store(self, values: list[Number]) -> Number:
-        """Write the values of all tiles, a list by pixels and channels; return the image."""
+        """Write the values of all tiles, listed by pixels and channels; return the image."""
         result = dr.empty(type(values[0]), self.grid.tiles * len(values))
         rows = dr.replace_type_t(self.types.FloatX, dr.type_v(result))
         dr.scatter(result, rows(values), self.tile)
@@ -265,7 +265,8 @@ def blur(canvas: Canvas, image: Float, deviation: float) -> Float:
     """Return the means of the pixels around each pixel, by Gaussian weights; evaluated.
 
     Only pixels of the image count: near its edges, means are over those inside the window. `image`
-    is as for `weighted_sums`, the deviation in pixels; outside the image are any finite values.
+    is as for `weighted_sums`, the deviation in pixels; outside the image, values are any finite
+    numbers.
     """
     return weighted_sums(canvas, image, Weights.of(canvas.types, deviation), means=True)
 

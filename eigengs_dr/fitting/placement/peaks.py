@@ -6,7 +6,7 @@ one size, and h hardly changes below them: with h of the pixel, ``<w, h w> = h <
 of g over h, and the largest reduction is where ``h c^2`` is largest.
 
 Images are in tile layout. A batch of images takes one launch of each kernel, and each image has
-peaks of its own.
+its own peaks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ...raster.parameters import gather_run
 from .filters import PIXELS, SIDE, Canvas, neighbourhood, radius_of
 
 SIZE = 0.6
-"""Standard deviation of an added Gaussian in pixels. The descent makes it as large as it should be.
+"""Standard deviation of an added Gaussian in pixels. The descent adapts its size.
 Peaks over three sizes in proportion to the mean spacing take four times as long, and have 0.01 to
 0.09 dB less, but 0.05 more with 10,000 Gaussians. 0.4 and 0.9 pixels lose 0.1 to 0.3 dB where
 Gaussians are dense (ten training photos of 256x256 pixels, 832 to 10,000 Gaussians, 300 to 3,000
@@ -83,7 +83,7 @@ def residual_peaks(canvas: Canvas, slope: Float, curvature: Float, count: int) -
     colors, maxima = _maxima(canvas, slope, curvature)
     place = dr.compress(maxima > 0)
     place, image, rank = _ranked(place, maxima, canvas, count)
-    if not dr.width(place):  # Dr.Jit does not compute with no elements
+    if not dr.width(place):  # Dr.Jit does not compute with empty arrays
         none = types.Float()
         return Peaks(types.Float2(none, none), [none] * channels, place, place)
     x, y, *_ = canvas.pixels(place)
@@ -131,7 +131,7 @@ def _blurred(rows: list, channels: int) -> list:
 
 
 def _if_maximum(rows: list, x: int, y: int) -> Float:
-    """Return a value if it is the largest of 3x3, of equal ones the first; 0 otherwise."""
+    """Return a value if it is the largest of 3x3, or the first of equal ones; 0 otherwise."""
     center, largest = rows[y][x], True
     for k in range(9):
         other = rows[y + k // 3 - 1][x + k % 3 - 1]

@@ -1,7 +1,7 @@
 """Centres of equal mass: pieces of a Hilbert curve through the pixels, and a Lloyd step.
 
-Masses and moments are sums of integers, in fixed point: they do not depend on the order in which a
-device adds.
+Masses and moments are sums of integers, in fixed point: they do not depend on the order of
+summation.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _curve_in_tile() -> list[tuple[int, int]]:
 
 
 CURVE = _curve_in_tile()
-"""Column and row of the pixels of a tile in the order of the curve, in the state 0."""
+"""Column and row of the pixels of a tile in the order of the curve, for state 0."""
 
 
 def curve_of(canvas: Canvas) -> tuple[UInt, UInt]:
@@ -234,8 +234,8 @@ FRACTION = 30
 """Bits behind the point of a mass."""
 
 LOCAL = dr.ReduceMode.Local
-"""Copies of an array for each thread, which is how Dr.Jit adds to small ones, make a program of its
-size."""
+"""Local mode, because Dr.Jit adds to small arrays in one copy per thread, which would make the
+program depend on their size."""
 
 
 def lloyd_step(
@@ -247,9 +247,9 @@ def lloyd_step(
     steps; of smooth images, 0.9 dB before the first step and 0.6 dB after 30 (8 crops of 96x96
     pixels, 40 and 300 Gaussians). Two searches took 2 and 4 % fewer Gaussians.
 
-    A centre counts as the middle of its pixel; of several in one pixel, only the last moves. The
-    squares of distances along both axes add up. Therefore the nearest centre is found along columns
-    first, and of those found along rows. A key holds the square, and both distances.
+    A centre counts as the middle of its pixel; if a pixel has several, only the last one moves. The
+    squares of distances along both axes add up. Therefore the nearest centres are found along
+    columns first, and the nearest of these along rows. A key holds the square, and both distances.
 
     Parameters
     ----------
