@@ -10,7 +10,7 @@ from .cone import pixel_angle
 from .versions import Texture, texture_class
 
 CLOSE = 1.25
-"""Ratio of a prefilter to the angle of a pixel that nobody sees."""
+"""Ratio of a prefilter to the angle of a pixel up to which nobody sees the difference."""
 
 
 def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:

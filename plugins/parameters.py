@@ -97,7 +97,7 @@ def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians
     ValueError
         If there is no tensor of this texture, or the shapes of the tensors do not match.
     """
-    return from_tensors(_found(parameters, texture), like)
+    return from_tensors(_tensors_in(parameters, texture), like)
 
 
 def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians) -> None:
@@ -111,13 +111,13 @@ def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians
     parameters, texture, like
         See `gaussians_of`. The function changes only entries of `parameters` that exist.
     """
-    found = _found(parameters, texture)
-    bounded = to_tensors(dr.detach(from_tensors(found, like)).bounded())
-    for name in found:
+    tensors = _tensors_in(parameters, texture)
+    bounded = to_tensors(dr.detach(from_tensors(tensors, like)).bounded())
+    for name in tensors:
         parameters[f"{texture}.{name}"] = bounded[name]
 
 
-def _found(parameters: Mapping[str, object], texture: str) -> Arrays:
+def _tensors_in(parameters: Mapping[str, object], texture: str) -> Arrays:
     keys = {name: f"{texture}.{name}" for name in FIELDS}
     found = {name: parameters[key] for name, key in keys.items() if key in parameters}
     if not found:
@@ -217,9 +217,9 @@ def shared_file(path: str, backend: str | None, first: int | None) -> SharedFile
         state = os.stat(path)
     identity = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
     key = (*identity, mi.variant(), backend, first)
-    found = _files.get(key)
+    file = _files.get(key)
     # While Dr.Jit copies the content, its thread may make another texture, which reads it first.
-    return found or _files.setdefault(key, SharedFile(path, backend, first))
+    return file or _files.setdefault(key, SharedFile(path, backend, first))
 
 
 SHAPES = ("mean", "factor")
@@ -237,7 +237,7 @@ class TextureParameters:
     Attributes
     ----------
     start : Gaussians
-        Those of a model at its mean, or a set like that of the texture, from `without_arrays`.
+        The set of a model at its mean, or a set like that of the texture, from `without_arrays`.
     read : dict of str to TensorXf
         The parameters at the start.
     tensors : dict of str to TensorXf
@@ -256,7 +256,7 @@ class TextureParameters:
     part: slice = field(default_factory=lambda: slice(None))
 
     def __post_init__(self) -> None:
-        # Own objects, so that each texture has its own gradient, of one memory.
+        # Separate objects on shared memory, so that each texture has its own gradient.
         self.tensors = {name: type(t)(t) for name, t in self.read.items()}
 
     @property
@@ -265,7 +265,7 @@ class TextureParameters:
         return int(self.tensors["mean"].shape[0]) if "mean" in self.tensors else len(self.start)
 
     def is_that_of_file(self) -> bool:
-        """Return whether the parameters have the memory of the file: nobody has changed them."""
+        """Return whether the parameters share the memory of the file: they have not changed."""
         unchanged = (t.array.index == self.read[k].array.index for k, t in self.tensors.items())
         return not dr.grad_enabled(self.tensors) and all(unchanged)
 
@@ -290,10 +290,10 @@ class TextureParameters:
 
     def _reconstruct(self, coefficients: Tensor) -> Gaussians:
         """Return the set of some coefficients of a model."""
-        start, found = self.start, tuple(coefficients.shape)
+        start, shape = self.start, tuple(coefficients.shape)
         expected = (len(self.weights), self.weights[0].shape[1])
-        if found != expected:
-            raise ValueError(f"coefficients has shape {found}, expected {expected}")
+        if shape != expected:
+            raise ValueError(f"coefficients has shape {shape}, expected {expected}")
         # An optimiser may leave values that are not finite; times zero weights, they give NaN.
         finite = dr.select(dr.isfinite(coefficients), coefficients, 0)
         types, count = types_of(start.mean), len(start)
@@ -312,12 +312,12 @@ def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> Te
 
     A channel with fewer components than others ignores the rest of its row.
     """
-    channels, most = len(model.weights), max(model.components)
-    weights = np.zeros((channels, len(model.gaussians) + 1, most), np.float32)
-    for padded, own in zip(weights, model.weights, strict=True):
-        padded[:, : len(own)] = own.T
+    channels, max_components = len(model.weights), max(model.components)
+    weights = np.zeros((channels, len(model.gaussians) + 1, max_components), np.float32)
+    for padded, matrix in zip(weights, model.weights, strict=True):
+        padded[:, : len(matrix)] = matrix.T
     if coefficients is None:
-        coefficients = np.zeros((channels, most), np.float32)
+        coefficients = np.zeros((channels, max_components), np.float32)
     tensors = {"coefficients": upload(mi.TensorXf, coefficients)}
     return TextureParameters(model.gaussians, tensors, [upload(mi.TensorXf, w) for w in weights])
 
@@ -349,7 +349,7 @@ def derived(inputs: Arrays, compute: Callable[[Arrays], Arrays]) -> Arrays:
 
 
 class _Derived(dr.CustomOp):
-    """The operation of `derived`: it keeps the graph of its own and walks it in both modes."""
+    """The operation of `derived`: it keeps its own graph and walks it in both modes."""
 
     def eval(self, inputs: Arrays, compute: Callable[[Arrays], Arrays]) -> Arrays:
         """Compute the arrays; `inputs` come without their derivatives."""
@@ -377,6 +377,6 @@ class _Derived(dr.CustomOp):
     def _walk(self, mode: dr.ADMode, source: Arrays, target: Arrays) -> Arrays:
         dr.enqueue(mode, source)
         dr.traverse(mode, dr.ADFlag.ClearInterior | dr.ADFlag.ClearInput)
-        found = dr.grad(target)
+        derivatives = dr.grad(target)
         dr.clear_grad(target)
-        return found
+        return derivatives

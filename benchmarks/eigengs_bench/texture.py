@@ -1,4 +1,4 @@
-"""How fast a texture of Gaussians is in Mitsuba, and what it holds: against a bitmap."""
+"""The speed and memory of a texture of Gaussians in Mitsuba, against a bitmap."""
 
 import math
 import time
@@ -21,7 +21,7 @@ from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.resize import resample
 from eigengs_dr.storage.npz import sizes_of
 
-SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples a pixel
+SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples per pixel
 COUNTS = (500, 5_000, 20_000)  # Gaussians of the textures
 SETTLED = 5_000  # Gaussians of the texture that is also prefiltered and differentiated
 CHANGED = (5_000, 50_000)  # Gaussians of the textures whose parameters change
@@ -48,7 +48,7 @@ def run(task: Task, variant: str) -> list[Row]:
 
 
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay out the figures of the last row of a ball, and what a user of the texture pays."""
+    """Lay out the figures of the last row of a ball, and the costs for a user of the texture."""
     balls = [row for row in rows if "poster" not in row["job"]]
     posters = [row for row in rows if "poster" in row["job"]]
     parts = [_posters(posters), _losses(balls, posters)] if posters else []
@@ -110,7 +110,7 @@ def _figures(row: Row, posters: Sequence[Row]) -> dict[str, str]:
 
 
 def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
-    """Lay out where Gaussians lose: figures over those of a bitmap, and what to use instead."""
+    """Lay out where Gaussians lose to a bitmap, and what to use instead."""
     row, kinds = balls[-1], ("photo", "material", "text")
     ratio = {k: [r["ratio"] for r in posters if r["kind"] == k] for k in kinds}
     floats = [r["ratio_floats"] for r in posters if r["kind"] != "text"]
@@ -156,7 +156,7 @@ LOOKUPS = {
 
 
 def _memory(row: Row) -> Table:
-    """Lay out what textures take in memory, beside bitmaps of the pixels of their pictures."""
+    """Lay out the memory of textures, beside that of bitmaps with the pixels of their pictures."""
     caption = (
         f"Memory of a texture of {PIXELS} pixels a Gaussian; seconds from file to first lookup"
     )
@@ -282,8 +282,8 @@ def _change(mi: Any, texture: Any, name: str) -> Any:
 
 
 def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None) -> Row:
-    """Measure what textures of files hold in memory, and how long their first lookup takes."""
-    found: Row = {}
+    """Measure the memory of textures from files, and the time to their first lookup."""
+    row: Row = {}
     for done, count in enumerate(HELD):
         side = round(math.sqrt(PIXELS * count))
         picture = resample(eg.sample("coffee")[:400, 100:500], side, side)
@@ -293,11 +293,11 @@ def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None)
             for name, given in ((str(count), 0.0), (f"filtered_{count}", angle)):
                 firsts = [_first_lookup(mi, path, given) for _ in range(4)]
                 bytes_held = firsts[0][0]
-                found[f"bytes_{name}"] = bytes_held
-                found[f"held_{name}"] = bytes_held / sum(sizes_of(path).values())
-                found[f"first_{name}_ms"] = 1e3 * median(s for _, s in firsts[1:])  # compiled
+                row[f"bytes_{name}"] = bytes_held
+                row[f"held_{name}"] = bytes_held / sum(sizes_of(path).values())
+                row[f"first_{name}_ms"] = 1e3 * median(s for _, s in firsts[1:])  # compiled
         progress("files", done + 1, len(HELD))
-    return found
+    return row
 
 
 def _first_lookup(mi: Any, path: Path, angle: float) -> tuple[int, float]:

@@ -52,7 +52,7 @@ NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directl
 
 
 class ConvertedTexture(NamedTuple):
-    """An image, as bitmaps and as Gaussians.
+    """An image as bitmaps and as Gaussians.
 
     Attributes
     ----------
@@ -104,12 +104,12 @@ class ConvertedScene(NamedTuple):
     better : list of ConvertedTexture
         Bitmaps that stayed, since they take less memory or time than Gaussians.
     left : list of (str, str)
-        What else stayed as it was, and why.
+        What else stayed, and why.
     psnr : list of float
         psnr_rgb in dB between the renderings of each camera; both have the same random numbers.
     noise : list of float
-        psnr_rgb between two renderings of the scene as it was, with other random numbers. Empty if
-        its environment map stays: the directions of another one are others.
+        psnr_rgb between two renderings of the original scene with different random numbers. Empty
+        if its environment map stays, since only a new one is sampled differently.
     """
 
     scene: Path
@@ -129,7 +129,7 @@ class ConvertedScene(NamedTuple):
 
 
 NOISE = 0.5
-"""Decibels by which renderings of other random numbers may differ more than others do."""
+"""Decibels by which renderings with other random numbers may vary."""
 
 
 @shows_progress
@@ -167,7 +167,7 @@ def convert_scene(
     parameters : mapping of str to str, optional
         Values for the defaults of an XML file.
     replace_all : bool, optional
-        Whether better bitmaps are replaced too: Gaussians are differentiable, and have no texels.
+        Whether to replace better bitmaps too: Gaussians are differentiable, and have no texels.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(label, done, total)``.
@@ -191,7 +191,7 @@ def convert_scene(
     Warns
     -----
     UserWarning
-        If a rendering after misses `target_psnr` against the one before.
+        If a rendering after the conversion misses `target_psnr` against the one before.
 
     Examples
     --------
@@ -233,7 +233,7 @@ class Settings(NamedTuple):
 
 
 def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
-    """Raise ValueError if there is something in a folder to write."""
+    """Raise ValueError if the output folder is not empty."""
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{output}: exists and is not empty; choose another folder")
 
@@ -254,26 +254,26 @@ def _convert_into(
     original = Original(make, settings.spp)
     uses, left = uses_of(again, original.key_of)
     result = ConvertedScene(work / SCENE, [], [], left, [], [])
-    made = dict[int, str]()
+    replacements = dict[int, str]()
     groups: dict[tuple[str, bool, bool], list[Use]] = {}
     on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
-        if any(original.textures([use])[0] in found for found in on_shapes):
+        if any(original.textures([use])[0] in hierarchy for hierarchy in on_shapes):
             groups.setdefault((use.file, use.raw, use.is_height), []).append(use)
         else:
             left.append((use.name, NO_SHAPE))
     sky = environment_of(again)
     total = len(groups) + (sky is not None)
 
-    def add(found: ConvertedTexture | str, nodes: dict[int, str]) -> None:
-        """Add what has become of an image, whose nodes have names."""
-        if isinstance(found, str):
-            left.extend((name, found) for name in nodes.values())
-        elif not found.file:
-            result.better.append(found)
+    def add(outcome: ConvertedTexture | str, nodes: dict[int, str]) -> None:
+        """Record the outcome for an image, with the names of its nodes."""
+        if isinstance(outcome, str):
+            left.extend((name, outcome) for name in nodes.values())
+        elif not outcome.file:
+            result.better.append(outcome)
         else:
-            result.textures.append(found)
-            made.update(dict.fromkeys(nodes, found.file))
+            result.textures.append(outcome)
+            replacements.update(dict.fromkeys(nodes, outcome.file))
 
     for number, group in enumerate(groups.values()):
         progress("textures", number, total)
@@ -281,8 +281,8 @@ def _convert_into(
             group[0].file, group[0].raw, {texture.file for texture in result.textures}
         )
         pixels = read_pixels(again.state.nodes[group[0].node].props)
-        found = _convert(original, group, pixels, file, settings)
-        add(found, {use.node: use.name for use in group})
+        outcome = _convert(original, group, pixels, file, settings)
+        add(outcome, {use.node: use.name for use in group})
     if sky is not None:
         progress("textures", len(groups), total)
         props = again.state.nodes[sky].props
@@ -292,14 +292,14 @@ def _convert_into(
         add(_convert_sky(original, name, read_pixels(props), file, settings), {sky: name})
     progress("textures", total, total)
     _mark_integrator(original, again)
-    _rewrite(again, made, work, target)
+    _rewrite(again, replacements, work, target)
     result.scene.write_text(_to_xml(again), encoding="utf-8")
     if settings.spp != 0:
         progress("renderings", 0, 2)
         after = pictures(mi.load_file(str(result.scene)), settings.spp)
         progress("renderings", 1, 2)
         result.psnr.extend(compare(original.pictures, after, work))
-        if sky in made:
+        if sky in replacements:
             others = pictures(original.scene, settings.spp, seed=1 << 16)
             result.noise.extend(map(psnr, original.pictures, others))
         progress("renderings", 2, 2)
@@ -318,7 +318,7 @@ def _convert(
 ) -> ConvertedTexture | str:
     """Fit the image of some uses and save the set, or return why it must stay.
 
-    Where the bitmap is better, there is no file.
+    If the bitmap is better, there is no file.
     """
     use, asked = group[0], (settings.target_psnr, settings.iterations)
     try:
@@ -383,11 +383,11 @@ def _chosen(
     )
 
 
-def _file_name(image: str, raw: bool, taken: set[str]) -> str:
-    """Name the file of a set by its image."""
+def _file_name(image: str, raw: bool, used: set[str]) -> str:
+    """Name the file of a set after its image."""
     stem = Path(image).stem
     names = [f"{stem}.npz", f"{stem}-data.npz", *(f"{stem}-{k}.npz" for k in range(2, 1000))]
-    return next(name for name in names[raw and f"{stem}.npz" in taken :] if name not in taken)
+    return next(name for name in names[raw and f"{stem}.npz" in used :] if name not in used)
 
 
 # --- The scene -----------------------------------------------------------------------------------
@@ -401,19 +401,19 @@ def _mark_integrator(original: Original, parsed: Parsed) -> None:
             nodes[parsed.state.root.props[slot].index()].type = mi.ObjectType.Integrator
 
 
-def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> None:
+def _rewrite(parsed: Parsed, replacements: dict[int, str], work: Path, target: Path) -> None:
     """Put the sets in the place of the bitmaps, and name other files relative to the folder.
 
-    `made` holds the new file for the index of each node that was a bitmap. Bitmaps that stay, and
-    sets that were there, become files too if they are in memory.
+    `replacements` holds the new file for the index of each node that was a bitmap. Bitmaps that
+    stay, and sets that were there already, become files too if they are in memory.
     """
     for index, node in enumerate(parsed.state.nodes):
         props = node.props
-        if index in made:
-            replace_bitmap(props, made[index])
+        if index in replacements:
+            replace_bitmap(props, replacements[index])
             continue
         if props.plugin_name() == GAUSSIANS and "to_uv" in props:
-            props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML lacks
+            props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML cannot hold
         is_set = props.plugin_name() in (GAUSSIANS, SKY)
         if is_set and ("mean" in props or "coefficients" in props):
             _save_set(props, work, f"gaussians-{index}.npz")

@@ -173,7 +173,7 @@ def test_a_bump_map_that_keeps_the_renderings_alike(folder, tmp_path, raw):
 def test_a_bump_map_without_renderings_stays(folder, tmp_path):
     found = eg.convert_scene(bumpy(folder, "waves.png"), tmp_path / "new", spp=0, **QUICK)
     [(_, reason)] = found.left
-    assert found.textures == [] and "renderings decide, and none is wanted" in reason
+    assert found.textures == [] and "renderings decide, and none was asked for" in reason
 
 
 def test_nothing_is_rendered_on_request(folder, tmp_path):
