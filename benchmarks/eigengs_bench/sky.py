@@ -85,7 +85,7 @@ def compare(variant: str, name: str) -> Row:
     mi.set_variant(variant)
     register_plugins()
     light = LIGHTS[name](ROWS)
-    bitmap = {"type": "envmap", "bitmap": mi.Bitmap(light)}
+    bitmap: dict[str, Any] = {"type": "envmap", "bitmap": mi.Bitmap(light)}
     held = resident_bytes(mi.load_dict(bitmap))
     plain = scene_of(mi, bitmap)
     gaussians, _ = fit_environment(plain, light, GOAL, STEPS, held)
