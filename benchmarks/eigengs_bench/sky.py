@@ -4,7 +4,7 @@ The set is the one that `eigengs-dr convert` finds, for a PSNR of 40 dB of the p
 light that it gives to surfaces.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -85,13 +85,15 @@ def compare(variant: str, name: str) -> Row:
     mi.set_variant(variant)
     register_plugins()
     light = LIGHTS[name](ROWS)
-    bitmap: dict[str, Any] = {"type": "envmap", "bitmap": mi.Bitmap(light)}
+    bitmap = {"type": "envmap", "bitmap": mi.Bitmap(light)}
     held = resident_bytes(mi.load_dict(bitmap))
     plain = scene_of(mi, bitmap)
     gaussians, _ = fit_environment(plain, light, GOAL, STEPS, held)
     sums = environment_of(gaussians)
     scenes = {"bitmap": plain, "gaussians": scene_of(mi, sums)}
-    programs = {key: partial(mi.render, scene) for key, scene in scenes.items()}
+    programs: dict[str, Callable[[], Any]] = {
+        key: partial(mi.render, scene) for key, scene in scenes.items()
+    }
     timed = interleaved(programs, WARM_UP, ROUNDS)
     true, seen = (lookups(mi, emitter) for emitter in (bitmap, sums))
     before, after = (pictures(mi, scene) for scene in scenes.values())
