@@ -19,6 +19,7 @@ from eigengs_bench.names import (
     SETS,
     SOLVE_STEPS,
     TABLES,
+    TEXTURE_PARTS,
 )
 from eigengs_bench.rows import FILE, Row, Task, code_state
 from eigengs_bench.rows import record as record_rows
@@ -268,13 +269,17 @@ def kernels() -> None:
 
 @question("texture")
 @data_argument
+@several("--part", "parts", TEXTURE_PARTS, "What to compare", TEXTURE_PARTS)
 @click.option("--variant", default="llvm_ad_rgb", help="Variant of Mitsuba.")
 def texture() -> None:
-    """Compare textures of Gaussians with bitmaps in Mitsuba: memory, and the time of a render.
+    """Compare Gaussians with bitmaps in Mitsuba: memory, time and pictures.
 
-    A material ball is timed. A poster seen at a slant shows how much memory a bitmap and Gaussians
-    take for equally good pictures; DATA has three of the posters in textures/. A poster takes a
-    minute.
+    \b
+    posters  a bitmap and Gaussians that look alike at a slant; DATA has three of them in textures/
+    lights   an envmap and Gaussians, over a ball
+    ball     the time of a material ball, and what textures hold
+
+    A poster takes a minute.
     """
 
 

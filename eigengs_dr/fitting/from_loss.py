@@ -33,6 +33,11 @@ PIXELS_PER_GAUSSIAN = 16
 """Pixels of the picture per Gaussian, if nothing indicates how many the scene needs. On the scenes
 of ``bench inverse`` with the photo "coffee", it ends within 0.4 dB of the best number."""
 
+BRIGHT = 2.0
+"""Logarithm of light that a pyramid of texels is to reach, that of light 100. Of three made-up
+lights with a sun or windows, by six photos of a metal ball, 240 steps with twice the rate of light
+to 1 found 0.6 dB more in PU21."""
+
 FIRST_PIXELS = 128
 """Pixels of the picture per Gaussian, for the smallest number that a judge tries."""
 
@@ -187,7 +192,8 @@ def _descend_texels(
     problem: Problem, coarse: Coarse, steps: int, ended: Callable[[int], bool]
 ) -> LossObjective:
     """Return the objective of a loss near the picture of a pyramid of texels."""
-    grey, (low, high) = problem.grey(), problem.loss.bounds or (0.0, 1.0)
+    no_end = all(view.space == "log" for view in problem.views)
+    grey, (low, high) = problem.grey(), problem.loss.bounds or (0.0, BRIGHT if no_end else 1.0)
     objective = problem.near(np.tile(grey, problem.size[0] * problem.size[1]))
     sums = coarse_picture(objective, coarse, steps, grey.tolist(), high - low, ended)
     return replace(problem.near(sums.numpy()), calls=objective.calls)

@@ -18,8 +18,8 @@ from skimage.transform import resize_local_mean
 
 from ..fitting.fit import fit
 from ..fitting.options import Goal
-from ..gaussian.gaussians import Gaussians
-from ..image.color import to_coded
+from ..gaussian.gaussians import Gaussians, with_colors
+from ..image.color import LOG_SLOPE, from_log, to_coded, to_log
 from ..image.metrics import psnr
 from ..plugins.cone import pixel_angle
 from ..raster.render import render
@@ -37,6 +37,9 @@ cameras."""
 
 BYTES = 100
 """Fewest bytes of a Gaussian in memory; they limit a set to the memory of its bitmap."""
+
+NEWTON, TINY = 4, 1e-30
+"""Steps of `with_mean_of`, and a divisor for black maps."""
 
 BLOCKS, NORMALS = (32, 64), (9, 16)
 """Rows and columns of the directions of light, and of the normals of surfaces."""
@@ -97,11 +100,53 @@ def fit_environment(
             encoding="linear",
             progress=False,
         )
-        kept = closeness(_means(result.gaussians), target)
+        balanced = with_mean_of(target, result.gaussians)
+        kept = closeness(_means(balanced), target)
         if kept >= target_psnr:
-            return result.gaussians.scaled(width, height), kept
-        reached.append(f"{kept:.1f} dB with {len(result.gaussians):,} Gaussians")
+            return balanced.scaled(width, height), kept
+        reached.append(f"{kept:.1f} dB with {len(balanced):,} Gaussians")
     raise Unsuitable(f"an environment map: {', '.join(reached)} for a goal of {target_psnr:g} dB")
+
+
+def with_mean_of(target: NDArray[np.float32], gaussians: Gaussians) -> Gaussians:
+    """Return a set whose light has the mean of a map over the sphere, in each channel.
+
+    A sun has most of the light of a map and few of its texels, so a fit of logarithms may miss the
+    mean by a few percent. Light is multiplied by a factor. Logarithms c become ``c + g c + s``: of
+    all g and s that give the mean, those with the smallest ``sum of (g c + s)^2``, by Newton steps.
+
+    Parameters
+    ----------
+    target : ndarray of float32, shape (H, W, 3)
+        Linear light.
+    gaussians : Gaussians
+        Of three channels, near the target, in the space "linear", "radiance" or "log".
+
+    Returns
+    -------
+    Gaussians
+        With other colours and another background.
+    """
+    in_logarithms = gaussians.space == "log"
+    codes = np.float64(_means(gaussians))
+    codes = to_log(codes) if in_logarithms else codes
+    area = _areas(target) / _areas(target).sum()
+    arrays = gaussians.to_arrays()
+    rows = np.float64(np.vstack([arrays["color"], arrays["background"].reshape(1, -1)]))
+    for channel, wanted in enumerate(np.einsum("hwc,hw->c", target, area)):
+        code, change = codes[..., channel], np.zeros(1 + in_logarithms)
+        moves = np.stack([code, np.ones_like(code)][: len(change)])
+        metric = np.linalg.pinv(np.einsum("ihw,jhw,hw->ij", moves, moves, area))
+        for _ in range(NEWTON):
+            light = code + np.tensordot(change, moves, 1)
+            light = from_log(light) if in_logarithms else light
+            slope = math.log1p(LOG_SLOPE) * (light + 1 / LOG_SLOPE) if in_logarithms else 1.0
+            rate = np.einsum("ihw,hw->i", moves, slope * area)
+            step = metric @ rate
+            change += step * (wanted - (light * area).sum()) / max(rate @ step, TINY)
+        rows[:, channel] *= 1 + change[0]
+        rows[-1, channel] += change[1:].sum()
+    return with_colors(gaussians, rows, gaussians.space)
 
 
 def _means(gaussians: Gaussians) -> NDArray[np.float32]:
@@ -125,13 +170,18 @@ def _as_seen(pixels: NDArray[np.float32], scene: mi.Scene) -> NDArray[np.float32
 
 def closeness(texels: NDArray[np.float32], target: NDArray[np.float32]) -> float:
     """Return the lower PSNR in dB of two maps, shape (H, W, 3): as pictures, and as light."""
-    theta = (np.arange(len(target)) + 0.5) * (np.pi / len(target))
-    area = np.repeat(np.sin(theta)[:, None], target.shape[1], axis=1)
+    area = _areas(target)
     codes = [to_coded(k.clip(0, 1)) for k in (texels, target)]
     seen = psnr(codes[0], codes[1], weight=area)
     lights = [_irradiance(k * area[..., None]) for k in (texels, target)]
     white = max(float(lights[1].max()), 1e-12)
     return min(seen, psnr(*(to_coded((k / white).clip(0, 1)) for k in lights)))
+
+
+def _areas(light: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the areas on the sphere of the texels of a map, but for a factor, shape (H, W)."""
+    theta = (np.arange(len(light)) + 0.5) * (np.pi / len(light))
+    return np.repeat(np.sin(theta)[:, None], light.shape[1], axis=1)
 
 
 def _irradiance(light: NDArray[np.floating]) -> NDArray[np.float64]:
