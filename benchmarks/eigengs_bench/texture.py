@@ -141,7 +141,9 @@ def _figures(balls: Sequence[Row], posters: Sequence[Row]) -> dict[str, str]:
     pictures = [one for one in posters if one["kind"] != "text"]
     medians = {k: median(one[k] for one in pictures) for k in ("ratio", "ratio_floats") if pictures}
     timed = {name: row[f"ratio_{name}"] for row in balls[-1:] for name in ("prefiltered", "step")}
-    return {name: f"{value:.2f}" for name, value in (medians | timed).items()}
+    held = [row[f"held_{count}"] for row in balls[-1:] for count in HELD]
+    range_held = {"held": f"{min(held):.1f} to {max(held):.1f}"} if held else {}
+    return {name: f"{value:.2f}" for name, value in (medians | timed).items()} | range_held
 
 
 def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
