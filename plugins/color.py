@@ -215,17 +215,17 @@ def slope_of(texture: Texture, value: Float) -> Float:
     elif texture.space in ("ycbcr", "rgb"):
         curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
         slope = dr.select(value <= 0.04045, 1 / 12.92, curved)
-    shown = (value >= 0) & ((value <= 1) | (texture.space in UNBOUNDED))
-    return dr.select(shown, slope, 0)
+    within = (value >= 0) & ((value <= 1) | (texture.space in UNBOUNDED))
+    return dr.select(within, slope, 0)
 
 
 def luminance(color: list) -> Float:
-    """Return the luminance of three channels, or the one channel there is."""
+    """Return the luminance of three channels, or the single channel."""
     return color[0] if len(color) == 1 else mi.luminance(mi.Color3f(*color))
 
 
 def brightness(texture: Texture, color: list) -> Float:
-    """Return what the texture reflects or emits in the mean: of wavelengths, where it has spectra.
+    """Return the mean that the texture reflects or emits: over wavelengths, where it has spectra.
 
     Parameters
     ----------

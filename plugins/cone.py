@@ -1,6 +1,6 @@
 """The footprint of a pixel on a texture: the cone of the pixel, cut by the surface.
 
-Mitsuba 3.10 finds the footprints of what the camera sees directly; else the angle of a pixel does.
+Mitsuba 3.10 gives footprints where the camera sees directly; elsewhere the angle of a pixel does.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ def current_angle(sensor: mi.Sensor) -> Float:
 
 def footprint_inputs() -> tuple[str, ...]:
     """Return the attributes of a surface interaction from which `seen_metric` finds a footprint."""
-    own = ("footprint",) if has_footprints() else ()
-    return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *own)
+    carried = ("footprint",) if has_footprints() else ()
+    return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *carried)
 
 
 def seen_metric(si: Interaction, inverse: tuple, angle: Float | None) -> tuple[list, Bool]:
-    """Return the metric of the renderer's footprint, or where there is none, of the cone's.
+    """Return the metric of the renderer's footprint, or of the cone's where there is none.
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def seen_metric(si: Interaction, inverse: tuple, angle: Float | None) -> tuple[l
     ValueError
         If there is no angle, and rays carry no footprints.
     """
-    found = footprint_of(si)
-    if found is None:
+    footprint = footprint_of(si)
+    if footprint is None:
         if angle is None:
             raise ValueError(
                 "gaussian_texture: prefilter = true needs a sensor, since rays of Mitsuba "
@@ -89,7 +89,7 @@ def seen_metric(si: Interaction, inverse: tuple, angle: Float | None) -> tuple[l
                 "sensor), or render by 'eigengs-dr scene'"
             )
         return metric(si, inverse, angle)
-    entries, present = footprint_metric(found, inverse)
+    entries, present = footprint_metric(footprint, inverse)
     if angle is None:
         return entries, present
     others, valid = metric(si, inverse, angle)

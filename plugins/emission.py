@@ -1,6 +1,6 @@
 """The brightness of the texture over uv, which gives its mean, its maximum and its emission.
 
-A survey evaluates the shown brightness at the centres of cells, the midpoint rule. By Poisson's
+A survey evaluates the displayed brightness at the centres of cells, the midpoint rule. By Poisson's
 summation formula, the rule with the spacing h gives the integral of a Gaussian with the standard
 deviation s to ``2 exp(-2 (pi s / h)^2)``: to 5e-4 for ``h = s / RESOLVED``. Values that are clamped
 or decoded have no closed form; the same points give their mean to the order of ``h^2``.
@@ -33,7 +33,7 @@ from .color import brightness, keep_finite, show_all
 from .versions import Texture
 
 RESOLVED = 0.65
-"""Standard deviation of a Gaussian, in spacings of the points, that the points resolve."""
+"""Smallest standard deviation of a Gaussian that points resolve, in spacings of the points."""
 
 FINEST, COARSEST = 0.25, 1.0
 """Smallest and largest spacing of the points, in texels; the largest is that of a bitmap."""
@@ -57,7 +57,7 @@ class Survey(NamedTuple):
 
 
 class Spacing(NamedTuple):
-    """How far apart the points of a survey are.
+    """Spacing of the points of a survey.
 
     Attributes
     ----------
@@ -113,13 +113,13 @@ def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
 
 
 def light_at(texture: Texture, uv: mi.Point2f) -> Float:
-    """Return the shown brightness at points of uv, without gradients and without a footprint."""
+    """Return the displayed brightness at points of uv, without gradients and footprints."""
     with dr.suspend_grad():
         return _light_at(texture, uv, texture.table.lists.cells, texture.table.packed)
 
 
 def _light_at(texture: Texture, uv: mi.Point2f, cells: CellLists, packed: Packed) -> Float:
-    """Return the brightness of a texture whose Gaussians these are."""
+    """Return the brightness of a texture with these Gaussians."""
     (x, _), (y, _), _ = texture.point(uv)
     sums = sum_at_points(cells, packed, x, y, mi.Bool(True), value_terms(packed))
     sums = sums[texture.part] if packed.channels > texture.channels else sums
@@ -131,21 +131,21 @@ def _light_at(texture: Texture, uv: mi.Point2f, cells: CellLists, packed: Packed
 
 
 def _smallest_deviation(shape: list, color: list) -> float:
-    """Return the smallest standard deviation of drawn Gaussians, in texels."""
+    """Return the smallest standard deviation of visible Gaussians, in texels."""
     a, b, c, *values = (np.asarray(row.numpy(), np.float64) for row in [*shape[2:], *color])
-    drawn = (a > 0) & (c > 0) & (np.abs(values).sum(axis=0) > 0)
+    visible = (a > 0) & (c > 0) & (np.abs(values).sum(axis=0) > 0)
     with np.errstate(all="ignore"):  # the axes have the product 1 / (a c)
         deviation = EXP2_SCALE / (a * c * max_deviation(a, b, c))
-    return float(deviation[drawn & np.isfinite(deviation)].min(initial=1e6))
+    return float(deviation[visible & np.isfinite(deviation)].min(initial=1e6))
 
 
 def _grid(texture: Texture, smallest: float, spacing: Spacing) -> tuple[int, int, float]:
     """Return the number of columns and rows of points, and their spacing in texels."""
     spans, multiple = np.minimum(texture.spans(), 1e9), spacing.multiple
-    wanted = spans / min(max(smallest / spacing.resolved, spacing.finest), spacing.coarsest)
-    wanted *= min(1.0, math.sqrt(MOST / wanted.prod()))
+    counts = spans / min(max(smallest / spacing.resolved, spacing.finest), spacing.coarsest)
+    counts *= min(1.0, math.sqrt(MOST / counts.prod()))
     columns, rows = (
-        multiple * math.ceil(max(FEWEST, n) / multiple) for n in np.minimum(wanted, MOST / FEWEST)
+        multiple * math.ceil(max(FEWEST, n) / multiple) for n in np.minimum(counts, MOST / FEWEST)
     )
     return columns, rows, float((spans / (columns, rows)).max())
 

@@ -45,12 +45,12 @@ def environment_of(gaussians: Gaussians | Fitted, **properties: object) -> Recor
     return plugin_of("gaussian_environment", gaussians, **properties)
 
 
-def texels_of(known: mi.SceneParameters, key: str, picture: Tensor) -> Tensor:
-    """Return a picture as the texels of a parameter: those of an ``envmap`` have more columns.
+def texels_of(parameters: mi.SceneParameters, key: str, picture: Tensor) -> Tensor:
+    """Return a picture as the texels of a parameter; an ``envmap`` has extra columns.
 
     Parameters
     ----------
-    known : mitsuba.SceneParameters
+    parameters : mitsuba.SceneParameters
     key : str
         Name of the texels.
     picture : TensorXf, shape (H, W, C)
@@ -58,9 +58,10 @@ def texels_of(known: mi.SceneParameters, key: str, picture: Tensor) -> Tensor:
     Returns
     -------
     TensorXf
-        Differentiable. Of an ``envmap``, light from 0, and the columns beyond the seam.
+        Differentiable. For an ``envmap``, light is clamped at 0, and columns beyond the seam are
+        added.
     """
-    node = known.properties[key][2]
+    node = parameters.properties[key][2]
     if not isinstance(node, mi.Emitter):
         return mi.TensorXf(picture)
     height, width, channels = picture.shape
@@ -112,7 +113,7 @@ def bake_environment(
             f"bake_environment: the set has {gaussians.channels} channels in the space "
             f"{gaussians.space!r}; it needs three of light or colour"
         )
-    shown = render(gaussians, width, height).numpy()
-    light = to_linear(shown) if encoding == "srgb" else shown
+    picture = render(gaussians, width, height).numpy()
+    light = to_linear(picture) if encoding == "srgb" else picture
     bitmap = mi.Bitmap(np.maximum(light, 0).astype(np.float32))
     return {"type": "envmap", "bitmap": bitmap, **properties}

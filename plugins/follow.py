@@ -10,7 +10,7 @@ from .cone import pixel_angle
 from .versions import Texture, texture_class
 
 CLOSE = 1.25
-"""Ratio of a prefilter to the angle of a pixel that nobody sees."""
+"""Ratio of a prefilter to the angle of a pixel up to which nobody sees the difference."""
 
 
 def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
@@ -31,6 +31,8 @@ def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
     ------
     ValueError
         If the sensor has no field of view.
+    TypeError
+        If the scene is none.
 
     Examples
     --------
@@ -42,6 +44,7 @@ def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
     >>> scene = mi.load_dict({"type": "scene", "wall": wall, "sensor": {"type": "perspective"}})
     >>> follow(scene)
     """
+    check_scene("follow", scene)
     for plugin in plugins_of(scene):
         plugin.follow(sensor_of(scene, sensor))
 
@@ -71,6 +74,15 @@ def follow_where_asked(scene: mi.Scene, sensor: mi.Sensor | int) -> None:
 def sensor_of(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
     """Return a sensor, or that of a number in the scene."""
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def check_scene(function: str, scene: object) -> None:
+    """Raise `TypeError` if the argument of a function is no scene, but its file or dictionary."""
+    if not isinstance(scene, mi.Scene):
+        raise TypeError(
+            f"{function}: scene is a {type(scene).__name__}; give a loaded one, by mi.load_file or "
+            "mi.load_dict"
+        )
 
 
 def plugins_of(scene: mi.Scene) -> list[Texture]:

@@ -29,10 +29,10 @@ from .sums import plugin_of_sums
 from .versions import Interaction, Properties
 
 FAR = 1e8
-"""Distance of what is infinitely far. Mitsuba 3.9 tells emitters in Python nothing of the scene."""
+"""Distance that stands for infinity. Mitsuba 3.9 tells Python emitters nothing about the scene."""
 
 ROUNDING = 1e-4
-"""Relative margin of the bounds of a scene, and the smallest ones."""
+"""Relative margin of the bounds of a scene, and smallest radius of the bounds."""
 
 WRAP = "sphere"
 
@@ -60,7 +60,7 @@ def gaussian_environment() -> type:
         model : string
             Instead of `filename`: a model, as ``eigengs-dr train`` writes it.
         coefficients : tensor (C, k), default: 0
-            With `model`: one row a channel; 0 is the mean image.
+            With `model`: one row per channel; 0 is the mean image.
         mean : tensor (N, 2)
             Instead of `filename`: x, y in pixels.
         factor : tensor (N, 3)
@@ -75,7 +75,7 @@ def gaussian_environment() -> type:
             With `mean`: ``radiance`` or ``log``; or ``linear``, ``rgb`` or ``ycbcr``, whose light
             ends at 1.
         to_world : transform, default: identity
-            Turns the light; the zenith is the y axis before.
+            Rotates the light; before, the zenith is the y axis.
         scale : float, default: 1
             Factor of the light.
         prefilter : float or boolean, default: 0
@@ -125,7 +125,7 @@ def gaussian_environment() -> type:
             return light_at(self, uv).numpy().reshape(u.shape)
 
         def set_scene(self, scene: mi.Scene) -> None:
-            """Take the bounds of a scene, which rays from the light need: they are NaN without.
+            """Take the bounds of a scene, without which rays from the light are NaN.
 
             Mitsuba 3.9 does not call this method of a plugin in Python.
             """
@@ -138,7 +138,7 @@ def gaussian_environment() -> type:
 
         # --- Lookups -----------------------------------------------------------------------------
 
-        # Why without the collector: see `eigengs_dr.plugins.gaussian_texture`.
+        # For why the collector is off, see `eigengs_dr.plugins.gaussian_texture`.
 
         @collector_off()
         def eval(self, si: Interaction, active: Mask = True) -> mi.Spectrum:
@@ -198,7 +198,7 @@ def gaussian_environment() -> type:
             column, row, inside = self.point(uv)
             where = inside & active
             sums = self.sums_at(column, row, where, self._footprint(uv))
-            color = [dr.select(where, self.scale * c, 0) for c in self.shown(sums)]
+            color = [dr.select(where, self.scale * c, 0) for c in self.display(sums)]
             if mi.is_monochromatic:
                 return mi.UnpolarizedSpectrum(luminance(color))
             rgb = mi.Color3f(*color)

@@ -43,7 +43,7 @@ def gaussian_texture() -> type:
         model : string
             Instead of `filename`: a model, as ``eigengs-dr train`` writes it.
         coefficients : tensor (C, k), default: 0
-            With `model`: one row a channel; 0 is the mean image.
+            With `model`: one row per channel; 0 is the mean image.
         mean : tensor (N, 2)
             Instead of `filename`: x, y in pixels.
         factor : tensor (N, 3)
@@ -61,14 +61,14 @@ def gaussian_texture() -> type:
         to_uv : transform, default: identity
             Applied to uv before the lookup; it must be invertible.
         wrap_mode : string, default: repeat
-            What lies outside: ``repeat``, ``mirror`` or ``clamp``.
+            Continuation outside of the image: ``repeat``, ``mirror`` or ``clamp``.
         raw : boolean, default: false
             Return values as they are, neither decoded nor clamped.
         prefilter : float or boolean, default: 0
             Angle of a pixel in radians, below 1, see `pixel_angle`: lookups average over the
             footprint of the pixel; 0 looks at points. With ``true`` the texture follows a sensor:
             call `follow` before a rendering, as ``eigengs-dr scene`` does. Footprints that rays
-            carry (Mitsuba 3.10) go before both. Slopes of bump maps ignore footprints.
+            carry (Mitsuba 3.10) take precedence over both. Slopes of bump maps ignore footprints.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         """
@@ -155,7 +155,7 @@ def gaussian_texture() -> type:
             inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
             sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))
             _, _, inside = self.point(si.uv)
-            return [dr.select(inside & active, s, 0) for s in self.shown(sums)]
+            return [dr.select(inside & active, s, 0) for s in self.display(sums)]
 
         def _look_up(self, si: Interaction) -> list:
             """Sum all channels of the table, in all lanes."""

@@ -39,7 +39,7 @@ AGAIN = 256
 """Largest number of blocks that are evaluated again: a million points."""
 
 NEVER = 2.0
-"""Start of leaves that fill the array: no sample is as large."""
+"""Start of the leaves that pad the array: larger than any sample."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def importance_of(
 
 
 def _roots(squares: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return ``sqrt(mean f^2)`` of leaves by level, from one leaf a block: a row a block.
+    """Return ``sqrt(mean f^2)`` of leaves by level, from one leaf per block; a row per block.
 
     Parameters
     ----------
@@ -165,15 +165,15 @@ def _roots(squares: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         In each block.
     """
     squares = squares.reshape(-1, *squares.shape[2:])
-    found = [np.sqrt(squares).reshape(len(squares), -1)]
+    roots = [np.sqrt(squares).reshape(len(squares), -1)]
     while (side := squares.shape[1] // 2) > 0:
         squares = squares.reshape(-1, side, 2, side, 2).mean(axis=(2, 4))
-        found.insert(0, np.sqrt(squares).reshape(len(squares), -1))
-    return found
+        roots.insert(0, np.sqrt(squares).reshape(len(squares), -1))
+    return roots
 
 
 def _levels(roots: list, price: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the level of each block at a price of a leaf, and what one level less would lose."""
+    """Return the level of each block at a price per leaf, and what one level less would lose."""
     losses = np.stack([r.mean(axis=1) for r in roots])
     losses -= losses[-1]
     prices = price * 4.0 ** np.arange(len(roots))

@@ -1,6 +1,6 @@
 """What lookups of ``gaussian_texture`` read, and the lookups: at a point, or over a footprint.
 
-A material that asks twice about a point pays once. A BSDF looks its textures up in its evaluation
+A material that looks a point up twice pays once. A BSDF looks its textures up in its evaluation
 and again in its sampling, often in one recorded program. Dr.Jit merges equal gathers of a bitmap,
 but not equal loops. Textures of the maps of one file share a table, so they share lookups too:
 the weights of the Gaussians are summed once for all channels.
@@ -50,7 +50,7 @@ class Lists:
     sizes : SizeClasses or None
         The Gaussians near every footprint; None without a prefilter.
     finest : TileLists or None
-        Those of the finest level of the pyramid; None where nobody has changed parameters.
+        Those of the finest level of the pyramid; None while no parameter has changed.
     """
 
     cells: CellLists
@@ -114,28 +114,28 @@ def make_table(
         parameters = decode(inputs)
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
         rows = invert(shape, color) if sizes else (shape, color)
-        found: Arrays = {
+        arrays: Arrays = {
             "packed": cells.pack(*rows),
             "background": [keep_finite(b) for b in parameters.background],
         }
-        dr.eval(found)
+        dr.eval(arrays)
         if sizes is not None and finest is not None:
-            packed = Packed(found["packed"], len(color), cutoff, inverted=True)
+            packed = Packed(arrays["packed"], len(color), cutoff, inverted=True)
             pyramid = build_pyramid(sizes, packed, finest, shape, color)
-            found |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
-            dr.eval(found["average"])
-        return found
+            arrays |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
+            dr.eval(arrays["average"])
+        return arrays
 
-    found = derived(inputs, compute)
-    background, pyramid = found["background"], None
+    arrays = derived(inputs, compute)
+    background, pyramid = arrays["background"], None
     channels = len(background)
     if sizes is not None:
         levels = levels_of(sizes.width, sizes.height, cells.count, sizes.wrap)
-        pyramid = GaussianPyramid(sizes.wrap, channels, levels, found["values"], mi.Float(1))
+        pyramid = GaussianPyramid(sizes.wrap, channels, levels, arrays["values"], mi.Float(1))
         pyramid = pyramid if derivatives else pyramid.halved()
-    packed = Packed(found["packed"], channels, cutoff, inverted=sizes is not None)
+    packed = Packed(arrays["packed"], channels, cutoff, inverted=sizes is not None)
     return Table(
-        replace(lists, finest=finest), packed, background, pyramid, found.get("average", [])
+        replace(lists, finest=finest), packed, background, pyramid, arrays.get("average", [])
     )
 
 
@@ -166,7 +166,7 @@ class _Lookups(threading.local):
 
     def __init__(self) -> None:
         self.scope = -1
-        self.found: dict[tuple, tuple[list, list]] = {}
+        self.results: dict[tuple, tuple[list, list]] = {}
 
 
 _lookups = _Lookups()
@@ -197,14 +197,14 @@ def reused(
         return look_up()
     backend = dr.backend_v(mi.Float)
     if scope(backend) != _lookups.scope:
-        _lookups.found.clear()
+        _lookups.results.clear()
     # The arrays keep their indices, so that no other variable has them.
     arrays = [table.packed.values, *(getattr(si, name) for name in inputs)]
     key = (where, *indices_of(arrays))
-    if key not in _lookups.found:
-        _lookups.found[key] = look_up(), arrays
+    if key not in _lookups.results:
+        _lookups.results[key] = look_up(), arrays
     _lookups.scope = scope(backend)
-    return _lookups.found[key][0]
+    return _lookups.results[key][0]
 
 
 def _is_traced() -> bool:
@@ -265,7 +265,7 @@ def sum_over_footprint(
     unit, blind = bound_covariance(inverse)
     squares = (sx * sx, sx * sy, sy * sy)
     footprint = [dr.select(valid, f * s, 0) for f, s in zip(unit, squares, strict=True)]
-    # Of a clamped image, the mean is nowhere seen: the largest footprint has its border too.
+    # A clamped image never shows its mean: the largest footprint includes its border too.
     blind &= valid & (sizes.wrap != "clamp")
     distant = is_minified(pyramid, footprint)
     near, wide = active & ~distant, active & distant & ~blind

@@ -1,4 +1,4 @@
-"""What a texture or an environment holds in memory between renderings."""
+"""The memory that a texture or an environment holds between renderings."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def resident_bytes(texture: Texture) -> int:
     Returns
     -------
     int
-        Of Gaussians: their parameters and their derivatives, the lists of Gaussians and what else
-        lookups read; where their light has been sampled, the distribution of that. Plugins of one
-        file share arrays, and each counts them. Of another plugin: its parameters, as
-        `mitsuba.traverse` shows them, and of an ``envmap`` the table by which it is sampled. Texels
+        For Gaussians: the parameters and their derivatives, the lists of Gaussians and what else
+        lookups read; and the distribution of the light, once it has been sampled. Plugins of one
+        file share arrays, and each counts them. For another plugin: its parameters, as
+        `mitsuba.traverse` shows them, and for an ``envmap`` its sampling table. Texels
         have 1, 2 or 4 channels, as in Dr.Jit's textures: three become four in the first rendering.
         Dr.Jit's allocator takes up to twice as much: it rounds the size of every array up to a
         power of two.
@@ -48,17 +48,17 @@ def resident_bytes(texture: Texture) -> int:
         return tables + sum(_texel_bytes(value) for _, value in mi.traverse(texture))
     arrays: dict[tuple, int] = {}
     sampled = 0
-    for found in _walk(vars(texture), {}):
-        if isinstance(found, Emission):
-            sampled += found.bytes
+    for value in _walk(vars(texture), {}):
+        if isinstance(value, Emission):
+            sampled += value.bytes
             continue
-        for array in (found, dr.grad(found)) if dr.grad_enabled(found) else (found,):
+        for array in (value, dr.grad(value)) if dr.grad_enabled(value) else (value,):
             arrays[indices_of([dr.detach(array)])] = dr.width(array) * dr.itemsize_v(array)
     return sum(arrays.values()) + sampled
 
 
 def _texel_bytes(value: Any) -> int:
-    """Return the bytes of a parameter that is an array; of a tensor (..., C) with its padding."""
+    """Return the bytes of a parameter if it is an array; for a tensor (..., C) with its padding."""
     if dr.is_tensor_v(value):
         *size, channels = value.shape
         return math.prod(size) * (1 << (channels - 1).bit_length()) * dr.itemsize_v(value.array)
@@ -66,7 +66,7 @@ def _texel_bytes(value: Any) -> int:
 
 
 def _table_bytes(envmap: mi.Emitter) -> int:
-    """Return the bytes of a table of sampling, the luminance of texels and its sums over 4^k."""
+    """Return the bytes of a sampling table: the luminance of texels and its sums over 4^k."""
     rows, columns, _ = mi.traverse(envmap)["data"].shape
     return round(7 / 3 * rows * (columns - 1)) * dr.itemsize_v(mi.Float)
 
@@ -75,7 +75,7 @@ def _walk(tree: Any, seen: dict[int, Any]) -> Iterator[DrJitArray | Emission]:
     """Yield the flat arrays of Dr.Jit in objects and collections, and the distributions."""
     if tree is None or isinstance(tree, type | str) or id(tree) in seen:
         return
-    seen[id(tree)] = tree  # rows are made on demand: what is freed would hand its id on
+    seen[id(tree)] = tree  # rows are made on demand: a freed one would pass its id on
     if dr.is_tensor_v(tree):
         tree = tree.array
     if isinstance(tree, Emission) or (dr.is_jit_v(tree) and dr.depth_v(tree) == 1):

@@ -17,6 +17,7 @@ from eigengs_dr.backend.arrays import types_of, upload
 from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.channels import slices
+from eigengs_dr.gaussian.file import file_errors
 from eigengs_dr.gaussian.gaussians import (
     FIELDS,
     Fitted,
@@ -94,9 +95,9 @@ def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians
     Raises
     ------
     ValueError
-        If the shapes of the tensors do not match.
+        If there is no tensor of this texture, or the shapes of the tensors do not match.
     """
-    return from_tensors(_found(parameters, texture), like)
+    return from_tensors(_tensors_in(parameters, texture), like)
 
 
 def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians) -> None:
@@ -110,15 +111,21 @@ def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians
     parameters, texture, like
         See `gaussians_of`. The function changes only entries of `parameters` that exist.
     """
-    found = _found(parameters, texture)
-    bounded = to_tensors(dr.detach(from_tensors(found, like)).bounded())
-    for name in found:
+    tensors = _tensors_in(parameters, texture)
+    bounded = to_tensors(dr.detach(from_tensors(tensors, like)).bounded())
+    for name in tensors:
         parameters[f"{texture}.{name}"] = bounded[name]
 
 
-def _found(parameters: Mapping[str, object], texture: str) -> Arrays:
+def _tensors_in(parameters: Mapping[str, object], texture: str) -> Arrays:
     keys = {name: f"{texture}.{name}" for name in FIELDS}
-    return {name: parameters[key] for name, key in keys.items() if key in parameters}
+    found = {name: parameters[key] for name, key in keys.items() if key in parameters}
+    if not found:
+        raise ValueError(
+            f"the parameters have no {' and no '.join(keys.values())}; give the name of the "
+            "texture in mitsuba.traverse, such as 'poster.bsdf.reflectance'"
+        )
+    return found
 
 
 # ---------------------------------------------------------------------------------------------
@@ -206,12 +213,13 @@ def shared_file(path: str, backend: str | None, first: int | None) -> SharedFile
 
     A file that has changed on disk counts as another one. For errors see `Gaussians.load`.
     """
-    state = os.stat(path)
+    with file_errors(path):
+        state = os.stat(path)
     identity = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
     key = (*identity, mi.variant(), backend, first)
-    found = _files.get(key)
+    file = _files.get(key)
     # While Dr.Jit copies the content, its thread may make another texture, which reads it first.
-    return found or _files.setdefault(key, SharedFile(path, backend, first))
+    return file or _files.setdefault(key, SharedFile(path, backend, first))
 
 
 SHAPES = ("mean", "factor")
@@ -229,7 +237,7 @@ class TextureParameters:
     Attributes
     ----------
     start : Gaussians
-        Those of a model at its mean, or a set like that of the texture, from `without_arrays`.
+        The set of a model at its mean, or a set like that of the texture, from `without_arrays`.
     read : dict of str to TensorXf
         The parameters at the start.
     tensors : dict of str to TensorXf
@@ -248,7 +256,7 @@ class TextureParameters:
     part: slice = field(default_factory=lambda: slice(None))
 
     def __post_init__(self) -> None:
-        # Own objects, so that each texture has its own gradient, of one memory.
+        # Separate objects on shared memory, so that each texture has its own gradient.
         self.tensors = {name: type(t)(t) for name, t in self.read.items()}
 
     @property
@@ -257,7 +265,7 @@ class TextureParameters:
         return int(self.tensors["mean"].shape[0]) if "mean" in self.tensors else len(self.start)
 
     def is_that_of_file(self) -> bool:
-        """Return whether the parameters have the memory of the file: nobody has changed them."""
+        """Return whether the parameters share the memory of the file: they have not changed."""
         unchanged = (t.array.index == self.read[k].array.index for k, t in self.tensors.items())
         return not dr.grad_enabled(self.tensors) and all(unchanged)
 
@@ -282,10 +290,10 @@ class TextureParameters:
 
     def _reconstruct(self, coefficients: Tensor) -> Gaussians:
         """Return the set of some coefficients of a model."""
-        start, found = self.start, tuple(coefficients.shape)
+        start, shape = self.start, tuple(coefficients.shape)
         expected = (len(self.weights), self.weights[0].shape[1])
-        if found != expected:
-            raise ValueError(f"coefficients has shape {found}, expected {expected}")
+        if shape != expected:
+            raise ValueError(f"coefficients has shape {shape}, expected {expected}")
         # An optimiser may leave values that are not finite; times zero weights, they give NaN.
         finite = dr.select(dr.isfinite(coefficients), coefficients, 0)
         types, count = types_of(start.mean), len(start)
@@ -304,12 +312,12 @@ def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> Te
 
     A channel with fewer components than others ignores the rest of its row.
     """
-    channels, most = len(model.weights), max(model.components)
-    weights = np.zeros((channels, len(model.gaussians) + 1, most), np.float32)
-    for padded, own in zip(weights, model.weights, strict=True):
-        padded[:, : len(own)] = own.T
+    channels, max_components = len(model.weights), max(model.components)
+    weights = np.zeros((channels, len(model.gaussians) + 1, max_components), np.float32)
+    for padded, matrix in zip(weights, model.weights, strict=True):
+        padded[:, : len(matrix)] = matrix.T
     if coefficients is None:
-        coefficients = np.zeros((channels, most), np.float32)
+        coefficients = np.zeros((channels, max_components), np.float32)
     tensors = {"coefficients": upload(mi.TensorXf, coefficients)}
     return TextureParameters(model.gaussians, tensors, [upload(mi.TensorXf, w) for w in weights])
 
@@ -341,7 +349,7 @@ def derived(inputs: Arrays, compute: Callable[[Arrays], Arrays]) -> Arrays:
 
 
 class _Derived(dr.CustomOp):
-    """The operation of `derived`: it keeps the graph of its own and walks it in both modes."""
+    """The operation of `derived`: it keeps its own graph and walks it in both modes."""
 
     def eval(self, inputs: Arrays, compute: Callable[[Arrays], Arrays]) -> Arrays:
         """Compute the arrays; `inputs` come without their derivatives."""
@@ -369,6 +377,6 @@ class _Derived(dr.CustomOp):
     def _walk(self, mode: dr.ADMode, source: Arrays, target: Arrays) -> Arrays:
         dr.enqueue(mode, source)
         dr.traverse(mode, dr.ADFlag.ClearInterior | dr.ADFlag.ClearInput)
-        found = dr.grad(target)
+        derivatives = dr.grad(target)
         dr.clear_grad(target)
-        return found
+        return derivatives

@@ -19,6 +19,7 @@ from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
 
 from .environment import texels_of
+from .follow import check_scene
 
 JUDGED = 4
 """Photos with held-out pixels, spread over all."""
@@ -112,6 +113,7 @@ def photo_loss(
     >>> loss = photo_loss(scene, "wall.bsdf.reflectance", [photo])
     >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40)
     """
+    check_scene("photo_loss", scene)
     if not 0 <= held_out < 1:
         raise ValueError(f"photo_loss: held_out is {held_out}; it must be in [0, 1)")
     if spp < 1:

@@ -14,6 +14,7 @@ from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.color import SPACES, rendered_as
+from eigengs_dr.image.formats import SUFFIXES
 
 from .parameters import TextureParameters, model_source, shared_file, without_arrays
 from .versions import Properties
@@ -63,7 +64,14 @@ def source_of(props: Properties) -> TextureParameters:
         if first < 0:
             raise _mistake(props, "first", first, "a number of Gaussians")
         name = _read(props, "map", "", str, "the name of a map")
-        source = shared_file(_path(props, "filename"), backend, first or None).source(name or None)
+        file = _path(props, "filename")
+        if Path(file).suffix.lower() in SUFFIXES:
+            bitmap = "envmap" if props.plugin_name() == "gaussian_environment" else "bitmap"
+            raise ValueError(
+                f"{file}: is an image, not a set of Gaussians; make one by 'eigengs-dr fit', or "
+                f"give the image to the plugin {bitmap}"
+            )
+        source = shared_file(file, backend, first or None).source(name or None)
     else:
         gaussians = _from_arrays(props, backend)
         source = TextureParameters(without_arrays(gaussians), to_tensors(gaussians))
@@ -118,7 +126,7 @@ def prefilter(props: Properties) -> tuple[float, bool]:
     -------
     angle : float
     follows : bool
-        Whether footprints are those of rays, or of the sensor that renders: ``true``.
+        Whether footprints come from rays or from the sensor that renders: ``true``.
     """
     if props.get("prefilter", 0.0) is True:
         return 0.0, True
@@ -135,7 +143,7 @@ def scale(props: Properties) -> float:
 
 
 def check_light(gaussians: Gaussians, plugin: str) -> None:
-    """Raise `ValueError` if a set is no light from all directions."""
+    """Raise `ValueError` if a set is not light from all directions."""
     if gaussians.channels not in (1, 3) or rendered_as(gaussians.space) is None:
         raise ValueError(
             f"{plugin}: the set has {gaussians.channels} channels in the space "
@@ -149,7 +157,7 @@ def check_light(gaussians: Gaussians, plugin: str) -> None:
 
 
 def check_rotation(transform: mi.AffineTransform4f) -> None:
-    """Raise `ValueError` if a transform of directions is no rotation, perhaps with a mirror."""
+    """Raise `ValueError` if a transform of directions is not a rotation, perhaps mirrored."""
     matrix = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
     if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
         raise ValueError(
@@ -158,7 +166,7 @@ def check_rotation(transform: mi.AffineTransform4f) -> None:
 
 
 def check_angle(value: float, plugin: str) -> float:
-    """Return the angle of a pixel; raise `ValueError` if it is none."""
+    """Return the angle of a pixel; raise `ValueError` if it is not one."""
     if not 0 <= value < 1:
         raise ValueError(
             f"{plugin}: prefilter is {value}; it is the angle of a pixel in radians, "
@@ -168,7 +176,7 @@ def check_angle(value: float, plugin: str) -> float:
 
 
 def check_known(props: Properties) -> None:
-    """Raise `ValueError` if there are properties that nobody has read."""
+    """Raise `ValueError` if there are properties that were not read."""
     if unknown := props.unqueried():
         raise ValueError(f"{props.plugin_name()}: it has no property {' and '.join(unknown)}")
 
@@ -199,7 +207,7 @@ def to_uv(props: Properties) -> mi.ScalarTransform3f:
     Raises
     ------
     ValueError
-        If it is no transform, or several at once.
+        If it is not a transform, or holds several.
     """
     transform = props.get("to_uv", mi.ScalarTransform3f())
     if not hasattr(transform, "matrix"):

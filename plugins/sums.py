@@ -94,7 +94,7 @@ def plugin_of_sums(base: type) -> Any:
             else:
                 lists = self.table.lists
             table = make_table(lists, self.cutoff, source.tensors, source.decode)
-            # Who has changed parameters once may change colours next, and needs all lists again.
+            # A texture that has changed may change its colours next, and needs all lists again.
             self.table = table if self.changed else replace(table, lists=lists)
             self.part = slice(None)
 
@@ -119,7 +119,7 @@ def plugin_of_sums(base: type) -> Any:
             return self.follows or self.sensor is not None or self.angle > 0
 
         def pixel(self) -> Float | None:
-            """Return the angle of a pixel; None if rays alone know it."""
+            """Return the angle of a pixel; None if only rays know it."""
             if self.sensor is not None:
                 return current_angle(self.sensor)
             return self.prefilter if self.angle else None
@@ -135,7 +135,7 @@ def plugin_of_sums(base: type) -> Any:
                 return sum_here(self.table, x, y, inside)
             return sum_over_footprint(self.table, column, row, inside, seen)
 
-        def shown(self, sums: list) -> list:
+        def display(self, sums: list) -> list:
             """Return the channels, decoded and clamped unless `raw`, of sums without background."""
             background = self.table.background[self.part]
             return show_all(self, [s + b for s, b in zip(sums[self.part], background, strict=True)])

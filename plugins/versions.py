@@ -1,4 +1,4 @@
-"""The one place for what differs between versions of Mitsuba.
+"""The one place for differences between versions of Mitsuba.
 
 3.10 has footprints of rays (pull request 1964) and finds plugins by itself (1943, see `entry`).
 Pull request 1885, which is open, turns `mitsuba.Texture` into `mitsuba.Field`.
@@ -34,8 +34,8 @@ def _renamed(holder: Any, before: str, after: str) -> Any:
 
 def texture_class() -> type:
     """Return the base class of textures."""
-    found: type = _renamed(mi, "Texture", "Field")
-    return found
+    texture: type = _renamed(mi, "Texture", "Field")
+    return texture
 
 
 def texture_kind() -> object:
@@ -82,11 +82,11 @@ _ended.close()  # its method `throw` raises an error, and adds no traceback
 
 
 def reason_first(create: Callable[[Properties], Any]) -> type:
-    """Return what calls `create` and raises its errors without a traceback.
+    """Return a class that calls `create` and raises its errors without a traceback.
 
     Mitsuba prints an error of a plugin as nanobind does: the traceback, then what went wrong. Every
-    function of Python that an error passes adds to the traceback. So `__new__` returns the error,
-    and ``__init__``, which holds no code of Python, raises it.
+    Python function that an error passes adds to the traceback. So `__new__` returns the error, and
+    ``__init__``, which runs no Python code, raises it.
     """
 
     class Created:
@@ -107,7 +107,7 @@ def reason_first(create: Callable[[Properties], Any]) -> type:
 
 
 def _as_field(texture: Any) -> type:
-    """Return a class of textures with what the class `mitsuba.Field` asks for besides.
+    """Return a class of textures with the methods that `mitsuba.Field` asks for in addition.
 
     A field says what it holds, and is asked for that by one method for each kind. C++ passes the
     arguments of a field before `active`, in some of its methods; a texture takes none.
@@ -148,7 +148,7 @@ def has_footprints() -> bool:
 
 
 def footprint_of(si: Interaction) -> tuple[Float, ...] | None:
-    """Return the footprint that the renderer found, without gradients.
+    """Return the footprint from the renderer, without gradients.
 
     Parameters
     ----------

@@ -1,5 +1,6 @@
 """Backends that tests run on, and what this machine cannot run."""
 
+import gc
 import signal
 from functools import cache
 
@@ -49,6 +50,16 @@ def pytest_collection_modifyitems(items):
     if needy and not has_gpu():
         for item in needy:
             item.add_marker(pytest.mark.skip(reason=NO_GPU))
+
+
+def pytest_collection_finish():
+    """Keep what imports and collection made out of later collections of garbage.
+
+    They are some hundred thousand objects that live to the end, and every full collection, of which
+    hypothesis and the package make many, would walk them all.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -16,7 +16,7 @@ from eigengs_dr.image.resize import center_crop
 
 Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-# Pixels of a side, Gaussians (as in the paper, and in the basis that ships), and steps.
+# Pixels per side, Gaussians (as in the paper, and in the basis that ships), and steps.
 SIDE, GAUSSIANS, ITERATIONS = 256, 5000, 1000
 SMOOTH_SIDE = 512  # distances of 7 pixels show; those of the paper's 20,000 are below 4
 STRIPE = 3  # rows of a stripe of the image that is foreign to a basis
@@ -26,8 +26,8 @@ class Case(NamedTuple):
     """One thing that may go wrong.
 
     ``image()`` makes the image. `place`, a `Placement`, returns means and factors to start from;
-    None for the start of the method. `rates` multiplies the rates of the method. `space` is that of
-    the fit, by default its own.
+    None for the start of the method. `rates` multiplies the rates of the method. `space` is the
+    colour space of the fit, by default that of the method.
     """
 
     name: str
@@ -41,12 +41,12 @@ class Case(NamedTuple):
 
 
 def photo(width: int = SIDE, height: int = SIDE) -> Image:
-    """Bring a photo of a cat to a size in pixels; enlarged, it is smooth."""
+    """Resize a photo of a cat to so many pixels; enlarged, it is smooth."""
     return np.clip(center_crop(eg.sample("chelsea"), width, height), 0, 1)
 
 
 def flat(red: float, green: float, blue: float) -> Image:
-    """Fill an image with one colour, 1 is white."""
+    """Fill an image with one colour; 1 is white."""
     return np.broadcast_to(np.array([red, green, blue], np.float32), (SIDE, SIDE, 3)).copy()
 
 
@@ -87,8 +87,8 @@ def _saturated() -> Image:
 
 
 def _noise() -> Image:
-    drawn = np.random.default_rng(0).normal(0, 0.3, (SIDE, SIDE, 3))
-    return np.clip(photo() + drawn, 0, 1).astype(np.float32)
+    noise = np.random.default_rng(0).normal(0, 0.3, (SIDE, SIDE, 3))
+    return np.clip(photo() + noise, 0, 1).astype(np.float32)
 
 
 def _foreign() -> Image:

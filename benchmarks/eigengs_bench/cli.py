@@ -1,4 +1,4 @@
-"""``eigengs-dr bench``: one command a question, whose module of the same name answers it."""
+"""``eigengs-dr bench``: one command per question, answered by the module of the same name."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -19,6 +19,7 @@ from eigengs_bench.names import (
     SETS,
     SOLVE_STEPS,
     TABLES,
+    TEXTURE_PARTS,
 )
 from eigengs_bench.rows import FILE, Row, Task, code_state
 from eigengs_bench.rows import record as record_rows
@@ -39,7 +40,7 @@ data_argument = click.argument("data", type=options.folder, required=False, meta
 
 
 def several(name: str, to: str, values: Any, text: str, default: Any = ()) -> Any:
-    """Make an option that takes some of several words, or numbers, and may be repeated."""
+    """Make an option that takes a word of several, or a number, and may be repeated."""
     kind = values if isinstance(values, click.ParamType) else click.Choice(list(values))
     text = f"{text}; may be repeated."
     once: Any = {"callback": lambda context, option, given: tuple(dict.fromkeys(given))}
@@ -47,13 +48,13 @@ def several(name: str, to: str, values: Any, text: str, default: Any = ()) -> An
 
 
 def sets_option(usual: tuple[str, ...]) -> Any:
-    """Make the option of the sets; by default the usual ones with DATA, and samples without."""
-    text = f"Images, by default {' '.join(usual)} with DATA, and {SAMPLES} without"
+    """Make the option ``--set``: by default the usual sets with DATA, or samples without."""
+    text = f"Set of images, by default {' '.join(usual)} with DATA, and {SAMPLES} without"
     return several("--set", "names", SETS, text)
 
 
 def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
-    """Make a function of settings, with its options and its text, into a command of the group.
+    """Turn a function with its options and its docstring into a command of the group.
 
     The command calls ``run(task, **settings)`` of the module of its name, prints the tables that
     ``summarize(rows)`` returns, and writes its charts to the folder.
@@ -107,11 +108,11 @@ def _show(section: Any, rows: list[Row], output: Path, run: options.Run) -> None
 
 @click.group("bench")
 def main() -> None:
-    """Measure speed and accuracy: one command a question.
+    """Measure speed and accuracy: one command per question.
 
-    Measurements are lines of FOLDER/rows.jsonl; a command goes on after a break, and does only what
-    is not there. DATA has a folder a set (faces256, cats512, cars256, natural256), with images to
-    train on in train/ and others in test/; kodak has no parts.
+    Each measurement is a line of FOLDER/rows.jsonl; a command that was interrupted resumes, and
+    measures only what is missing. DATA has one folder per set (faces256, cats512, cars256,
+    natural256), with images to train on in train/ and others in test/; kodak has no such parts.
 
     \b
     Examples:
@@ -124,8 +125,8 @@ def main() -> None:
 @question("tables", PAPER_SETS)
 @data_argument
 @sets_option(PAPER_SETS)
-@several("--table", "tables", TABLES, "By default all")
-@number("--images", "Of each set.", 20, 1)
+@several("--table", "tables", TABLES, "Table of the paper, by default all")
+@number("--images", "Number of images from each set.", 20, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def tables() -> None:
     """Measure every method on images of test folders, on which nothing was trained or tuned.
@@ -135,24 +136,24 @@ def tables() -> None:
     ablation  eigengs in YCbCr or RGB, with and without the frequency-aware split
     cross     eigengs with the basis of other images
 
-    models/ of FOLDER keeps trained bases and models: about a gigabyte a set.
+    FOLDER/models keeps trained bases and models: about a gigabyte per set.
     """
 
 
 @question("pictures")
 @data_argument
-@several("--picture", "wanted", PICTURES, "What to draw, by default what DATA is enough for")
-@number("--images", "Test images a set, for curves and radii.", 8, 1)
+@several("--picture", "pictures", PICTURES, "What to draw, by default all that DATA suffices for")
+@number("--images", "Test images per set, for curves and radii.", 8, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def pictures() -> None:
-    """Draw the curves, histograms and pictures of the paper, with our fits.
+    """Draw the curves, histograms and pictures of the paper from our fits.
 
     \b
     iterations  fits at iterations 0, 10, 100 and the last, by every method
     colors      fits in YCbCr and in RGB, and their errors
     curves      PSNR every 50 iterations
     tiles       a slow gradient by every method, and its errors
-    radii       how large Gaussians are, with the frequency-aware split and without
+    radii       sizes of Gaussians, with and without the frequency-aware split
     split       what Gaussians for low and for high frequencies render alone
     cross       images projected on bases of other images
     """
@@ -161,10 +162,10 @@ def pictures() -> None:
 @question("pareto", (SAMPLES,))
 @data_argument
 @sets_option((SAMPLES,))
-@number("--images", "Of each set.", 3, 1)
+@number("--images", "Number of images from each set.", 3, 1)
 @number("--iterations", "Steps of the longest fits.", 1000, 1)
 def pareto() -> None:
-    """Measure speed against accuracy: fits that differ from the default one in one setting.
+    """Measure speed against accuracy: fits that differ from the default in one setting.
 
     An image takes about two minutes.
     """
@@ -173,7 +174,7 @@ def pareto() -> None:
 @question("rate", (SAMPLES,))
 @data_argument
 @sets_option((SAMPLES,))
-@number("--images", "Of each set.", 3, 1)
+@number("--images", "Number of images from each set.", 3, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def rate() -> None:
     """Compare packed fits with JPEG, JPEG 2000, WebP, AVIF and JPEG XL, and with published means.
@@ -186,20 +187,20 @@ def rate() -> None:
 @data_argument
 @sets_option(("natural256",))
 @several("--target", "targets", click.FloatRange(1, 100), "PSNR in YCbCr", (32.0, 36.0, 40.0))
-@number("--images", "Of each set.", 20, 1)
+@number("--images", "Number of images from each set.", 20, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def number_of_gaussians() -> None:
     """Measure how many Gaussians the search of fit --target-psnr finds, and what it costs.
 
-    Beside it: a default fit of the number that was found. An image of 256x256 pixels takes ten
-    seconds.
+    A default fit with the same number of Gaussians is timed for comparison. An image of 256x256
+    pixels takes ten seconds.
     """
 
 
 @question("stability")
-@click.option("--case", "cases", multiple=True, help="By default all; may be repeated.")
-@several("--preset", "presets", PRESETS, "Methods, by default all", PRESETS)
-@number("--iterations", "Most steps of a fit.", 10_000, 0)
+@click.option("--case", "cases", multiple=True, help="Hard case, by default all; may be repeated.")
+@several("--preset", "presets", PRESETS, "Method, by default all", PRESETS)
+@number("--iterations", "Largest number of steps of a fit.", 10_000, 0)
 def stability() -> None:
     """Try every method on hard cases: odd images, odd starts, rates too high, seeds, units.
 
@@ -212,10 +213,10 @@ def stability() -> None:
 @several("--counts", "counts", click.IntRange(min=1), "Gaussians", KODAK_COUNTS)
 @several("--steps", "steps", click.IntRange(min=0), "Steps of a fit", (1000,))
 @number("--solve-steps", "Steps of the colour solve.", SOLVE_STEPS, 1)
-@number("--images", "The first photos.", 24, 1)
-@click.option("--timed", is_flag=True, help="Nothing else runs: the seconds count.")
+@number("--images", "Number of photos, from the first.", 24, 1)
+@click.option("--timed", is_flag=True, help="Record seconds: nothing else runs on the machine.")
 def kodak() -> None:
-    """Fit the Kodak photos by numbers of Gaussians, beside what other methods published.
+    """Fit the Kodak photos with several numbers of Gaussians, beside published figures.
 
     \b
     Examples:
@@ -229,35 +230,35 @@ def kodak() -> None:
 @question("peers", ("kodak384",))
 @data_argument
 @sets_option(("kodak384",))
-@several("--peer", "peers", PEERS, "By default all")
+@several("--peer", "peers", PEERS, "What to compare with, by default all")
 @several("--image", "photos", click.STRING, "Name of an image, by default the first of a set")
-@number("--gaussians", "Of a fit.", 2000, 1)
-@number("--images", "Of each set.", 1, 1)
+@number("--gaussians", "Number of Gaussians of a fit.", 2000, 1)
+@number("--images", "Number of images from each set.", 1, 1)
 @number("--iterations", "Steps of our longer fits.", 1000, 1)
-@click.option("--timed", is_flag=True, help="Nothing else runs: the seconds count.")
+@click.option("--timed", is_flag=True, help="Record seconds: nothing else runs on the machine.")
 def peers() -> None:
-    """Compare fits with what else one would pick on a laptop, each on its own terms.
+    """Compare fits with the alternatives on a laptop, each on its own terms.
 
     \b
-    splatthis  2D Gaussians in PyTorch, in an environment below FOLDER: a gigabyte, minutes a photo
-    texels     the best bitmap that takes no more memory, with its pyramid
+    splatthis  2D Gaussians in PyTorch, in an environment in FOLDER: a gigabyte, minutes per photo
+    texels     the best bitmap with a pyramid that takes no more memory
     JPEG, AVIF files of as many bytes as a packed fit
     """
 
 
 @question("scaling")
 @several("--part", "parts", PARTS, "What to vary", PARTS)
-@number("--max-side", "Leave out larger images, in pixels; the largest have 8192.", 4096, 1)
-@number("--iterations", "Least number of steps behind a mean.", 24, 1)
+@number("--max-side", "Largest side of an image in pixels, up to 8192.", 4096, 1)
+@number("--iterations", "Fewest steps that a mean is taken over.", 24, 1)
 def scaling() -> None:
-    """Measure what size costs: time of a step, of the start, and memory.
+    """Measure what size costs: the time of a step and of the start, and memory.
 
     \b
-    pixels   images of 128x128 to 8192x8192 with 0.076 Gaussians a pixel
+    pixels   images of 128x128 to 8192x8192 with 0.076 Gaussians per pixel
     splats   100 to 2,000,000 Gaussians on images of one size
-    small    images a second of whole fits of 100 steps, one by one and by fit_many
+    small    images per second of whole fits of 100 steps, one by one and by fit_many
 
-    Every size runs in a process of its own. All sizes to 4096x4096 take some ten minutes and 5 GB.
+    Every size runs in its own process. All sizes up to 4096x4096 take about ten minutes and 5 GB.
     """
 
 
@@ -268,34 +269,39 @@ def kernels() -> None:
 
 @question("texture")
 @data_argument
-@click.option("--variant", default="llvm_ad_rgb", help="Of Mitsuba.")
+@several("--part", "parts", TEXTURE_PARTS, "What to compare", TEXTURE_PARTS)
+@click.option("--variant", default="llvm_ad_rgb", help="Variant of Mitsuba.")
 def texture() -> None:
-    """Compare textures of Gaussians with bitmaps in Mitsuba: memory, and time of a material ball.
+    """Compare Gaussians with bitmaps in Mitsuba: memory, time and pictures.
 
-    A poster is seen aslant with a bitmap, and with Gaussians, whose pictures are equally good; DATA
-    has three of its materials in textures/. A poster takes a minute.
+    \b
+    posters  a bitmap and Gaussians that look alike at a slant; DATA has three of them in textures/
+    lights   an envmap and Gaussians, over a ball
+    ball     the time of a material ball, and what textures hold
+
+    A poster takes a minute.
     """
 
 
 @question("inverse")
 def inverse() -> None:
-    """Recover textures from photos by texels, a pyramid of them, Gaussians and coefficients.
+    """Recover textures from photos by texels, a pyramid of texels, Gaussians or coefficients.
 
     \b
     poster    a flat picture, with 3 and with 16 cameras around it
     ball      the colour of a glossy coat, seen from all sides
     material  its colour and its roughness, with 6 and with 8 cameras
 
-    Steps render 4 samples a pixel, others 1 and 16. All takes about half an hour.
+    Steps render 4 samples per pixel, others 1 and 16. Everything takes about half an hour.
     """
 
 
 @main.command()
 @click.argument("folder", type=options.folder, metavar="FOLDER")
-@options.output("For README.md and its charts.", "REPORT")
+@options.output("Folder for README.md and its charts.", "REPORT")
 @options.shared("quiet")
 def report(run: options.Run, folder: Path, output: Path) -> None:
-    """Write README.md and its charts: all questions that the rows of a folder answer.
+    """Write a README.md with charts for all questions that the rows of a folder answer.
 
     Every section names the commands, days, machines, versions and commits behind its figures.
     """
@@ -311,7 +317,7 @@ def report(run: options.Run, folder: Path, output: Path) -> None:
 def pages(run: options.Run, check: bool) -> None:
     """Write tables, charts and figures of docs/rows.jsonl into README.md and docs/.
 
-    They stand between marks, <!-- table: kodak.quality --> and <!-- end -->; charts lie in
+    They go between marks, <!-- table: kodak.quality --> and <!-- end -->; charts lie in
     docs/images/measured/.
     """
     from eigengs_bench.pages import outdated, write

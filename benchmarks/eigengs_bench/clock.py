@@ -1,4 +1,4 @@
-"""Clocks: a descent that is looked at on its way, and programs that take turns."""
+"""Clocks: a descent that is measured on its way, and programs that are timed in turn."""
 
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -28,14 +28,14 @@ METHODS = {"default": eg.DEFAULT, "gaussianimage": GAUSSIANIMAGE, "eigengs": EIG
 """The methods that are compared, by name."""
 
 WARM_STEPS = 10
-"""Steps of a fit that compiles the programs of others."""
+"""Steps of a fit that compiles the programs of the fits to be timed."""
 
 SOON = {Redistribute: Redistribute(after=1), Relocate: Relocate(every=3), Perturb: Perturb(every=3)}
 """Controls that act within `WARM_STEPS`."""
 
 
 class Moment(NamedTuple):
-    """A descent after some steps: seconds since before its start, RGB that is not clamped."""
+    """A descent after some steps: seconds with the start, and RGB that is not clamped."""
 
     iteration: int
     seconds: float
@@ -44,7 +44,7 @@ class Moment(NamedTuple):
 
 
 class Run(NamedTuple):
-    """A descent before its first step, and the RGB that comes on top of its pictures, or 0."""
+    """A descent before its first step, and the RGB that is added to its pictures, or 0."""
 
     objective: Pixels
     state: State
@@ -52,7 +52,7 @@ class Run(NamedTuple):
 
 
 def start(image: Image, options: FitOptions) -> Run:
-    """Start as `eigengs_dr.fit` does, for the state after each step, which that does not show."""
+    """Start as `eigengs_dr.fit` does, which does not expose the state after each step."""
     method, source = options.method, None
     if options.start is not None:
         source = load_start(options.start, options.backend)
@@ -61,8 +61,8 @@ def start(image: Image, options: FitOptions) -> Run:
     height, width = pixels.shape[:2]
     data = data_of(pixels, space)
     types = types_for(source, options.backend)
-    shown = picture(types, space, [pixels], [data])
-    objective = replace(Pixels.of(data, space, types), pictures=(shown,))
+    display = picture(types, space, [pixels], [data])
+    objective = replace(Pixels.of(data, space, types), pictures=(display,))
     if source is None:
         count = options.count_for(width * height)
         placed = method.place_and_solve(objective, count, options.seed)
@@ -78,9 +78,9 @@ def follow(
 ) -> Iterator[Moment]:
     """Run a descent to its last step and yield its state after the steps in `marks`.
 
-    It takes all steps, and shows the set as it is, where `eigengs_dr.fit` stops and keeps the best.
-    Sets with more Gaussians than asked for, which a descent has on its way, are left out. The time
-    of the start counts; the clock stops between moments.
+    It takes all steps and yields the set as it is, where `eigengs_dr.fit` stops early and keeps the
+    best. States with more Gaussians than requested, which a descent passes through, are left out.
+    The time of the start counts; the clock stops between moments.
     """
     spent, resumed = 0.0, time.perf_counter()
     objective, state, mean_image = start(image, options)
@@ -114,14 +114,14 @@ def warm_up(image: Image, iterations: int, **options: Any) -> None:
 
 
 def decibels(picture: Image, image: Image, space: str) -> float:
-    """Return a PSNR for a row, in dB, at most `MAX_PSNR`; a fit that failed has NaN."""
+    """Return a PSNR for a row, in dB, at most `MAX_PSNR`; NaN for a fit that failed."""
     return min(eg.psnr(picture, image, space), MAX_PSNR)
 
 
 def judge(picture: Image, image: Image) -> dict[str, float]:
     """Return psnr_ycbcr, psnr_rgb, ssim and ms_ssim of a picture."""
-    found = {f"psnr_{space}": decibels(picture, image, space) for space in ("ycbcr", "rgb")}
-    return {**found, "ssim": eg.ssim(picture, image), "ms_ssim": eg.ms_ssim(picture, image)}
+    psnr = {f"psnr_{space}": decibels(picture, image, space) for space in ("ycbcr", "rgb")}
+    return {**psnr, "ssim": eg.ssim(picture, image), "ms_ssim": eg.ms_ssim(picture, image)}
 
 
 def score(moment: Moment, image: Image) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def interleaved(
     rounds: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, float]:
-    """Time programs in turns, one of each a round; return median milliseconds by name."""
+    """Time programs in turn, each once per round; return median milliseconds by name."""
     times: dict[str, list[float]] = {name: [] for name in programs}
     for done in range(warm_up + rounds):
         for name, program in programs.items():

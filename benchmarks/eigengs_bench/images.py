@@ -1,7 +1,7 @@
 """The sets of images that benchmarks run on, and the models trained on them.
 
-A folder of data has one folder a set, with images to train on in ``train/`` and others, to measure
-on, in ``test/``; or, where nothing is trained, with the images themselves.
+A folder of data has one folder per set. It holds images to train on in ``train/`` and others, to
+measure on, in ``test/``; or, where nothing is trained, the images themselves.
 """
 
 from pathlib import Path
@@ -14,35 +14,35 @@ from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.resize import center_crop
 
 SAMPLE_NAMES = ("chelsea", "coffee", "astronaut")
-MAX_COMPONENTS = 500  # of the basis of a set: models of fewer take the first of them
+MAX_COMPONENTS = 500  # of the basis of a set: models with fewer take the first of them
 
 
 def images_of(task: Task, name: str, count: int | None = None) -> list[tuple[str, Image]]:
-    """Load names and pixels of the first images of a set, by default `task.images` of them.
+    """Load names and pixels of the first images of a set, by default `task.images` images.
 
-    Portraits have the size of the set turned by a quarter. `ImageError` if the set is not there.
+    Portraits have the sides of the set swapped. `ImageError` if the set is not there.
     """
     count, sides = task.images if count is None else count, SETS[name][1:3]
     if name == SAMPLES:
         return [(photo, center_crop(eg.sample(photo), *sides)) for photo in SAMPLE_NAMES[:count]]
-    folder, found = Path(task.data or "") / SETS[name].folder, []
+    folder, pictures = Path(task.data or "") / SETS[name].folder, []
     for file in image_files(folder / "test" if (folder / "test").is_dir() else folder)[:count]:
         picture = eg.load_image(file)
         upright = picture.shape[0] > picture.shape[1]
         size = (min(sides), max(sides)) if upright else sides
-        found.append((file.name, center_crop(picture, *size)))
-    return found
+        pictures.append((file.name, center_crop(picture, *size)))
+    return pictures
 
 
 def is_present(task: Task, name: str) -> bool:
-    """Tell whether a set is there, with images to train on where models are trained on them."""
+    """Return whether a set exists, with images to train on if models are trained on it."""
     if task.data is None or name == SAMPLES:
         return task.data is None and name == SAMPLES
     return is_trained(task, name) or (name == "kodak" and (task.data / name).is_dir())
 
 
 def is_trained(task: Task, name: str) -> bool:
-    """Tell whether the folder of data has images of a set to train on."""
+    """Return whether the folder of data has images of a set to train on."""
     return bool(task.data) and (Path(task.data or "") / SETS[name].folder / "train").is_dir()
 
 

@@ -1,8 +1,8 @@
-"""What recovers textures from photos: texels, a pyramid of texels, Gaussians, coefficients.
+"""Recovery of textures from photos by texels, a pyramid of texels, Gaussians or coefficients.
 
-A step renders one camera by a few samples a pixel. PSNRs are of pictures by cameras that took no
-photo, and of the maps of a material. The parameters of a pyramid are differences of texels to the
-next coarser level (Weier et al. 2025, doi 10.1145/3730855), so coarse ones move many texels.
+A step renders one camera with a few samples per pixel. PSNRs are those of pictures by cameras that
+took no photo, and of the maps of a material. The parameters of a pyramid are differences of texels
+to the next coarser level (Weier et al. 2025, doi 10.1145/3730855), so coarse ones move many texels.
 """
 
 import gc
@@ -48,7 +48,7 @@ Maps = Mapping[str, Image]
 
 
 class Scene(NamedTuple):
-    """What is to be recovered: maps in linear light or data, by photos of some cameras."""
+    """What is to be recovered: maps of linear light or data, from photos of some cameras."""
 
     kind: str
     cameras: int
@@ -59,12 +59,12 @@ class Scene(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Textures; values to optimise, by their rates; the parameters of a scene that they make."""
+    """Textures, the values to optimise with their rates, and the parameters they set in a scene."""
 
     textures: dict[str, dict[str, Any]]
     start: dict[str, Any]
     rates: dict[str, float]
-    shown: Callable[[Any], dict[str, Any]] = dict
+    parameters_of: Callable[[Any], dict[str, Any]] = dict
     bound: Callable[[Any], None] = lambda values: None
 
 
@@ -84,7 +84,7 @@ def pyramid(mi: Any, kind: str) -> Unknown:
             start[f"{name}{side}"] = mi.TensorXf(np.zeros((side, side, channels), np.float32))
         start[f"{name}{sides[-1]}"] += float(grey(name)[0, 0, 0])
 
-    def shown(values: Any) -> dict[str, Any]:
+    def parameters_of(values: Any) -> dict[str, Any]:
         result = {}
         for name, key in NAMES[kind].items():
             total = values[f"{name}{sides[-1]}"]
@@ -95,7 +95,7 @@ def pyramid(mi: Any, kind: str) -> Unknown:
             result[f"{key}.data"] = total
         return result
 
-    return Unknown(texels(mi, kind).textures, start, dict.fromkeys(start, 0.004), shown)
+    return Unknown(texels(mi, kind).textures, start, dict.fromkeys(start, 0.004), parameters_of)
 
 
 def lookups(mi: Any, kind: str) -> Unknown:
@@ -103,15 +103,15 @@ def lookups(mi: Any, kind: str) -> Unknown:
     from eigengs_dr.plugins import keep_in_bounds, texture_of
 
     [(name, key)] = NAMES[kind].items()
-    found = eg.lattices((TEXELS, TEXELS), SIDES, [GREY] * 3, space="linear")
+    lattices = eg.lattices((TEXELS, TEXELS), SIDES, [GREY] * 3, space="linear")
     rates = {"mean": 0.2, "factor": 0.02, "color": 0.01, "background": 0.005}
-    texture = texture_of(found, cutoff=CUTOFF)
+    texture = texture_of(lattices, cutoff=CUTOFF)
     tensors = mi.traverse(mi.load_dict(texture))
     start = {f"{key}.{field}": mi.TensorXf(tensors[field]) for field in rates}
     named = dict(zip(start, rates.values(), strict=True))
 
     def bound(values: Any) -> None:
-        keep_in_bounds(values, key, found)
+        keep_in_bounds(values, key, lattices)
 
     return Unknown({name: texture}, start, named, bound=bound)
 
@@ -128,14 +128,14 @@ def coefficients(mi: Any, kind: str) -> Unknown:
     start = {"z": dr.zeros(mi.TensorXf, deviation.shape)}
     texture["model"] = str(SHIPPED["natural"])
 
-    def shown(values: Any) -> dict[str, Any]:
+    def parameters_of(values: Any) -> dict[str, Any]:
         return {f"{key}.coefficients": values["z"] * scale}
 
-    return Unknown({name: texture}, start, {"z": 0.3}, shown)
+    return Unknown({name: texture}, start, {"z": 0.3}, parameters_of)
 
 
 def fit(mi: Any, scene: Scene, steps: int) -> Row:
-    """Recover maps by `eg.fit` of a `photo_loss`; the second of two runs has compiled kernels."""
+    """Recover maps by `eg.fit` of a `photo_loss`; the second run counts, after compilation."""
     from eigengs_dr.plugins import photo_loss
 
     names = NAMES[scene.kind]
@@ -147,15 +147,15 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
         size = (TEXELS, TEXELS)
         result = eg.fit(loss=loss, size=size, space=spaces, iterations=steps, progress=False)
         dr.sync_thread()
-    drawn = eg.render(result.gaussians).numpy()
+    rendering = eg.render(result.gaussians).numpy()
     ends = np.cumsum([grey(name).shape[2] for name in names])[:-1]
-    found = dict(zip(names, np.split(drawn, ends, axis=2), strict=True))
+    maps = dict(zip(names, np.split(rendering, ends, axis=2), strict=True))
     count = sum(array.size for array in result.gaussians.to_arrays().values())
     return {
         "seconds": result.seconds,
         "parameters": count,
         "gaussians": len(result.gaussians),
-        **judge(mi, scene, {name: np.clip(picture, 0, 1) for name, picture in found.items()}),
+        **judge(mi, scene, {name: np.clip(picture, 0, 1) for name, picture in maps.items()}),
     }
 
 
@@ -207,7 +207,7 @@ def recover(mi: Any, scene: Scene, method: str, steps: int) -> Row:
 
 
 def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = False) -> Row:
-    """Descend by Adam; the seconds are without the first steps, which compile and record."""
+    """Descend by Adam; the seconds leave out the first step, which compiles and records."""
     from eigengs_dr.plugins import photo_loss
 
     loaded = scene_of(mi, scene.kind, unknown.textures, scene.cameras)
@@ -216,10 +216,10 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
     names = NAMES[scene.kind]
     replayed = photo_loss(loaded, names, photos, spp=scene.spp).function if frozen else None
 
-    def error(shown: Mapping[str, Any], step: int) -> Any:
+    def error(tensors: Mapping[str, Any], step: int) -> Any:
         if replayed:
-            return replayed({name: shown[f"{key}.data"] for name, key in names.items()}, step)
-        parameters.update(shown)
+            return replayed({name: tensors[f"{key}.data"] for name, key in names.items()}, step)
+        parameters.update(tensors)
         camera = step % scene.cameras
         rendered = mi.render(loaded, parameters, sensor=camera, spp=scene.spp, seed=step)
         return dr.mean(dr.square(rendered - photos[camera]), axis=None)
@@ -228,7 +228,7 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
     for step in range(steps):
         rate = LAST_RATE + (1 - LAST_RATE) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
         values.set_learning_rate({key: rate * r for key, r in unknown.rates.items()})
-        dr.backward(error(unknown.shown(values), step))
+        dr.backward(error(unknown.parameters_of(values), step))
         values.step()
         unknown.bound(values)
         if not step:
@@ -236,31 +236,31 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
             started = time.perf_counter()
     dr.sync_thread()
     seconds = time.perf_counter() - started
-    last = unknown.shown(values)
+    last = unknown.parameters_of(values)
     parameters.update(last)
     row = {"seconds": seconds, "parameters": sum(dr.width(v) for v in unknown.start.values())}
     row["psnr_rgb"] = _psnr(_photos(mi, loaded, scene.cameras), scene.photos[scene.cameras :])
     if len(scene.maps) > 1:
-        found = {n: last[f"{key}.data"].numpy() for n, key in NAMES[scene.kind].items()}
-        row |= _judge_maps(scene, found)
+        maps = {n: last[f"{key}.data"].numpy() for n, key in NAMES[scene.kind].items()}
+        row |= _judge_maps(scene, maps)
     return row
 
 
-def judge(mi: Any, scene: Scene, found: Maps) -> Row:
+def judge(mi: Any, scene: Scene, maps: Maps) -> Row:
     """Return psnr_rgb of the cameras that took no photo, and the PSNRs of several maps."""
-    loaded = scene_of(mi, scene.kind, _bitmaps(mi, found), scene.cameras)
+    loaded = scene_of(mi, scene.kind, _bitmaps(mi, maps), scene.cameras)
     views = _photos(mi, loaded, scene.cameras)
     row = {"psnr_rgb": _psnr(views, scene.photos[scene.cameras :])}
-    return row | (_judge_maps(scene, found) if len(scene.maps) > 1 else {})
+    return row | (_judge_maps(scene, maps) if len(scene.maps) > 1 else {})
 
 
-def _judge_maps(scene: Scene, found: Maps) -> Row:
+def _judge_maps(scene: Scene, maps: Maps) -> Row:
     """Return the PSNRs of maps where they are seen, and of the best constant in place of each."""
     row = {}
     for name, true in scene.maps.items():
         mean = np.average(true.reshape(-1, true.shape[2]), axis=0, weights=scene.seen.ravel())
         constant = np.broadcast_to(mean, true.shape)
-        for key, picture in ((name, found[name]), (f"{name}_constant", constant)):
+        for key, picture in ((name, maps[name]), (f"{name}_constant", constant)):
             pair = [np.clip(values, 0, 1) for values in (picture, true)]
             if SPACES[name] == "linear":
                 pair = [to_coded(values) for values in pair]
@@ -275,7 +275,7 @@ def _psnr(pictures: Sequence[Image], photos: Sequence[Image]) -> float:
 
 
 def maps_of(kind: str) -> Maps:
-    """Return the maps of a scene: photos in linear light; of one, the grey as roughness."""
+    """Return the maps of a scene: photos in linear light, and the grey of one as roughness."""
     maps = {}
     for name, photo in PHOTOS[kind].items():
         codes = np.clip(center_crop(eg.sample(photo), TEXELS, TEXELS), 0, 1)
@@ -317,7 +317,7 @@ def _bitmaps(mi: Any, maps: Maps) -> dict[str, dict[str, Any]]:
 
 
 def scene_of(mi: Any, kind: str, textures: Mapping[str, dict[str, Any]], count: int) -> Any:
-    """Load a poster or a ball over a floor, under a lamp and the sky; judges look from between."""
+    """Load a poster or a ball on a floor, under a lamp and the sky; judges are between cameras."""
     at, box = mi.ScalarTransform4f(), {"type": "box"}
     film = {"type": "hdrfilm", "pixel_format": "rgb", "width": SIDE, "height": SIDE, "rfilter": box}
     scene = {"type": "scene", "integrator": {"type": "prb", "max_depth": 3}}
@@ -392,8 +392,8 @@ def gain(
 ) -> list[float]:
     """Return the decibels of each fit above a pyramid at equal seconds.
 
-    Between two descents of the pyramid, its PSNR is linear in the logarithm of the seconds; outside
-    of them it is that of the nearest.
+    Between two descents of the pyramid, its PSNR is linear in the logarithm of the seconds; beyond
+    them it is that of the nearest.
     """
     curve = sorted((row["seconds"], row[key]) for row in methods[rival].values())
     seconds, psnr = zip(*curve, strict=True)
@@ -404,7 +404,7 @@ def gain(
 
 
 def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
-    """Put the gains of a scene and its cameras on one line a pyramid, a column a descent."""
+    """Lay out the gains of a scene and its cameras: a line per pyramid, a column per descent."""
     descents = [*((steps, SPP) for steps in STEPS), *((NOISY_STEPS, spp) for spp in NOISES)]
     cells: dict[tuple[str, int, str], dict[tuple[int, int], str]] = {}
     for (scene, cameras, spp), methods in curves.items():
@@ -447,7 +447,7 @@ def _materials(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table
 
 
 def _chart(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Figure:
-    """Draw PSNR over seconds, a part for each scene and number of cameras."""
+    """Draw PSNR over seconds, a panel for each scene and number of cameras."""
     cases = [case for case in curves if len(next(iter(curves[case].values()))) > 1]
     lines = max(1, math.ceil(len(cases) / 2))
     figure = fr.new_figure(8, 1 + 2.1 * lines, "Textures recovered from photos")

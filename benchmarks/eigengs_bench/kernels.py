@@ -38,7 +38,7 @@ PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program tha
 
 
 def run(task: Task) -> list[Row]:
-    """Time the kernels in one run, the variants in turns; every figure is a median.
+    """Time the kernels in one run, the variants in turn; every figure is a median.
 
     `plain_ms` and `fast_ms` are forward and reverse together, with lists given and programs frozen,
     the ratios plain over fast. `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without
@@ -110,7 +110,7 @@ def kernel_figures(
 
 
 def programs(scene: eg.Gaussians, plain: bool) -> tuple[Any, Any]:
-    """Make frozen programs that draw a scene, forward and with reverse.
+    """Make frozen programs that draw a scene: forward, and forward with reverse.
 
     ``program.func.clear()`` frees a program. `plain` is `render_plain` instead of `rasterize`.
     """
@@ -178,8 +178,8 @@ def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time a refinement, its steps alone, and a round of relocation."""
     photo, method = center_crop(eg.sample("astronaut"), SIDE, SIDE), eg.DEFAULT
     data = data_of(photo, "ycbcr")
-    shown = picture(types, "ycbcr", [photo], [data])
-    objective = replace(Pixels.of(data, "ycbcr", types), pictures=(shown,))
+    display = picture(types, "ycbcr", [photo], [data])
+    objective = replace(Pixels.of(data, "ycbcr", types), pictures=(display,))
     start = method.place_and_solve(objective, COUNT)
     bare = replace(method, controls=())
     moves = [c for c in method.controls if isinstance(c, (Relocate, Perturb))]

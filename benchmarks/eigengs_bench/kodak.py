@@ -1,4 +1,4 @@
-"""The table that the field compares in: fits of the Kodak photos by numbers of Gaussians and steps.
+"""The usual comparison: fits of the Kodak photos with several numbers of Gaussians and steps.
 
 A row has psnr_float, the PSNR in RGB of float pixels clamped to [0, 1], which is the metric of the
 published figures; psnr_rgb, of 8-bit pixels; psnr_ycbcr, ms_ssim, and the seconds of the fit. The
@@ -41,8 +41,8 @@ CAPTION = "PSNR in RGB of float pixels clamped to [0, 1]; means of the photos, m
 OTHERS = (fr.RED, fr.ORANGE, fr.PINK, fr.GREEN, fr.GREY, fr.SKY, fr.INK, "#a07c00")
 MARKERS = "s^vDPX<>"
 
-# The metric is of RGB. On 9 training photos (5 of scikit-image, 4 of cats) fits in RGB gain 0.06,
-# 0.05, 0.13, 0.46 and 0.57 dB in it with 0.0127, 0.0254, 0.076, 0.127 and 0.178 Gaussians a pixel.
+# The metric is in RGB. On 9 training photos (5 of scikit-image, 4 of cats) fits in RGB gain 0.06,
+# 0.05, 0.13, 0.46 and 0.57 dB with 0.0127, 0.0254, 0.076, 0.127 and 0.178 Gaussians per pixel.
 COLOR = "rgb"
 
 
@@ -56,7 +56,7 @@ def run(
 def _jobs(
     task: Task, counts: Sequence[int], steps: Sequence[int], solve_steps: int, timed: bool
 ) -> Iterator[Job]:
-    """Name the fits: all of the first number of steps before the next, photo by photo."""
+    """Name the fits, photo by photo: all with the first number of steps before the next."""
     photos = images_of(task, SET)
     method = replace(eg.DEFAULT, solve_steps=solve_steps)
     options: Row = {"space": COLOR, "method": method, "backend": task.backend}
@@ -70,31 +70,31 @@ def _jobs(
 
 
 def _measure(image: Image, count: int, iterations: int, options: Row) -> Row:
-    found = eg.fit(image, count, iterations, **options)
+    result = eg.fit(image, count, iterations, **options)
     return {
-        "psnr_float": decibels(np.clip(found.image, 0, 1), image, "data"),
-        "psnr_rgb": decibels(found.image, image, "rgb"),
-        "psnr_ycbcr": decibels(found.image, image, "ycbcr"),
-        "ms_ssim": eg.ms_ssim(found.image, image),
-        "seconds": found.seconds,
-        "taken": found.iterations,
+        "psnr_float": decibels(np.clip(result.image, 0, 1), image, "data"),
+        "psnr_rgb": decibels(result.image, image, "rgb"),
+        "psnr_ycbcr": decibels(result.image, image, "ycbcr"),
+        "ms_ssim": eg.ms_ssim(result.image, image),
+        "seconds": result.seconds,
+        "taken": result.iterations,
     }
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out the quality of each number of Gaussians: a table and a chart.
+    """Lay out the quality for each number of Gaussians: tables and a chart.
 
     Seconds are those of timed fits alone.
     """
     usual = {"solve_steps": SOLVE_STEPS}  # rows of fits with the default do not name it
     fits = fr.frame_of([{**row, "job": {**usual, **row["job"]}} for row in rows])
-    photos, known = fits.drop_duplicates([*FIT, "image"]), published()
+    photos, others = fits.drop_duplicates([*FIT, "image"]), published()
     means = photos.groupby(FIT)[["psnr_float", "psnr_rgb", "ms_ssim"]].mean()
     means["seconds"] = fits[fits.timed].groupby(FIT).seconds.median()
     means["photos"] = photos.groupby(FIT).image.nunique()
     ours = means.reset_index().rename(columns={"iterations": "steps"})
     ours["method"], ours["source"] = ours.solve_steps.map(_name), "measured"
-    both = pd.concat([ours, known.assign(photos=24)]).sort_values("gaussians", kind="stable")
+    both = pd.concat([ours, others.assign(photos=24)]).sort_values("gaussians", kind="stable")
     both["where"] = (" (" + both.machine + ")").fillna("")
     lines = [
         (
@@ -111,12 +111,12 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         for line in both.itertuples()
     ]
     table = fr.table(CAPTION, COLUMNS, lines, "all")
-    charts = {"kodak-gaussians": _over_gaussians(photos, known)}
-    return fr.Section([table, _by_counts(both)], charts, _figures(ours, known))
+    charts = {"kodak-gaussians": _over_gaussians(photos, others)}
+    return fr.Section([table, _by_counts(both)], charts, _figures(ours, others))
 
 
 def _by_counts(both: pd.DataFrame) -> fr.Table:
-    """Put the usual numbers of Gaussians side by side: a line a method and its steps."""
+    """Put the usual numbers of Gaussians side by side: a line for each method and its steps."""
     both = both[both.gaussians.isin(KODAK_COUNTS)].fillna({"steps": 0})
     both["cell"] = [
         fr.number(line.psnr_float, 2)
@@ -135,10 +135,12 @@ def _by_counts(both: pd.DataFrame) -> fr.Table:
     return fr.table(caption, ("method", *(f"{n:,}" for n in KODAK_COUNTS)), lines, "quality")
 
 
-def _figures(ours: pd.DataFrame, known: pd.DataFrame) -> dict[str, str]:
-    """Write PSNR and seconds of fits of 1,000 steps, beside the best published of Gaussians."""
+def _figures(ours: pd.DataFrame, others: pd.DataFrame) -> dict[str, str]:
+    """Write PSNR and seconds of fits of 1,000 steps, and the best published PSNR of Gaussians."""
     usual = ours[(ours.steps == 1000) & (ours.solve_steps == SOLVE_STEPS)].set_index("gaussians")
-    best = known[~known.method.str.contains("not Gaussians")].groupby("gaussians").psnr_float.max()
+    best = (
+        others[~others.method.str.contains("not Gaussians")].groupby("gaussians").psnr_float.max()
+    )
     figures = {}
     for count in sorted(set(usual.index) & set(best.index)):
         figures[f"psnr_{count}"] = f"{fr.number(usual.psnr_float[count])} dB"
@@ -148,7 +150,7 @@ def _figures(ours: pd.DataFrame, known: pd.DataFrame) -> dict[str, str]:
 
 
 def published() -> pd.DataFrame:
-    """Read the published figures: a line a method and a number of Gaussians, with its source."""
+    """Read the published figures: a line per method and number of Gaussians, with its source."""
     return pd.read_csv(str(files("eigengs_bench") / "published_kodak.csv"))
 
 
@@ -157,8 +159,8 @@ def _name(depth: int) -> str:
     return "default" if depth == SOLVE_STEPS else f"default, solve_steps={depth}"
 
 
-def _over_gaussians(photos: pd.DataFrame, known: pd.DataFrame) -> Figure:
-    """Draw PSNR over the number of Gaussians: a line a number of steps, a line a method."""
+def _over_gaussians(photos: pd.DataFrame, others: pd.DataFrame) -> Figure:
+    """Draw PSNR over the number of Gaussians: a line per number of steps, and per method."""
     figure = fr.new_figure(8, 4.6, f"Kodak, {fr.counted(photos.image)}: quality over numbers")
     axis = figure.subplots()
     for (steps, depth), part in photos.groupby(KIND):
@@ -166,7 +168,7 @@ def _over_gaussians(photos: pd.DataFrame, known: pd.DataFrame) -> Figure:
         points, label = part.groupby("gaussians").psnr_float.mean(), _name(depth)
         label += f", {steps:,} steps"
         axis.plot(points, "o-", ms=5, color=fr.BLUE, alpha=alpha, label=label)
-    styles = zip(OTHERS, MARKERS, known.groupby("method", sort=False), strict=False)
+    styles = zip(OTHERS, MARKERS, others.groupby("method", sort=False), strict=False)
     for color, marker, (name, part) in styles:
         label = name.partition(" (")[0]
         axis.plot(part.gaussians, part.psnr_float, f"{marker}--", ms=5, color=color, label=label)

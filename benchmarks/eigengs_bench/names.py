@@ -29,6 +29,7 @@ PRESETS = ("default", "gaussianimage", "eigengs")
 TABLES = ("main", "ablation", "cross")
 PICTURES = ("iterations", "colors", "curves", "tiles", "radii", "split", "cross")
 PARTS = ("pixels", "splats", "small")
+TEXTURE_PARTS = ("posters", "lights", "ball")
 PEERS = ("splatthis", "texels", "JPEG", "AVIF")
 KODAK_COUNTS = (5_000, 10_000, 30_000, 50_000, 70_000)  # Gaussians of published tables
 SOLVE_STEPS = 10  # of the colour solve of a fit, by default

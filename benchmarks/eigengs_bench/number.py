@@ -15,7 +15,7 @@ from eigengs_bench.rows import Job, Row, Task
 
 
 def run(task: Task, names: Sequence[str], targets: Sequence[float]) -> list[Row]:
-    """Search on every image of some sets for the number of Gaussians of every target."""
+    """Search for the number of Gaussians for every target, on every image of some sets."""
     return task.measure("number", list(_jobs(task, names, targets)))
 
 
@@ -31,13 +31,13 @@ def _search(task: Task, image: Image, target: float) -> Row:
     goal = eg.Goal(target, space="ycbcr")
     search = partial(eg.fit, image, target_psnr=goal, backend=task.backend)
     search(iterations=min(WARM_STEPS, task.iterations))  # untimed, to compile
-    found = search(iterations=task.iterations)
-    count = len(found.gaussians)
+    result = search(iterations=task.iterations)
+    count = len(result.gaussians)
     usual = eg.fit(image, count, task.iterations, backend=task.backend)
     return {
         "gaussians": count,
-        **{key: getattr(found, key) for key in ("stopped", "iterations", "seconds")},
-        **{f"psnr_{space}": decibels(found.image, image, space) for space in ("ycbcr", "rgb")},
+        **{key: getattr(result, key) for key in ("stopped", "iterations", "seconds")},
+        **{f"psnr_{space}": decibels(result.image, image, space) for space in ("ycbcr", "rgb")},
         "fit_seconds": usual.seconds,
         "fit_psnr": decibels(usual.image, image, "ycbcr"),
     }
@@ -54,7 +54,7 @@ COLUMNS = {
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out how many Gaussians a PSNR takes: a table a set."""
+    """Lay out how many Gaussians a PSNR takes: a table per set."""
     tables, points = [], fr.frame_of(rows)
     points["met"] = points.stopped == "met"
     points["ratio"] = points.seconds / points.fit_seconds

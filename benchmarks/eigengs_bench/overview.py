@@ -1,8 +1,8 @@
-"""PSNR over seconds: this package beside what else there is, on one machine and as published.
+"""PSNR over seconds: this package beside its alternatives, on one machine and as published.
 
 Rows are those of other questions: "pareto" has the methods of this package on photos of
-scikit-image; "kodak" has timed fits, which stand beside published figures; "peers" has what else
-runs on this machine.
+scikit-image; "kodak" has timed fits, to compare with published figures; "peers" has other programs
+on this machine.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ def charts(rows: Mapping[str, Sequence[Row]]) -> dict[str, Figure]:
 
 
 def _speed(rows: Mapping[str, Sequence[Row]]) -> Figure:
-    """Draw methods on small photos, Kodak beside published figures, and what else runs here."""
+    """Draw methods on small photos, Kodak beside published figures, and other programs."""
     peers = fr.frame_of(rows.get("peers", []))
     figure = fr.new_figure(11.5 if len(peers) else 9, 4.8)
     axes = figure.subplots(1, 3 if len(peers) else 2)
@@ -55,7 +55,7 @@ def _speed(rows: Mapping[str, Sequence[Row]]) -> Figure:
 
 
 def _methods(axis: Axes, fits: pd.DataFrame) -> None:
-    """Draw a line a method: fits of more and more steps, the start included."""
+    """Draw a line per method: fits with more and more steps, the start included."""
     fits = fits[(fits.knob == "preset") & (fits.set == SAMPLES)]
     for (method, color), marker in zip(fr.COLORS.items(), "osD", strict=True):
         points = fits[fits.value == method].groupby("iteration")[["seconds", "psnr_rgb"]]
@@ -69,7 +69,7 @@ def _methods(axis: Axes, fits: pd.DataFrame) -> None:
 
 
 def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
-    """Draw timed fits, a line a number of steps, and what is published with its seconds."""
+    """Draw timed fits, a line per number of steps, and published figures that have seconds."""
     timed = fits[fits.timed & (fits.iterations > 0)]
     for (steps, part), alpha in zip(timed.groupby("iterations"), (1.0, 0.5), strict=False):
         points = part.groupby("gaussians").agg({"seconds": "median", "psnr_float": "mean"})
@@ -80,9 +80,9 @@ def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
             words = f"{count:,} Gaussians" if count == points.index.min() else f"{count:,}"
             at = (point.seconds, point.psnr_float)
             axis.annotate(words, at, (-6, 3), textcoords="offset points", fontsize=7, ha="right")
-    known = published().dropna(subset="seconds")
+    others = published().dropna(subset="seconds")
     marks = zip(
-        known.groupby("method", sort=False), (fr.RED, fr.ORANGE, fr.GREY), "*XP", strict=False
+        others.groupby("method", sort=False), (fr.RED, fr.ORANGE, fr.GREY), "*XP", strict=False
     )
     for (name, part), color, marker in marks:
         method, counts = str(name).partition(" (")[0], ", ".join(f"{n:,}" for n in part.gaussians)
@@ -93,7 +93,7 @@ def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
 
 
 def _peers(axis: Axes, points: pd.DataFrame) -> None:
-    """Draw what each program reaches: a line a program, a point a setting."""
+    """Draw what each program reaches: a line per program, a point per setting."""
     groups = points.groupby("peer", sort=False)
     for (name, part), (color, marker) in zip(groups, PEERS, strict=False):
         means = part.groupby("setting").agg({"seconds": "median", "psnr_rgb": "mean"})

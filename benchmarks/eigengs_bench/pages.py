@@ -9,8 +9,8 @@ A page has marks, which are comments of HTML and do not show::
 In a sentence it is ``<!-- figure: kernels.peak -->6.3<!-- end -->``, not at the start of a line. A
 page shows a chart as a picture in ``docs/images/measured/``.
 
-Rows of "once" hold tables that no question of today makes: their caption, columns and lines. If
-nobody wrote down the commit of a run, theirs is the one with which the figures came into a page.
+Rows of "once" hold tables that no current question produces: their caption, columns and lines.
+Where the commit of a run was not recorded, it is the one that brought the figures into a page.
 """
 
 import re
@@ -21,7 +21,7 @@ from pathlib import Path
 from matplotlib import __version__ as drawn_with
 
 from eigengs_bench import overview
-from eigengs_bench.report import QUESTIONS, Table, as_text, drawn, sources_of, table
+from eigengs_bench.report import QUESTIONS, Table, as_text, chart_file, sources_of, table
 from eigengs_bench.rows import Row, read
 from eigengs_dr.storage.atomic import atomic_write
 
@@ -39,20 +39,20 @@ def pages_of(checkout: Path) -> list[Path]:
 
 
 def outdated(checkout: Path) -> dict[Path, bytes]:
-    """Return the pages and charts that differ from what the rows give, with what they should hold.
+    """Return the pages and charts that are out of date, with what they should hold.
 
-    A chart that another version of matplotlib has drawn counts as right. `ValueError` if a page
+    A chart drawn by another version of matplotlib counts as up to date. `ValueError` if a page
     names a table, a figure or a chart that no row holds.
     """
     parts, charts = contents(checkout / ROWS)
-    right, wanted = dict[Path, bytes](), set[str]()
+    right, used = dict[Path, bytes](), set[str]()
     for page in pages_of(checkout):
         text = page.read_text("utf-8")
         right[page] = filled(text, parts, str(page)).encode()
-        wanted |= set(CHART.findall(text))
-    if unknown := wanted - charts.keys():
+        used |= set(CHART.findall(text))
+    if unknown := used - charts.keys():
         raise ValueError(f"{checkout / ROWS}: no row holds the chart {min(unknown)}")
-    right |= {checkout / CHARTS / f"{name}.svg": charts[name] for name in wanted}
+    right |= {checkout / CHARTS / f"{name}.svg": charts[name] for name in used}
     return {path: content for path, content in right.items() if not _is_right(path, content)}
 
 
@@ -65,7 +65,7 @@ def _is_right(path: Path, content: bytes) -> bool:
 
 
 def write(checkout: Path) -> list[Path]:
-    """Write the pages and charts that differ from what the rows give, and return their paths."""
+    """Write the pages and charts that are out of date, and return their paths."""
     changed = outdated(checkout)
     (checkout / CHARTS).mkdir(parents=True, exist_ok=True)
     for path, content in changed.items():
@@ -94,24 +94,24 @@ def filled(text: str, parts: Mapping[str, str], name: str) -> str:
 
 
 def contents(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Return what a page can name, in Markdown, by its mark; and the charts by their names."""
+    """Return the Markdown for each mark that a page can hold, and the charts by their names."""
     rows: dict[str, list[Row]] = {}
     for row in read(path):
         rows.setdefault(row["bench"], []).append(row)
     parts = _tables_measured_once(rows.get("once", []))
-    charts = {name: drawn(figure) for name, figure in overview.charts(rows).items()}
+    charts = {name: chart_file(figure) for name, figure in overview.charts(rows).items()}
     for bench in QUESTIONS:
-        if made := rows.get(bench):
-            section = import_module(f"eigengs_bench.{bench}").summarize(made)
-            known = [one for one in section.tables if not one.frame.empty]
-            parts |= {f"table: {bench}.{one.name}": _with_source(one, made) for one in known}
+        if measured := rows.get(bench):
+            section = import_module(f"eigengs_bench.{bench}").summarize(measured)
+            tables = [one for one in section.tables if not one.frame.empty]
+            parts |= {f"table: {bench}.{one.name}": _with_source(one, measured) for one in tables}
             parts |= {f"figure: {bench}.{name}": text for name, text in section.figures.items()}
-            charts |= {name: drawn(figure) for name, figure in section.charts.items()}
+            charts |= {name: chart_file(figure) for name, figure in section.charts.items()}
     return parts, charts
 
 
 def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
-    """Lay out the rows of "once"; rows of one table are parts of it, of several runs."""
+    """Lay out the rows of "once"; the rows of one table are its parts, from several runs."""
     groups: dict[str, list[Row]] = {}
     for row in measured:
         groups.setdefault(row["job"]["table"], []).append(row)
@@ -124,14 +124,14 @@ def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
     }
 
 
-def _with_source(shown: Table, rows: Sequence[Row]) -> str:
-    """Lay a table out for a page: its caption below it, and folded how its rows were made."""
-    cells = as_text(shown, "pipe").removeprefix(shown.caption).strip()
-    sources = sources_of(rows if shown.rows is None else shown.rows)
+def _with_source(measured: Table, rows: Sequence[Row]) -> str:
+    """Lay out a table for a page: the caption below it, and its sources folded away."""
+    cells = as_text(measured, "pipe").removeprefix(measured.caption).strip()
+    sources = sources_of(rows if measured.rows is None else measured.rows)
     if not sources:
-        return f"{cells}\n\n*{shown.caption}.*"
+        return f"{cells}\n\n*{measured.caption}.*"
     lines = "\n".join(f"- {line}" for line in sources)
-    return f"{cells}\n\n*{shown.caption}.*\n\n{_folded('How it was measured', lines)}"
+    return f"{cells}\n\n*{measured.caption}.*\n\n{_folded('How it was measured', lines)}"
 
 
 def _folded(title: str, text: str) -> str:

@@ -22,9 +22,9 @@ from eigengs_bench.names import SETS
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.fitting.place import Grid, Random
 
-# Steps of runs of a method whose rates fall: each number is a run of its own.
+# Steps of runs of a method whose rates fall: each number takes its own run.
 HORIZONS = (0, 10, 100, 300, 1000)
-# Steps after which the one run is looked at where rates stay: it stands for all shorter ones.
+# Steps after which a run with constant rates is measured: it stands for all shorter ones.
 MARKS = (0, 10, 20, 50, 100, 200, 500, 1000)
 
 
@@ -47,12 +47,14 @@ def run(task: Task, names: Sequence[str]) -> list[Row]:
 
 
 def variants(task: Task, name: str) -> list[Variant]:
-    """List the fits that are compared on a set, the default one first.
+    """List the fits that are compared on a set, the default first.
 
-    The basis is that of the set, which is trained if it is missing, or else the one that ships.
+    The basis is that of the set, trained if it is missing, or else the one that ships.
     """
-    count, own = SETS[name].gaussians, is_trained(task, name)
-    basis = model_for(task, name, name, 300) if own else eg.EigenGS.load("natural", task.backend)
+    count, trained = SETS[name].gaussians, is_trained(task, name)
+    basis = (
+        model_for(task, name, name, 300) if trained else eg.EigenGS.load("natural", task.backend)
+    )
     return [
         Variant("preset", "default", count),
         Variant("preset", "gaussianimage", count, METHODS["gaussianimage"]),
@@ -77,7 +79,7 @@ def _jobs(task: Task, name: str) -> Iterator[Job]:
 
 
 def trace(task: Task, fit: Variant, image: Image) -> Row:
-    """Run a variant once untimed, then once for every number of steps it is judged at."""
+    """Run a variant once untimed, then once for every number of steps at which it is judged."""
     iterations = task.iterations
     options = {k: v for k, v in fit._asdict().items() if k not in ("knob", "value")}
     options["backend"] = task.backend
@@ -85,9 +87,9 @@ def trace(task: Task, fit: Variant, image: Image) -> Row:
     falls = fit.method.decay < 1
     marks = sorted({n for n in (HORIZONS if falls else MARKS) if n < iterations} | {iterations})
     runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
-    moments = [m for steps, shown in runs for m in descent(image, steps, shown, **options)]
-    found = [score(moment, image) for moment in moments]
-    return {"gaussians": len(moments[-1].gaussians), "trace": found}
+    moments = [m for steps, kept in runs for m in descent(image, steps, kept, **options)]
+    scores = [score(moment, image) for moment in moments]
+    return {"gaussians": len(moments[-1].gaussians), "trace": scores}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -103,7 +105,7 @@ VARIANTS: dict[str, Any] = {
     "RGB": ("psnr_rgb", fr.mean),
     "on front": ("front", "first"),
 }
-# What a knob is, its colour and marker.
+# The description of a knob, its colour and its marker.
 KNOBS = {
     "init": ("Where Gaussians start", fr.PINK, "s"),
     "solve steps": ("Steps of the colour solve", fr.ORANGE, "^"),
@@ -113,7 +115,7 @@ KNOBS = {
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out what was measured: a table and a chart a set."""
+    """Lay out what was measured: a table and a chart per set."""
     tables, charts = [], {}
     for name, part in fr.frame_of(rows, "trace").groupby("set", sort=False):
         points = points_of(part)
@@ -139,11 +141,11 @@ def points_of(fits: pd.DataFrame) -> pd.DataFrame:
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Find the points (seconds, PSNR) of which none is as fast and better, or faster and as good.
 
-    From the fastest to the best; of equal points one; no point with NaN is on a front.
+    They are sorted from the fastest to the best, without duplicates and without NaN.
     """
     best, kept = -math.inf, []
-    known = [point for point in points if not any(map(math.isnan, point))]
-    for seconds, reached in sorted(known, key=lambda point: (point[0], -point[1])):
+    finite = [point for point in points if not any(map(math.isnan, point))]
+    for seconds, reached in sorted(finite, key=lambda point: (point[0], -point[1])):
         if reached > best:
             best = reached
             kept.append((seconds, reached))

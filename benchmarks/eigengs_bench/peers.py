@@ -1,11 +1,11 @@
-"""What else one would pick on a laptop: a package of Gaussians, codecs, and a smaller bitmap.
+"""The alternatives on a laptop: a package of Gaussians, codecs, and a smaller bitmap.
 
-A row has the figures of `judge` of a picture, "seconds" of what made it, "bytes" of its file,
+A row has the figures of `judge` for a picture, the "seconds" it took, the "bytes" of its file,
 "memory", the bytes of the parameters that a renderer reads, and "number" of Gaussians or texels.
 The seconds count where the job is "timed": nothing else ran on the machine.
 
-A package that fits Gaussians has a virtual environment of its own below the folder of the rows, and
-draws its own picture.
+A package that fits Gaussians has its own virtual environment in the folder of the rows, and draws
+its own picture.
 """
 
 import io
@@ -31,14 +31,14 @@ from eigengs_bench import report as fr
 from eigengs_bench.clock import Image, judge
 from eigengs_bench.images import images_of
 from eigengs_bench.names import PEERS
-from eigengs_bench.rate import BUDGET, CODECS, WARM_UP
+from eigengs_bench.rate import CODECS, WARM_UP, fit_and_pack
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.image.io import save_image, to_8bit
 
 OURS, PACKED, TEXELS = "eigengs_dr", "eigengs_dr, packed", "texels"
-# With the build of PyTorch that it fits with.
+# With the build of PyTorch that it was measured with.
 REQUIREMENTS = ("splatthis==0.3.2", "torch==2.13.0")
-# A third of its steps, and its steps, by the profile that is its default and its most costly one.
+# A third of the steps, and all steps, of its default profile, which is also its most costly one.
 SPLATTHIS = {"170 steps": "70,50,33,17", "500 steps": "200,150,100,50"}
 CODED = {"JPEG": ("JPEG 4:2:0", "JPEG 4:4:4"), "AVIF": ("AVIF 4:4:4",)}
 BETTER = {
@@ -57,7 +57,7 @@ def run(
     gaussians: int,
     timed: bool,
 ) -> list[Row]:
-    """Measure images of sets, or some of them by their names, by this package and by the peers."""
+    """Measure images of sets, all or some by name, with this package and with the peers."""
     shared: Row = {"gaussians": gaussians, "timed": timed}
     jobs = (
         ({"set": name, "image": photo, **shared, **label}, work)
@@ -92,29 +92,24 @@ def _jobs(task: Task, image: Image, count: int, peers: Sequence[str]) -> Iterato
 
 
 def memory_of(count: int) -> int:
-    """Return the bytes of a set of three channels: mean, factor, colour; and one background."""
+    """Return the bytes of a set of three channels: mean, factor and colour, and a background."""
     return 4 * (8 * count + 3)
 
 
 def _fit(task: Task, image: Image, count: int, steps: int) -> Row:
-    made = partial(eg.fit, image, count, backend=task.backend)
-    made(iterations=min(WARM_UP, steps))
-    result = made(iterations=steps)
+    fit = partial(eg.fit, image, count, backend=task.backend)
+    fit(iterations=min(WARM_UP, steps))
+    result = fit(iterations=steps)
     memory = {"memory": memory_of(count), "number": count}
     return {"seconds": result.seconds, **memory, **judge(result.image, image)}
 
 
 def _packed(task: Task, image: Image, count: int) -> Row:
-    made = partial(eg.fit, image, count, backend=task.backend)
-    made(iterations=min(WARM_UP, task.iterations))
-    started = time.perf_counter()
-    result = made(iterations=task.iterations)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "fit.egs"
-        size = eg.pack(result.gaussians, path, image, BUDGET).bytes
-        seconds = time.perf_counter() - started
-        shown = eg.picture_of(eg.Gaussians.load(path, task.backend))
-    return {"seconds": seconds, "bytes": size, "number": count, **judge(shown, image)}
+        size, seconds = fit_and_pack(task, image, count, path)
+        picture = eg.picture_of(eg.Gaussians.load(path, task.backend))
+    return {"seconds": seconds, "bytes": size, "number": count, **judge(picture, image)}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -123,13 +118,13 @@ def _packed(task: Task, image: Image, count: int) -> Row:
 
 
 def environment(folder: Path, requirements: Sequence[str]) -> Path:
-    """Make a virtual environment with some packages, if it is not there; return its programs.
+    """Make a virtual environment with some packages, if it is missing; return its programs.
 
-    `ValueError` with the last words of pip if a package cannot be installed.
+    `ValueError` with the last line of pip if a package cannot be installed.
     """
     programs, done = folder / ("Scripts" if os.name == "nt" else "bin"), folder / "packages.txt"
-    wanted = "\n".join(requirements)
-    if not done.exists() or done.read_text() != wanted:
+    listed = "\n".join(requirements)
+    if not done.exists() or done.read_text() != listed:
         EnvBuilder(clear=True, with_pip=True).create(folder)
         python = str(programs / "python")
         command = [python, "-m", "pip", "install", "--quiet", *requirements]
@@ -137,17 +132,17 @@ def environment(folder: Path, requirements: Sequence[str]) -> Path:
         if process.returncode:
             words = (process.stderr.strip() or "pip failed").splitlines()[-1]
             raise ValueError(f"{folder}: {' '.join(requirements)} cannot be installed: {words}")
-        done.write_text(wanted)
+        done.write_text(listed)
     return programs
 
 
 def _pixels(file: Path | io.BytesIO) -> Image:
-    """Decode a picture of 8 bits."""
+    """Decode an 8-bit picture."""
     return np.asarray(pillow.open(file).convert("RGB")).astype(np.float32) / np.float32(255)
 
 
 def _splatthis(folder: Path, image: Image, count: int, stages: str) -> Row:
-    """Fit with splatthis, which counts its seconds itself, without those of its imports."""
+    """Fit with splatthis, which measures its own seconds, without its imports."""
     program = environment(folder / "splatthis", REQUIREMENTS) / "splatthis"
     with TemporaryDirectory() as place:
         here = Path(place)
@@ -160,18 +155,18 @@ def _splatthis(folder: Path, image: Image, count: int, stages: str) -> Row:
         if process.returncode:
             raise ValueError(f"splatthis failed: {(process.stderr or '?').splitlines()[-1]}")
         log = json.loads((here / "log" / "run_manifest.json").read_text())
-        shown = _pixels(preview)
+        picture = _pixels(preview)
         size = drawing.stat().st_size
     figures = {"seconds": log["total_time_sec"], "number": log["final_splat_count"], "bytes": size}
-    # What its optimiser sees, before the splats are drawn as those of SVG.
+    # What its optimiser sees, before the splats are drawn as SVG.
     figures["own_psnr_rgb"] = log["final_metrics"]["psnr_srgb"]
-    return {**figures, "requirements": list(REQUIREMENTS), **judge(shown, image)}
+    return {**figures, "requirements": list(REQUIREMENTS), **judge(picture, image)}
 
 
 def _texels(image: Image, count: int) -> Row:
-    """Fit a bitmap of 8 bits, which with its pyramid takes no more memory than a set.
+    """Fit an 8-bit bitmap that, with its pyramid, takes no more memory than a set.
 
-    The texels are those of least squares under bilinear lookups, so no bitmap of this size is
+    The texels are the least-squares solution under bilinear lookups, so no bitmap of this size is
     closer, but for rounding.
     """
     started = time.perf_counter()
@@ -185,9 +180,9 @@ def _texels(image: Image, count: int) -> Row:
     texels = np.einsum("ry,yxc,kx->rkc", inverse[0], image, inverse[1], optimize=True)
     texels = np.round(255 * np.clip(texels, 0, 1)) / 255
     seconds = time.perf_counter() - started
-    shown = np.einsum("yr,rkc,xk->yxc", up, texels, across, optimize=True).astype(np.float32)
+    picture = np.einsum("yr,rkc,xk->yxc", up, texels, across, optimize=True).astype(np.float32)
     memory = {"memory": 4 * rows * columns, "number": rows * columns}
-    return {"seconds": seconds, **memory, **judge(shown, image)}
+    return {"seconds": seconds, **memory, **judge(picture, image)}
 
 
 def bilinear(size: int, count: int) -> NDArray[np.float64]:
@@ -201,7 +196,7 @@ def bilinear(size: int, count: int) -> NDArray[np.float64]:
 
 
 def _coded_as_small(packed: Callable[[], Row], image: Image, title: str) -> Row:
-    """Encode at the best quality whose file has at most as many bytes as a packed fit."""
+    """Encode at the best quality whose file is no larger than that of a packed fit."""
     size = packed()["bytes"]
     source, codec = pillow.fromarray(to_8bit(image).astype(np.uint8)), CODECS[title]
 
@@ -217,8 +212,8 @@ def _coded_as_small(packed: Callable[[], Row], image: Image, title: str) -> Row:
     started = time.perf_counter()
     content = encoded(low)
     seconds = time.perf_counter() - started
-    shown = _pixels(io.BytesIO(content))
-    return {"seconds": seconds, "bytes": len(content), "quality": low, **judge(shown, image)}
+    picture = _pixels(io.BytesIO(content))
+    return {"seconds": seconds, "bytes": len(content), "quality": low, **judge(picture, image)}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -227,13 +222,13 @@ def _coded_as_small(packed: Callable[[], Row], image: Image, title: str) -> Row:
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out what each peer reaches, a table a set, what it does better, and those on a GPU."""
+    """Lay out what each peer reaches, a table per set, what it does better, and those on a GPU."""
     points, tables = fr.frame_of(rows), []
     for name, part in points.groupby("set", sort=False):
         tables.append(_table(str(name), part))
     better = fr.table("What a peer does better", ("peer", "better"), BETTER.items(), "better")
-    known = pd.read_csv(str(files("eigengs_bench") / "published_peers.csv"), dtype=str)
-    gpu = fr.Table("Packages that need a CUDA GPU, by what they publish", known, "published")
+    published = pd.read_csv(str(files("eigengs_bench") / "published_peers.csv"), dtype=str)
+    gpu = fr.Table("Packages that need a CUDA GPU, by what they publish", published, "published")
     return fr.Section([*tables, better._replace(rows=()), gpu._replace(rows=())])
 
 

@@ -1,7 +1,7 @@
 """The paper's curves, histograms and rows of pictures, with our fits, and tiles side by side.
 
 All pictures but the tiles have the size of the model, 256x256 pixels, and its number of Gaussians.
-The row of a curve has "psnr_ycbcr" every `EVERY` steps; that of a set of pictures says its file.
+The row of a curve has "psnr_ycbcr" every `EVERY` steps; that of a set of pictures names its file.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +27,7 @@ from eigengs_dr.image.resize import center_crop
 from eigengs_dr.raster.render import picture_of
 from eigengs_dr.viewer.pictures import overlay
 
-COMPONENTS = 300  # a channel of the models that are trained, as in the paper's comparisons
+COMPONENTS = 300  # per channel of the models that are trained, as in the paper's comparisons
 PHOTO = "coffee"  # photo of scikit-image that the basis "natural" was not trained on
 # What stands above the pictures of a method.
 HEADINGS = {
@@ -40,15 +40,17 @@ NEEDS = {"radii": [CATS], "split": [CATS], "cross": [CATS, NATURAL]}
 CREDIT = "Images: AFHQ, NAVER Corp., CC BY-NC 4.0"  # of all pictures of cats
 EVERY = 50  # iterations between two points of a curve
 MAGNIFIED, STRETCHED = 8, 20  # factors of errors before they are added to mid-grey
-BORDER = 0.08  # around the middle of a picture, in its sides: Gaussians there reach into it
+BORDER = (
+    0.08  # around the middle of a picture, relative to its sides: Gaussians there reach into it
+)
 CELL, LETTERS = 1.8, 0.42  # sides of a picture, and height of the lines around it, in inches
 
-Cell = tuple[str, NDArray[Any]]  # the line below a picture, and the picture: RGB, not clamped
+Cell = tuple[str, NDArray[Any]]  # the caption of a picture, and the picture: RGB, not clamped
 
 
-def run(task: Task, wanted: Sequence[str]) -> list[Row]:
-    """Draw pictures into the folder; by default those whose sets of images are there."""
-    chosen = wanted or [p for p in PICTURES if all(is_present(task, s) for s in NEEDS.get(p, []))]
+def run(task: Task, pictures: Sequence[str]) -> list[Row]:
+    """Draw pictures into the folder, by default those whose sets of images exist."""
+    chosen = pictures or [p for p in PICTURES if all(is_present(task, s) for s in NEEDS.get(p, []))]
     functions = (_iterations, _colors, _curves, _tiles, _radii, _split, _cross)
     makers = dict(zip(PICTURES, functions, strict=True))
     return [row for name in chosen for row in makers[name](task)]
@@ -69,7 +71,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 def preset_descent(
     task: Task, image: Image, model: EigenGS, preset: str, marks: Sequence[int], **options: Any
 ) -> Iterator[Moment]:
-    """Fit by a method with the number of Gaussians of a model; "eigengs" starts from it."""
+    """Fit by a method with as many Gaussians as a model has; "eigengs" starts from the model."""
     method, count = METHODS[preset], len(model.gaussians)
     start = model if method.needs_model else None
     shared = {"gaussians": count, "backend": task.backend, "method": method, "start": start}
@@ -77,7 +79,7 @@ def preset_descent(
 
 
 def to_size(image: Image, model: EigenGS) -> Image:
-    """Bring the largest centred part of an image to the size of a model."""
+    """Resize the largest centred part of an image to the size of a model."""
     return center_crop(image, model.gaussians.width, model.gaussians.height)
 
 
@@ -109,7 +111,7 @@ def _curve_jobs(task: Task, name: str) -> Iterator[Job]:
 
 
 def _curves_chart(rows: Sequence[Row]) -> Figure:
-    """Draw lines in the colours of the methods, one panel a set: means over its images."""
+    """Draw lines in the colours of the methods, one panel per set: means over its images."""
     names = list(dict.fromkeys(row["job"]["set"] for row in rows))
     columns = min(3, len(names))
     lines = -(-len(names) // columns)
@@ -133,11 +135,11 @@ def _radii(task: Task) -> list[Row]:
     """Measure how large Gaussians are, with and without the split by frequency."""
 
     def work(split: bool) -> Row:
-        model, found = model_for(task, CATS, CATS, COMPONENTS, split=split), []
+        model, radii = model_for(task, CATS, CATS, COMPONENTS, split=split), []
         for _, image in images_of(task, CATS):
             *_, last = preset_descent(task, image, model, "eigengs", [task.iterations])
-            found.append(radii_of(last.gaussians).round(3))
-        return {"radii": np.stack(found), "low": model.low}
+            radii.append(radii_of(last.gaussians).round(3))
+        return {"radii": np.stack(radii), "low": model.low}
 
     jobs: list[Job] = [
         (
@@ -150,7 +152,7 @@ def _radii(task: Task) -> list[Row]:
 
 
 def radii_of(gaussians: Gaussians) -> NDArray[np.float64]:
-    """Geometric mean of the standard deviations of every Gaussian, in pixels, shape (N,)."""
+    """Return the geometric mean of the standard deviations of every Gaussian, in pixels, (N,)."""
     factor = gaussians.to_arrays()["factor"].astype(np.float64)
     return 1 / np.sqrt(factor[:, 0] * factor[:, 2])  # det F = a c
 
@@ -180,10 +182,10 @@ def _radii_chart(rows: Sequence[Row]) -> Figure:
 # ---------------------------------------------------------------------------------------------
 
 
-def _drawn(
+def _draw_rows(
     task: Task, file: str, caption: str, make: Callable[[], list[tuple[str, Sequence[Cell]]]]
 ) -> list[Row]:
-    """Draw rows of pictures into a file, once; cats have a line of credit."""
+    """Draw rows of pictures into a file, once; pictures of cats carry a line of credit."""
 
     def work() -> Row:
         rows = make()
@@ -213,7 +215,7 @@ def _iterations(task: Task) -> list[Row]:
         return rows
 
     caption = f"Iterations of every method: {words}, {_size(model)}; PSNR in YCbCr"
-    return _drawn(task, file, caption, make)
+    return _draw_rows(task, file, caption, make)
 
 
 def _colors(task: Task) -> list[Row]:
@@ -235,7 +237,7 @@ def _colors(task: Task) -> list[Row]:
         return rows
 
     caption = f"A photo fitted in YCbCr and in RGB by the method default: {_size(model)}"
-    return _drawn(task, "colors.jpg", caption, make)
+    return _draw_rows(task, "colors.jpg", caption, make)
 
 
 def _tiles(task: Task) -> list[Row]:
@@ -245,15 +247,15 @@ def _tiles(task: Task) -> list[Row]:
         case = CASES["smooth"]._replace(iterations=task.iterations)
         image = case.image()
         middle = (slice(len(image) // 3, 2 * len(image) // 3),) * 2
-        shown, errors = [], []
+        cells, errors = [], []
         for preset in HEADINGS:
             picture = fit_case(case, image, preset, task.backend).image
-            shown.append((f"{preset}: {psnr(picture, image, 'ycbcr'):.1f} dB", picture[middle]))
+            cells.append((f"{preset}: {psnr(picture, image, 'ycbcr'):.1f} dB", picture[middle]))
             errors.append(("", (0.5 + STRETCHED * (picture - image))[middle]))
-        return [("", shown), (f"their errors times {STRETCHED}", errors)]
+        return [("", cells), (f"their errors times {STRETCHED}", errors)]
 
     caption = f"The middle of a slow gradient after {task.iterations:,} steps; PSNR in YCbCr"
-    return _drawn(task, "tiles.png", caption, make)
+    return _draw_rows(task, "tiles.png", caption, make)
 
 
 def _split(task: Task) -> list[Row]:
@@ -278,7 +280,7 @@ def _split(task: Task) -> list[Row]:
         return [("", top), ("", bottom)]
 
     caption = "A cat encoded by a model with the frequency-aware split, and outlines of Gaussians"
-    return _drawn(task, "cats-split.png", caption, make)
+    return _draw_rows(task, "cats-split.png", caption, make)
 
 
 def _cross(task: Task) -> list[Row]:
@@ -294,13 +296,13 @@ def _cross(task: Task) -> list[Row]:
         for _, image in images_of(task, CATS, 3):
             cells: list[Cell] = [("photo", image)]
             for words, model in bases.items():
-                shown = picture_of(model.encode(image, "projected"))
-                cells.append((f"{words}: {psnr(shown, image, 'ycbcr'):.1f} dB", shown))
+                projected = picture_of(model.encode(image, "projected"))
+                cells.append((f"{words}: {psnr(projected, image, 'ycbcr'):.1f} dB", projected))
             rows.append(("", cells))
         return rows
 
     caption = "Cats at iteration 0: projected on bases of cats, of ImageNet, and the one that ships"
-    return _drawn(task, "cats-cross.png", caption, make)
+    return _draw_rows(task, "cats-cross.png", caption, make)
 
 
 def _cell_of(moment: Moment, image: Image) -> Cell:
@@ -314,7 +316,7 @@ def _size(model: EigenGS) -> str:
 
 
 def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Outlines over the middle quarter of a picture, which has room for all of them."""
+    """Draw outlines over the middle quarter of a picture, enlarged to make room for them."""
     height, width = picture.shape[:2]
     away = np.abs(gaussians.to_arrays()["mean"] / (width, height) - 0.5)
     near = gaussians[(away < 0.25 + BORDER).all(axis=1)]
@@ -323,9 +325,9 @@ def _outlines(gaussians: Gaussians, picture: NDArray[np.float32]) -> NDArray[np.
 
 
 def strip(rows: Sequence[tuple[str, Sequence[Cell]]], credit: str = "") -> Figure:
-    """Put rows of pictures below each other, each below its heading."""
-    most = max(len(cells) for _, cells in rows)
-    figure = fr.new_figure(CELL * most, (CELL + LETTERS) * len(rows))
+    """Stack rows of pictures, each below its heading."""
+    columns = max(len(cells) for _, cells in rows)
+    figure = fr.new_figure(CELL * columns, (CELL + LETTERS) * len(rows))
     figure.supxlabel(credit, fontsize=7)
     parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, (heading, cells) in zip(parts, rows, strict=True):

@@ -1,9 +1,9 @@
-"""What textures take that look alike: bitmaps and Gaussians on a poster that a camera sees aslant.
+"""Memory of textures that look alike: bitmaps and Gaussians on a poster seen at a slant.
 
-A poster of `TEXELS` x `TEXELS` texels fills the width of a film of half as many pixels. Of smaller
-bitmaps, and of Gaussians, the smallest is found whose picture differs from that of the poster by
-40 dB, of a text by 30: in 8 bits of sRGB, or of values for maps of one channel. Pixels beside the
-poster do not count. The light is even, so that pictures have no noise.
+A poster of `TEXELS` x `TEXELS` texels fills the width of a film of half as many pixels. The
+smallest bitmap and the smallest set of Gaussians are searched whose pictures reach 40 dB against
+that of the poster, or 30 dB for a text: in 8 bits of sRGB, or of values for maps of one channel.
+Pixels beside the poster do not count. The light is even, so that pictures have no noise.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ SLOT = "poster.bsdf.reflectance"
 
 
 class Poster(NamedTuple):
-    """What is on the poster, `TEXELS` x `TEXELS`; the space of its Gaussians; the PSNR in dB."""
+    """The image of a poster, `TEXELS` x `TEXELS`; the space of its Gaussians; the PSNR in dB."""
 
     kind: str
     image: Image
@@ -43,7 +43,7 @@ class Poster(NamedTuple):
 
 
 def posters(data: Path | None) -> Iterator[tuple[str, Callable[[], Poster]]]:
-    """Yield the names of the posters, and what loads them: photos, materials, and a text."""
+    """Yield the names of the posters and functions that load them: photos, materials, a text."""
     for name in PHOTOS:
         yield name, partial(_poster, "photo", partial(eg.sample, name), "linear")
     for name in MAPS:
@@ -55,7 +55,7 @@ def posters(data: Path | None) -> Iterator[tuple[str, Callable[[], Poster]]]:
 
 
 def _poster(kind: str, load: Callable[[], Image], space: str) -> Poster:
-    """Load an image for a poster, of maps the first channel."""
+    """Load an image for a poster; of maps, the first channel."""
     image = center_crop(load(), TEXELS, TEXELS).clip(0, 1)
     return Poster(kind, image[..., :1] if space == "data" else image, space, GOAL)
 
@@ -74,7 +74,7 @@ def letters(side: int) -> Image:
 
 
 def jobs(variant: str, data: Path | None) -> Iterator[Job]:
-    """Yield what measures each poster."""
+    """Yield the measurement of each poster."""
     for name, load in posters(data):
         yield {"variant": variant, "poster": name}, partial(compare, variant, load)
 
@@ -101,30 +101,30 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
     inside = 1.0 * (picture(mi, {"type": "rgb", "value": SKY / 2})[..., 0] < 0.75 * SKY)
 
     def psnr(texture: dict[str, Any]) -> float:
-        shown = picture(mi, texture)
+        rendering = picture(mi, texture)
         if poster.space == "data":
-            return eg.psnr(shown, goal, "data", weight=inside)
-        return eg.psnr(to_coded(shown), to_coded(goal), "rgb", weight=inside)
+            return eg.psnr(rendering, goal, "data", weight=inside)
+        return eg.psnr(to_coded(rendering), to_coded(goal), "rgb", weight=inside)
 
     side = _smallest_side(lambda n: psnr(bitmap(mi, resample(poster.image, n, n))) >= poster.goal)
     small = bitmap(mi, resample(poster.image, side, side))
-    found: Row = {"kind": poster.kind, "side": side, "psnr_bitmap": psnr(small)}
+    row: Row = {"kind": poster.kind, "side": side, "psnr_bitmap": psnr(small)}
     small = bitmap(mi, resample(poster.image, side, side))
-    found["bitmap_bytes"] = resident_bytes(mi.load_dict(small))
-    scene, wanted = scene_of(mi, bitmap(mi, poster.image)), poster.goal
+    row["bitmap_bytes"] = resident_bytes(mi.load_dict(small))
+    scene, target_psnr = scene_of(mi, bitmap(mi, poster.image)), poster.goal
     with TemporaryDirectory() as folder:
         file = {"type": "gaussian_texture", "filename": f"{folder}/poster.npz"}
         for _ in range(TRIES):
-            fit = eg.fit_for_scene(scene, SLOT, poster.image, wanted, poster.space)
+            fit = eg.fit_for_scene(scene, SLOT, poster.image, target_psnr, poster.space)
             fit.gaussians.save(file["filename"])
-            found |= {"gaussians": len(fit.gaussians), "psnr": psnr(file)}
-            if found["psnr"] >= poster.goal:
+            row |= {"gaussians": len(fit.gaussians), "psnr": psnr(file)}
+            if row["psnr"] >= poster.goal:
                 break
-            wanted += poster.goal - found["psnr"] + 0.05
-        found["bytes"] = resident_bytes(mi.load_dict(file))
-        found["filtered_bytes"] = resident_bytes(mi.load_dict(file | {"prefilter": 1e-3}))
-    found["ratio"] = found["bytes"] / found["bitmap_bytes"]
-    return found | {"ratio_floats": found["ratio"] / 4}
+            target_psnr += poster.goal - row["psnr"] + 0.05
+        row["bytes"] = resident_bytes(mi.load_dict(file))
+        row["filtered_bytes"] = resident_bytes(mi.load_dict(file | {"prefilter": 1e-3}))
+    row["ratio"] = row["bytes"] / row["bitmap_bytes"]
+    return row | {"ratio_floats": row["ratio"] / 4}
 
 
 def _smallest_side(suffices: Callable[[int], bool]) -> int:
@@ -137,7 +137,7 @@ def _smallest_side(suffices: Callable[[int], bool]) -> int:
 
 
 def bitmap(mi: Any, image: Image) -> dict[str, Any]:
-    """Return an image as a bitmap of 8 bits: sRGB, or values of one channel."""
+    """Return an image as an 8-bit bitmap: sRGB, or values of one channel."""
     codes = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
     return {"type": "bitmap", "bitmap": mi.Bitmap(codes), "raw": image.shape[2] == 1}
 

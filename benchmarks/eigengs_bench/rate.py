@@ -29,22 +29,22 @@ from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.image.io import to_8bit
 
 OURS = "packed Gaussians"
-PIXELS = (256, 128, 64, 32, 16, 8)  # pixels a Gaussian of the fits that are packed
+PIXELS = (256, 128, 64, 32, 16, 8)  # pixels per Gaussian of the fits that are packed
 # Decibels that packing may lose: of some numbers below it and some above,
 # these had the best PSNR at equal size on training photos, by little.
 BUDGET = 0.8
-WARM_UP = 6  # untimed steps before a fit, that compile its programs
+WARM_UP = 6  # untimed steps that compile the programs of a fit
 QUALITIES = (2, 5, 10, 15, 20, 30, 40, 50, 60, 70, 80, 85, 90, 95)
 RATIOS = (200, 120, 80, 60, 48, 40, 32, 26, 20, 16, 13, 10, 8, 6)
 # Decibels of PSNR in 8-bit RGB at which the sizes of files are compared.
 LEVELS = (28.95, 31.27, 32.0, 33.19, 36.0)
 # Slopes at which means are compared with published ones: the fall of the mean squared error, with
-# 255 as white, for a bit a pixel more.
+# 255 as white, for one more bit per pixel.
 SLOPES = np.geomspace(1000, 10, 13)
 
 
 class Codec(NamedTuple):
-    """Pillow's name and options of a codec, at a slow and good setting of the encoder; its line.
+    """A codec: Pillow's name and options for a slow, good setting of the encoder; its line.
 
     The settings are qualities, or ratios of the sizes of the pixels and the file.
     """
@@ -56,14 +56,14 @@ class Codec(NamedTuple):
     settings: tuple[int, ...] = QUALITIES
 
     def set_to(self, setting: int) -> dict[str, Any]:
-        """Return the options of a file with a setting."""
+        """Return the options for writing a file with a setting."""
         if self.kind == "JPEG2000":
             return {**self.options, "quality_mode": "rates", "quality_layers": [setting]}
         return {**self.options, "quality": setting}
 
 
 # 4:4:4 and the tuning for PSNR are 0.1 to 0.5 dB better than AVIF's defaults. Slower settings take
-# up to 20 s a photo, for 1 % more bits at equal PSNR.
+# up to 20 s per photo, for 1 % more bits at equal PSNR.
 AVIF = {"speed": 4, "max_threads": 1, "subsampling": "4:4:4", "advanced": {"tune": "psnr"}}
 CODECS = {
     "JPEG 4:2:0": Codec("JPEG", {"optimize": True, "subsampling": 2}, fr.ORANGE, "s--"),
@@ -77,7 +77,7 @@ import_module("pillow_jxl")  # Pillow knows JPEG XL from then on
 
 
 def run(task: Task, names: Sequence[str]) -> list[Row]:
-    """Measure on each image a packed fit of each size, and the codecs."""
+    """Measure a packed fit of each size, and the codecs, on each image."""
     jobs = [job for name in names for job in _jobs(task, name, images_of(task, name))]
     return task.measure("rate", jobs)
 
@@ -94,20 +94,25 @@ def _jobs(task: Task, name: str, images: list[tuple[str, Image]]) -> Iterator[Jo
             yield {**about, "codec": title}, partial(_coded, image, codec)
 
 
-def _packed(task: Task, image: Image, count: int) -> Row:
-    made = partial(eg.fit, image, count, backend=task.backend)
-    made(iterations=min(WARM_UP, task.iterations))
+def fit_and_pack(task: Task, image: Image, count: int, path: Path) -> tuple[int, float]:
+    """Write a packed fit; return its bytes and the seconds, after a short fit that compiles."""
+    fit = partial(eg.fit, image, count, backend=task.backend)
+    fit(iterations=min(WARM_UP, task.iterations))
     started = time.perf_counter()
-    fitted = made(iterations=task.iterations)
+    result = fit(iterations=task.iterations)
+    size = eg.pack(result.gaussians, path, image, BUDGET).bytes
+    return size, time.perf_counter() - started
+
+
+def _packed(task: Task, image: Image, count: int) -> Row:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "fit.egs"
-        receipt = eg.pack(fitted.gaussians, path, image, BUDGET)
-        seconds = {"seconds": time.perf_counter() - started}
+        size, seconds = fit_and_pack(task, image, count, path)
         eg.picture_of(eg.Gaussians.load(path, task.backend))  # compiles
-        loaded = time.perf_counter()
-        shown = eg.picture_of(eg.Gaussians.load(path, task.backend))
-        seconds["decode_seconds"] = time.perf_counter() - loaded
-    return {"points": [_point(count, receipt.bytes, shown, image) | seconds]}
+        started = time.perf_counter()
+        picture = eg.picture_of(eg.Gaussians.load(path, task.backend))
+        times = {"seconds": seconds, "decode_seconds": time.perf_counter() - started}
+    return {"points": [_point(count, size, picture, image) | times]}
 
 
 def _coded(image: Image, codec: Codec) -> Row:
@@ -119,14 +124,14 @@ def _coded(image: Image, codec: Codec) -> Row:
         coded = time.perf_counter()
         pixels = np.asarray(pillow.open(file).convert("RGB"))
         seconds = {"seconds": coded - started, "decode_seconds": time.perf_counter() - coded}
-        shown = pixels.astype(np.float32) / 255
-        points.append(_point(setting, len(file.getvalue()), shown, image) | seconds)
+        picture = pixels.astype(np.float32) / 255
+        points.append(_point(setting, len(file.getvalue()), picture, image) | seconds)
     return {"points": points}
 
 
-def _point(setting: int, size: int, shown: NDArray[Any], image: Image) -> Row:
+def _point(setting: int, size: int, picture: NDArray[Any], image: Image) -> Row:
     bits = 8 * size / (image.shape[0] * image.shape[1])
-    return {"setting": setting, "bytes": size, "bits_per_pixel": bits, **judge(shown, image)}
+    return {"setting": setting, "bytes": size, "bits_per_pixel": bits, **judge(picture, image)}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -135,7 +140,7 @@ def _point(setting: int, size: int, shown: NDArray[Any], image: Image) -> Row:
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out the bits a pixel that each codec takes for a PSNR: a table and a chart a set."""
+    """Lay out the bits per pixel that each codec takes for a PSNR: a table and a chart per set."""
     tables, charts, figures = [], {}, {}
     for name, part in fr.frame_of(rows, "points").groupby("set", sort=False):
         tables.append(_table(str(name), part))
@@ -146,27 +151,27 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 
 
 def rates(points: pd.DataFrame, level: float) -> pd.DataFrame:
-    """Interpolate bits a pixel at a PSNR: a line an image that all codecs reach it on."""
-    found = {
+    """Interpolate bits per pixel at a PSNR: a line for each image on which all codecs reach it."""
+    bits = {
         key: fr.smallest(dict(zip(part.bits_per_pixel, part.psnr_rgb, strict=True)), level)
         for key, part in points.groupby(["image", "codec"], sort=False)
     }
-    return pd.Series(found).unstack().dropna()
+    return pd.Series(bits).unstack().dropna()
 
 
 def _table(name: str, points: pd.DataFrame) -> fr.Table:
-    found = [rates(points, level) for level in LEVELS]
+    by_level = [rates(points, level) for level in LEVELS]
     lines = [
         (
             codec,
-            *(fr.mean(sizes[codec], 2) for sizes in found),
+            *(fr.mean(sizes[codec], 2) for sizes in by_level),
             _saved(points, codec),
             fr.median(part.seconds),
             fr.median(part.decode_seconds, 3),
         )
         for codec, part in points.groupby("codec", sort=False)
     ]
-    reached = (str(len(sizes)) for sizes in found)
+    reached = (str(len(sizes)) for sizes in by_level)
     lines.append(("images that all reach", *reached, *[fr.MISSING] * 3))
     caption = (
         f"{name}, {fr.counted(points.image)}: bits a pixel for a PSNR in 8-bit RGB, interpolated; "
@@ -177,7 +182,7 @@ def _table(name: str, points: pd.DataFrame) -> fr.Table:
 
 
 def bd_rate(ours: pd.DataFrame, other: pd.DataFrame) -> float:
-    """Return the mean change of the bits at equal PSNR, from -1 on; NaN if no PSNR is of both.
+    """Return the mean change of the bits at equal PSNR, above -1; NaN if the PSNRs do not overlap.
 
     The logarithm of the bits is interpolated over the PSNR by monotone cubics (Bjontegaard,
     VCEG-M33; the cubics are those of later reference software).
@@ -216,10 +221,10 @@ def _share(points: pd.DataFrame, codec: str) -> str:
 
 
 def at_equal_slope(points: pd.DataFrame) -> pd.DataFrame:
-    """Return means over the images: at each slope, every image at the point that suits it best.
+    """Return means over the images: at each slope, the best point of every image.
 
-    The published means have equal settings of an encoder, which are about equal slopes. Means at
-    equal numbers of Gaussians would give easy and hard images alike, and flatter by about 0.5 dB.
+    The published means are over equal settings of an encoder, or about equal slopes. Means at equal
+    numbers of Gaussians would treat easy and hard images alike, and flatter by about 0.5 dB.
     """
     error = 255**2 * 10 ** (-points.psnr_rgb / 10)
     chosen = []
@@ -232,7 +237,7 @@ def at_equal_slope(points: pd.DataFrame) -> pd.DataFrame:
 
 def _published(points: pd.DataFrame) -> fr.Table:
     """Lay out the BD-rate of the means of ours and of the codecs against published means."""
-    known = pd.read_csv(str(files("eigengs_bench") / "published_rate.csv"))
+    published = pd.read_csv(str(files("eigengs_bench") / "published_rate.csv"))
     here = {"source": "measured here, at equal slope"}
     measured = {
         name: at_equal_slope(part).assign(**here)
@@ -240,7 +245,7 @@ def _published(points: pd.DataFrame) -> fr.Table:
     }
     lines = [
         (name, f"{100 * bd_rate(measured[OURS], part):+.0f} %", part.source.iloc[0])
-        for name, part in [*known.groupby("method", sort=False), *measured.items()]
+        for name, part in [*published.groupby("method", sort=False), *measured.items()]
         if name != OURS
     ]
     caption = (
@@ -252,11 +257,11 @@ def _published(points: pd.DataFrame) -> fr.Table:
 
 
 def _chart(points: pd.DataFrame, name: str) -> Figure:
-    """Draw PSNR in RGB and MS-SSIM over bits a pixel: means over the images, a point a setting."""
+    """Draw PSNR in RGB and MS-SSIM over bits per pixel: means over images, a point per setting."""
     images = fr.counted(points.image)
     figure = fr.new_figure(8, 4.2, f"Rate against distortion: {name}, {images}")
     points = points.sort_values("setting", kind="stable")
-    # Fits have other numbers of Gaussians on images of other sizes: the n-th are one point.
+    # Numbers of Gaussians differ between image sizes: the n-th of each size form one point.
     rank = points.groupby(["codec", "image"]).cumcount().rename("rank")
     means = points.groupby(["codec", rank])[["bits_per_pixel", "psnr_rgb", "ms_ssim"]].mean()
     styles = {OURS: (fr.BLUE, "o-")} | {k: (c.color, c.style) for k, c in CODECS.items()}

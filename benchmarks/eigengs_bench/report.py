@@ -1,4 +1,4 @@
-"""Rows as data frames, tables and charts, and one report in Markdown of all rows of a folder."""
+"""Rows as data frames, tables and charts, and a Markdown report of all rows of a folder."""
 
 import math
 import re
@@ -18,9 +18,9 @@ from eigengs_bench.rows import FILE, Row, code_name, read
 from eigengs_dr.storage.atomic import atomic_write
 
 TAG = re.compile(rb"<[^>]+>")  # of an SVG file
-MISSING = "-"  # cell of a figure that is not there
+MISSING = "-"  # cell of a missing figure
 
-# Colours that readers tell apart who confuse red and green (Okabe and Ito, 2008).
+# Colours that readers who confuse red and green can tell apart (Okabe and Ito, 2008).
 BLUE, RED, GREEN, ORANGE = "#0072b2", "#d55e00", "#009e73", "#e69f00"
 SKY, PINK, GREY, INK = "#56b4e9", "#cc79a7", "#888888", "#222222"
 COLORS = {"default": BLUE, "gaussianimage": RED, "eigengs": GREEN}
@@ -43,9 +43,9 @@ QUESTIONS = {
 
 
 class Table(NamedTuple):
-    """Texts under headings; the caption says what they are, and what they were measured on.
+    """Cells under headings; the caption says what they are, and what they were measured on.
 
-    Pages of the manual know a table by its name. It is of `rows`, or of all of its section.
+    Pages of the manual refer to a table by name. It shows `rows`, or all rows of its section.
     """
 
     caption: str
@@ -55,7 +55,7 @@ class Table(NamedTuple):
 
 
 class Section(NamedTuple):
-    """Tables of rows, charts by the stem of a file, and figures of sentences by a name."""
+    """Tables of rows, charts by the stem of their file, and figures in sentences by their name."""
 
     tables: Sequence[Table] = ()
     charts: Mapping[str, Figure] = {}
@@ -63,7 +63,7 @@ class Section(NamedTuple):
 
 
 def write_report(folder: Path, output: Path) -> None:
-    """Write README.md and its charts: all questions that rows of a folder answer.
+    """Write a README.md with charts for all questions that the rows of a folder answer.
 
     `ValueError` if the folder holds no rows, or damaged ones.
     """
@@ -84,7 +84,7 @@ def write_report(folder: Path, output: Path) -> None:
 
 
 def sources_of(rows: Sequence[Row]) -> list[str]:
-    """Say how rows were made: each command with its days and commit, and the machine."""
+    """Describe how rows were measured: each command with its days and commit, and the machine."""
     lines = []
     for run in (row["run"] for row in rows):
         lines.append(f"`{run['command']}`, {run['date'][:10]}, {code_name(run)}")
@@ -101,10 +101,10 @@ def sources_of(rows: Sequence[Row]) -> list[str]:
 
 
 def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
-    """Lay rows out: a line a row, or a line an entry of the list `key` of the rows that have it.
+    """Lay out rows: a line per row, or per entry of the list `key` of the rows that have it.
 
-    Columns are the fields of the jobs, and the figures. Figures of fits that have failed, null in
-    the file, are NaN.
+    Columns are the fields of the jobs, and the figures. Figures of failed fits, null in the file,
+    are NaN.
     """
     lines = []
     for row in rows:
@@ -117,12 +117,12 @@ def frame_of(rows: Iterable[Row], key: str = "") -> pd.DataFrame:
 def table(
     caption: str, columns: Iterable[str], lines: Iterable[Sequence[Any]], name: str = ""
 ) -> Table:
-    """Make a table of lines of texts."""
+    """Make a table from lines of text."""
     return Table(caption, pd.DataFrame(list(lines), columns=list(columns)), name)
 
 
 def grouped(caption: str, frame: pd.DataFrame, by: list[str], columns: Mapping[str, Any]) -> Table:
-    """Make a table with a line a group: a cell is (column, function that writes its values)."""
+    """Make a table with a line per group; a cell is (column, function that formats its values)."""
     if frame.empty:
         return Table(caption, frame)
     cells = frame.groupby(by, sort=False).agg(**columns).reset_index()
@@ -130,7 +130,7 @@ def grouped(caption: str, frame: pd.DataFrame, by: list[str], columns: Mapping[s
 
 
 def as_text(table: Table, style: str = "simple") -> str:
-    """Lay a table out for a terminal, or for Markdown with the style "pipe"."""
+    """Lay out a table for a terminal, or for Markdown with the style "pipe"."""
     if table.frame.empty:
         return f"{table.caption}: none"
     others = table.frame.columns[1:]
@@ -140,7 +140,7 @@ def as_text(table: Table, style: str = "simple") -> str:
 
 
 def is_numeric(cells: pd.Series) -> bool:
-    """Tell whether the cells of a column begin like numbers, or are empty."""
+    """Return whether the cells of a column begin like numbers, or are empty."""
     return bool(cells.astype(str).str.fullmatch(r"[-+\d].*|").all())
 
 
@@ -150,7 +150,7 @@ def number(value: float | None, decimals: int = 1) -> str:
 
 
 def mean(values: pd.Series, decimals: int = 1) -> str:
-    """Write the mean of figures. NaN is of fits that have failed: "46.3 (2 failed)"."""
+    """Write the mean of figures. NaN stands for failed fits: "46.3 (2 failed)"."""
     failed = int(values.isna().sum())
     return number(values.mean(), decimals) + (f" ({failed} failed)" if failed else "")
 
@@ -167,15 +167,15 @@ def extent(values: pd.Series, decimals: int = 2) -> str:
 
 
 def counted(images: pd.Series) -> str:
-    """Write how many different images there are: "1 image", "3 images"."""
+    """Write the number of different images: "1 image", "3 images"."""
     return f"{images.nunique()} image" + "s" * (images.nunique() != 1)
 
 
 def smallest(curve: Mapping[Any, float], target: float) -> float:
-    """Interpolate the size at a PSNR, which is taken as linear in the logarithm of the size.
+    """Interpolate the size at a PSNR, which is assumed linear in the logarithm of the size.
 
-    Between the first two neighbours, by their sizes (Gaussians, or bits), that have the PSNR
-    between them; NaN where there are none.
+    It lies between the first two neighbours, by size (Gaussians, or bits), with the PSNR between
+    them; NaN if there are none.
     """
     for (few, low), (many, high) in pairwise(sorted(curve.items())):
         if low <= target <= high:
@@ -190,13 +190,13 @@ def smallest(curve: Mapping[Any, float], target: float) -> float:
 
 
 def new_figure(width: float, height: float, title: str = "") -> Figure:
-    """Make an empty figure, sides in inches, that arranges its parts itself."""
+    """Make an empty figure, sides in inches, that arranges its own parts."""
     figure = Figure(figsize=(width, height), layout="constrained")  # not pyplot: no screen
     figure.suptitle(title)
     return figure
 
 
-# Names in an SVG file are else drawn at random. Verdana is as wide as DejaVu Sans.
+# Without a salt, ids in an SVG file are random. Verdana is as wide as DejaVu Sans.
 STYLE: Any = {
     "svg.hashsalt": "eigengs_dr",
     "svg.fonttype": "none",
@@ -204,8 +204,8 @@ STYLE: Any = {
 }
 
 
-def drawn(figure: Figure, kind: str = "svg") -> bytes:
-    """Return the file of a chart, "svg", "png" or "pdf"; letters of an SVG file stay text."""
+def chart_file(figure: Figure, kind: str = "svg") -> bytes:
+    """Return the file of a chart, "svg", "png" or "pdf"; text in an SVG file stays text."""
     undated: Any = {"Date": None} if kind == "svg" else None
     with rc_context(STYLE), BytesIO() as file:
         figure.savefig(file, format=kind, dpi=90, metadata=undated)
@@ -214,14 +214,14 @@ def drawn(figure: Figure, kind: str = "svg") -> bytes:
 
 
 def _short(tag: re.Match[bytes]) -> bytes:
-    """Round the numbers of a tag to hundredths, put it on one line, and turn nothing by nothing."""
+    """Round the numbers of a tag to hundredths, join its lines, and drop rotations by 0."""
     short = re.sub(rb"(\d\.\d\d)\d+", rb"\1", tag[0])
     return b" ".join(re.sub(rb' transform="rotate\(-0 [^"]*"', b"", short).split())
 
 
 def save_figure(path: Path, figure: Figure) -> None:
     """Write a chart as .svg, .png or .pdf, whole or not at all."""
-    content = drawn(figure, path.suffix[1:])
+    content = chart_file(figure, path.suffix[1:])
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
 
@@ -229,7 +229,7 @@ def save_figure(path: Path, figure: Figure) -> None:
 def label_axes(
     axis: Axes, x: str, y: str, logarithmic: str = "x", legend: bool = True, **rest: Any
 ) -> None:
-    """Name the axes, give some of them logarithmic scales with plain numbers, add a legend."""
+    """Label the axes, give some of them logarithmic scales with plain numbers, add a legend."""
     for side in logarithmic:
         getattr(axis, f"set_{side}scale")("log", subs=(2, 5))
         getattr(axis, f"{side}axis").set_major_formatter("{x:,g}")
@@ -241,11 +241,11 @@ def label_axes(
 
 
 def legend_beside(figure: Figure, axis: Axes) -> None:
-    """Name the lines of an axis once, to the right of all axes of a figure."""
+    """Draw the legend of an axis once, to the right of all axes of a figure."""
     figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", fontsize=8)
 
 
 def legend_below(figure: Figure, axis: Axes, columns: int) -> None:
-    """Name the lines of an axis once, below all axes of a figure."""
+    """Draw the legend of an axis once, below all axes of a figure."""
     named = axis.get_legend_handles_labels()
     figure.legend(*named, loc="outside lower center", fontsize=8, ncols=columns)

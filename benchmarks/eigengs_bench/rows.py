@@ -1,9 +1,9 @@
-"""Measurements as lines of JSON, one by one: a run goes on after a break.
+"""Measurements as lines of JSON, written one by one: an interrupted run resumes.
 
 A row has "bench", the question; "job", the name of the measurement; its figures; and "run": date,
-command, machine, versions, and the "commit" of the code with "clean", whether no tracked file but
-those of docs/ differed from it. Seconds of other machines or versions differ: a folder holds rows
-of one machine.
+command, machine, versions, and the "commit" of the code with "clean", whether no tracked file
+outside docs/ differed from it. Seconds depend on machine and versions: a folder holds rows of one
+machine.
 """
 
 import json
@@ -32,7 +32,7 @@ STATUS = Path("/proc/self/status")  # of Linux
 
 
 class Task(NamedTuple):
-    """What questions share: `folder` of rows and models, `data` of image sets, `run` of rows."""
+    """What questions share: the `folder` of rows and models, the `data`, and the `run` of rows."""
 
     folder: Path
     run: Row
@@ -43,38 +43,38 @@ class Task(NamedTuple):
     progress: Callable[..., None] = lambda *_: None  # progress(label, done, total)
 
     def measure(self, bench: str, jobs: Iterable[Job], label: str = "") -> list[Row]:
-        """Do the jobs that the folder has no rows of, and add a row after each; return their rows.
+        """Do the jobs that the folder has no rows for, add a row after each, and return all rows.
 
-        `ValueError` if the file of rows is damaged, or of another machine or other versions.
+        `ValueError` if the file of rows is damaged, or comes from another machine or version.
         """
         path = self.folder / FILE
-        known = {_key(row["bench"], row["job"]): row for row in read(path)}
-        for row in known.values():
+        measured = {_key(row["bench"], row["job"]): row for row in read(path)}
+        for row in measured.values():
             if _machine(row["run"]) != _machine(self.run):
                 raise ValueError(
                     f"{path}: was measured on another machine or with other versions "
                     f"({row['run'].get('cpu')}); write to another folder, or delete the file"
                 )
-        wanted, rows = list(jobs), []
-        for done, (name, work) in enumerate(wanted):
-            self.progress(label or bench, done, len(wanted))
+        named, rows = list(jobs), []
+        for done, (name, work) in enumerate(named):
+            self.progress(label or bench, done, len(named))
             key = _key(bench, name)
-            if key not in known:
+            if key not in measured:
                 now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
                 row = {"bench": bench, "job": name, **work(), "run": {"date": now, **self.run}}
-                known[key] = plain(row)
-                _append(path, known[key])
-            rows.append(known[key])
-        self.progress(label or bench, len(wanted), len(wanted))
+                measured[key] = plain(row)
+                _append(path, measured[key])
+            rows.append(measured[key])
+        self.progress(label or bench, len(named), len(named))
         return rows
 
 
 def read(path: Path, bench: str = "") -> list[Row]:
-    """Read the rows of a file, of one question or all; `ValueError` names a damaged line.
+    """Read the rows of a file, for one question or all; `ValueError` names a damaged line.
 
     An incomplete last line does not count.
     """
-    found = []
+    rows = []
     lines = path.read_text("utf-8", "replace").split("\n")[:-1] if path.exists() else []
     for number, line in enumerate(lines, 1):
         try:
@@ -82,40 +82,40 @@ def read(path: Path, bench: str = "") -> list[Row]:
             if not isinstance(row["job"], dict) or not isinstance(row["run"], dict):
                 raise TypeError
             if bench in ("", row["bench"]):
-                found.append(row)
+                rows.append(row)
         except (ValueError, KeyError, TypeError):
             message = f"{path}: line {number} is not a measurement; delete that line"
             raise ValueError(message) from None
-    return found
+    return rows
 
 
 def record(path: Path, rows: Iterable[Row]) -> None:
-    """Add rows to a file for the manual, instead of those of the same names, with 5 digits.
+    """Add rows with 5 digits to a file for the manual; they replace rows of the same name.
 
-    A measurement that is made anew each time, "at" some second, has one row there.
+    A measurement that is repeated each time, "at" some second, has one row there.
     """
-    known = {_key(row["bench"], row["job"]): row for row in read(path)}
+    kept_rows = {_key(row["bench"], row["job"]): row for row in read(path)}
     for row in rows:
         job = {k: v for k, v in row["job"].items() if k != "at"}
         kept = {k: v for k, v in row["run"]["versions"].items() if v and not k.endswith("_path")}
         run = {k: row["run"][k] for k in RECORDED} | {"versions": kept}
         text = json.dumps(row | {"run": run})
         rounded = json.loads(text, parse_float=lambda number: float(f"{float(number):.5g}"))
-        known[_key(row["bench"], job)] = rounded | {"job": job}
-    lines = map(json.dumps, known.values())
+        kept_rows[_key(row["bench"], job)] = rounded | {"job": job}
+    lines = map(json.dumps, kept_rows.values())
     with atomic_write(path) as temporary:
         temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
 
 
 def code_state(folder: Path = Path(eigengs_dr.__file__).parent) -> Row:
-    """Find the commit of the code, and whether all but docs/ is clean; None each without git."""
+    """Find the commit of the code, and whether all but docs/ is clean; None without git."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(folder), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", "__init__.py")  # not a package below another tree
+        git("ls-files", "--error-unmatch", "__init__.py")  # not a package inside another tree
         everything = ("--", ":/", ":(top,exclude)docs")  # the rows of the manual are there
         clean = not git("status", "--porcelain", "--untracked-files=no", *everything)
         return {"commit": git("rev-parse", "HEAD"), "clean": clean}
@@ -124,14 +124,14 @@ def code_state(folder: Path = Path(eigengs_dr.__file__).parent) -> Row:
 
 
 def code_name(run: Row) -> str:
-    """Name the code of a run: "commit 0a1b2c3d4", and whether its tree was not clean."""
+    """Name the code of a run: "commit 0a1b2c3d4", and whether it had uncommitted changes."""
     if not run.get("commit"):
         return f"version {run.get('versions', {}).get('eigengs_dr', 'unknown')}, commit unknown"
     return f"commit {run['commit'][:9]}" + ("" if run["clean"] else " with uncommitted changes")
 
 
 def alone(title: str, work: Callable[..., Row], *arguments: Any) -> Callable[[], Row]:
-    """Return what measures in a new process, which has the peak of its memory for itself.
+    """Return a function that measures in a new process, so that its peak memory is its own.
 
     It raises `ValueError` with the title if memory runs out.
     """
@@ -142,7 +142,7 @@ def alone(title: str, work: Callable[..., Row], *arguments: Any) -> Callable[[],
                 return pool.submit(work, *arguments).result()
         except BrokenProcessPool:
             raise ValueError(
-                f"{title}: its process was ended, as it is where memory runs out; "
+                f"{title}: its process was killed, perhaps because memory ran out; "
                 "free some, or leave the case out"
             ) from None
 
@@ -150,7 +150,7 @@ def alone(title: str, work: Callable[..., Row], *arguments: Any) -> Callable[[],
 
 
 def peak_gib() -> float | None:
-    """Most memory of this process so far, in GiB; None on Windows."""
+    """Return the peak memory of this process so far, in GiB; None on Windows."""
     if sys.platform == "win32":
         return None
     if STATUS.exists():  # the figure of getrusage includes the process that started this one
@@ -163,7 +163,7 @@ def peak_gib() -> float | None:
 
 
 def _append(path: Path, row: Row) -> None:
-    """Add a line behind the last whole one."""
+    """Append a row after the last complete line."""
     path.touch()
     with path.open("rb+") as file:
         whole = file.read().rfind(b"\n") + 1

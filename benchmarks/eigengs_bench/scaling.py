@@ -1,4 +1,4 @@
-"""What size costs: seconds and memory of a fit over pixels and Gaussians, and of small fits.
+"""The cost of size: seconds and memory of a fit over pixels and Gaussians, and of small fits.
 
 The row of a descent has place_seconds and solve_seconds, step_ms (median of steps on their own,
 most of which build no lists) and mean_ms (of steps in a row, with lists), and peak_gib, the memory
@@ -35,13 +35,13 @@ if TYPE_CHECKING:  # the processes that are measured load neither pandas nor mat
 
     from eigengs_bench import report as fr
 
-# The mosaic: the middles of photos as squares of as many pixels a side, in turns and turned.
+# The mosaic: the middles of photos as squares of this side in pixels, alternating and rotated.
 PHOTOS, CELL = ("astronaut", "chelsea", "coffee", "motorcycle", "rocket"), 256
-DENSITY = 0.0763  # Gaussians a pixel where the number of pixels varies: 5,000 on 256x256
+DENSITY = 0.0763  # Gaussians per pixel where the number of pixels varies: 5,000 on 256x256
 WARM_UP = 8  # steps that compile programs and settle
-# Small images take more steps, up to as many times: about as many pixels in all.
+# Small images take up to so many times more steps, for about as many pixels in total.
 MORE_STEPS, PIXELS_IN_ALL = 4, 1 << 27
-# Steps of whole fits, least seconds of all of a size, and how many images a side of a mosaic has.
+# Steps of whole fits, fewest seconds for all of a size, and images along a side of the mosaic.
 FIT_STEPS, FIT_SECONDS, MANY = 100, 4.0, 8
 
 
@@ -77,10 +77,10 @@ def _jobs(task: Task, parts: Sequence[str], max_side: int) -> Iterator[Job]:
     for part in parts:
         for case in CASES[part]:
             if max(case.width, case.height) <= max_side:
-                most = min(
+                max_steps = min(
                     MORE_STEPS * task.iterations, PIXELS_IN_ALL // (case.width * case.height)
                 )
-                steps = FIT_STEPS if part == "small" else max(task.iterations, most)
+                steps = FIT_STEPS if part == "small" else max(task.iterations, max_steps)
                 work = measure_fits if part == "small" else measure_descent
                 title = f"{case.width}x{case.height}, {case.gaussians:,} Gaussians"
                 job = {"part": part, **case._asdict(), "iterations": steps}
@@ -110,7 +110,7 @@ def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
 
 
 def _place(image: Image, count: int, types: ArrayTypes) -> tuple[Pixels, eg.Gaussians, float]:
-    """Upload an image and place Gaussians; return the seconds of both too."""
+    """Upload an image and place Gaussians; also return the seconds of each."""
     data = data_of(image, "ycbcr")
     started = time.perf_counter()
     objective = Pixels.of(data, "ycbcr", types)
@@ -120,7 +120,7 @@ def _place(image: Image, count: int, types: ArrayTypes) -> tuple[Pixels, eg.Gaus
 
 
 def time_steps(objective: Pixels, start: eg.Gaussians, steps: int) -> tuple[float, float]:
-    """Return milliseconds of a step: the median of single ones, and the mean of `steps` in a row.
+    """Return milliseconds per step: the median of single steps, and the mean of `steps` in a row.
 
     Steps run asynchronously: a mean waits for its last step only, a median for each.
     """
@@ -143,7 +143,7 @@ def time_steps(objective: Pixels, start: eg.Gaussians, steps: int) -> tuple[floa
 
 
 def measure_fits(case: Case, steps: int, backend: str | None, enough: float = FIT_SECONDS) -> Row:
-    """Fit images of one size one by one, and by `fit_many`; each for `enough` seconds at least."""
+    """Fit images of one size one by one, and by `fit_many`, for at least `enough` seconds each."""
     photos = mosaic(MANY * case.width, MANY * case.height)
     images = [
         photos[top : top + case.height, left : left + case.width].copy()
@@ -159,7 +159,7 @@ def measure_fits(case: Case, steps: int, backend: str | None, enough: float = FI
 
 
 def _rate(call: Callable[[], Any], enough: float) -> float:
-    """Return calls a second, without the first one, which compiles."""
+    """Return calls per second, without the first one, which compiles."""
     call()
     done, started, seconds = 0, time.perf_counter(), 0.0
     while seconds < enough:
@@ -206,7 +206,7 @@ CAPTIONS = {
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out seconds and memory over pixels and Gaussians, and images a second."""
+    """Lay out seconds and memory over pixels and Gaussians, and images per second."""
     from eigengs_bench import report as fr
 
     frame = fr.frame_of(rows)
@@ -217,15 +217,15 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     tables, charts = [], {}
     for name, part in frame.groupby("part", sort=False):
         caption = CAPTIONS[str(name)]
-        shown = RATES if name == "small" else FIGURES
+        figures = RATES if name == "small" else FIGURES
         if name != "small":
             x = "pixels" if name == "pixels" else "gaussians"
             line = "equal density of Gaussians" if name == "pixels" else part["size"]
             part = part.assign(line=line)
             charts[f"scaling-{name}"] = _chart(part, x)
-        columns = {title: (column, fr.median) for title, column in shown.items()}
-        found = fr.grouped(caption, part, ["size", "Gaussians"], columns)
-        tables.append(found._replace(name=str(name)))
+        columns = {title: (column, fr.median) for title, column in figures.items()}
+        grouped = fr.grouped(caption, part, ["size", "Gaussians"], columns)
+        tables.append(grouped._replace(name=str(name)))
     return fr.Section(tables, charts)
 
 

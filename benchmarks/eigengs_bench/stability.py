@@ -1,4 +1,4 @@
-"""Hard cases times methods: which fits stay finite, and end no worse than they were.
+"""Every method on every hard case: which fits stay finite, and end no worse than they began.
 
 Every cell is a call of `eigengs_dr.fit`, as a user makes it.
 """
@@ -23,7 +23,7 @@ BASIS = "natural"  # where methods that need a basis start
 
 
 def run(task: Task, cases: Sequence[str], presets: Sequence[str]) -> list[Row]:
-    """Measure every cell of the matrix, case by case, by methods of some names."""
+    """Measure every cell of the matrix, case by case, by the named methods."""
     return task.measure("stability", _jobs(task, chosen_cases(cases, task.iterations), presets))
 
 
@@ -31,41 +31,41 @@ def _jobs(task: Task, cases: Iterable[Case], presets: Sequence[str]) -> Iterator
     for case, name in product(cases, presets):
         job = {"case": case.name, "preset": name, "iterations": case.iterations}
         for seed in case.seeds:
-            shown = {"seed": seed} if len(case.seeds) > 1 else {}
-            yield {**job, **shown}, partial(measure_cell, case, name, task.backend, seed)
+            seeded = {"seed": seed} if len(case.seeds) > 1 else {}
+            yield {**job, **seeded}, partial(measure_cell, case, name, task.backend, seed)
 
 
 def measure_cell(case: Case, name: str, backend: str | None, seed: int = 0) -> Row:
     """Fit a case by the method of a name and score it: one cell.
 
-    "needs", alone, says what a method lacks. Else "finite" is true if all PSNRs of the trace are
-    numbers, and all parameters and pixels of the result are finite; start and end are PSNRs of the
-    first and of the last row of the trace.
+    A row with "needs" alone says what a method lacks. Otherwise "finite" is true if all PSNRs of
+    the trace are numbers, and all parameters and pixels of the result are finite; start and end are
+    PSNRs of the first and of the last row of the trace.
     """
     image = case.image()
     if needs := _needs(case, image, name, backend):
         return {"needs": needs}
-    found = fit_case(case, image, name, backend, seed)
-    reached = [row["psnr_ycbcr"] for row in found.trace]
-    values = [found.image, *found.gaussians.to_arrays().values()]
+    result = fit_case(case, image, name, backend, seed)
+    reached = [row["psnr_ycbcr"] for row in result.trace]
+    values = [result.image, *result.gaussians.to_arrays().values()]
     return {
         "finite": not np.isnan(reached).any() and all(np.isfinite(v).all() for v in values),
-        "gaussians": len(found.gaussians),
-        "seconds": found.seconds,
+        "gaussians": len(result.gaussians),
+        "seconds": result.seconds,
         "start_ycbcr": min(reached[0], MAX_PSNR),
         "end_ycbcr": min(reached[-1], MAX_PSNR),
     }
 
 
 def _needs(case: Case, image: Image, name: str, backend: str | None) -> str:
-    """Return what a method lacks for a case, or ""."""
+    """Return what a method lacks for a case, or "" if nothing."""
     if not METHODS[name].needs_model:
         return ""
     if case.place is not None or case.space is not None:
         return "a basis of the case"
-    most = image.shape[0] * image.shape[1]
-    fits = len(eg.EigenGS.load(BASIS, backend).gaussians) <= most
-    return "" if fits else f"a basis with at most {most} Gaussians"
+    pixels = image.shape[0] * image.shape[1]
+    fits = len(eg.EigenGS.load(BASIS, backend).gaussians) <= pixels
+    return "" if fits else f"a basis with at most {pixels} Gaussians"
 
 
 def fit_case(
@@ -106,7 +106,7 @@ def _start(case: Case, image: Image, backend: str | None) -> eg.Gaussians:
 def summarize(rows: Sequence[Row]) -> fr.Section:
     """Lay out two matrices of cases and methods: PSNRs, and seconds.
 
-    Of several seeds, a cell has the mean, and the range of the ends.
+    With several seeds, a cell has the mean, and the range of the ends.
     """
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
     ends = f"PSNR in dB, YCbCr, at the end, from the start; {steps} steps"
@@ -130,7 +130,7 @@ def _heat_map(rows: Sequence[Row]) -> Figure:
     mesh = axis.pcolormesh(means, cmap="cividis", vmin=5, vmax=60, edgecolors="white")
     for (y, x), value in np.ndenumerate(means.to_numpy()):
         text = "needs a basis" if np.isnan(value) else _decibels(value)
-        dark = value < 30  # of the colours, on which white letters read
+        dark = value < 30  # of the colours, on which white letters are legible
         axis.text(x + 0.5, y + 0.5, text, ha="center", va="center", color="w" if dark else "k")
     axis.set_xticks(np.arange(means.shape[1]) + 0.5, means.columns)
     axis.set_yticks(np.arange(len(means)) + 0.5, means.index)
@@ -144,9 +144,9 @@ def _heat_map(rows: Sequence[Row]) -> Figure:
 def _matrix(
     caption: str, cell: Callable[[list[Row]], str], rows: Sequence[Row], name: str
 ) -> fr.Table:
-    """Put a figure of every case and method into a matrix; of equal rows the last is shown.
+    """Arrange the rows in a matrix of cases and methods; the last of equal rows is shown.
 
-    A cell is of all seeds.
+    A cell holds the rows of all seeds.
     """
     groups: dict[tuple[str, str], dict[int, Row]] = {}
     for row in rows:
@@ -162,7 +162,7 @@ def _matrix(
 
 
 def _ends(rows: list[Row]) -> str:
-    """Write the end and the start; of several seeds the mean, with the range of the ends."""
+    """Write the end and the start; for several seeds the mean, with the range of the ends."""
     if "needs" in rows[0]:
         return f"needs {rows[0]['needs']}"
     if not all(row["finite"] for row in rows):
@@ -175,8 +175,8 @@ def _ends(rows: list[Row]) -> str:
 
 
 def _seconds(rows: list[Row]) -> str:
-    known = [row["seconds"] for row in rows if "seconds" in row]
-    return fr.number(float(np.median(known)) if known else None)
+    seconds = [row["seconds"] for row in rows if "seconds" in row]
+    return fr.number(float(np.median(seconds)) if seconds else None)
 
 
 def _decibels(value: float) -> str:

@@ -19,9 +19,9 @@ from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import NATURAL, SETS, TABLES
 from eigengs_bench.rows import Job, Row, Task
 
-# Where the paper's tables look, and 0 and 10 beside.
+# Iterations of the paper's tables, and 0 and 10.
 ITERATIONS = (0, 10, 100, 500, 1000, 5000, 10000)
-COMPONENTS = (300, 500)  # components a channel in the paper's tables
+COMPONENTS = (300, 500)  # components per channel in the paper's tables
 LENT = {"faces256": "cats256", "cats256": "faces256"}  # the sets that lend each other their basis
 
 
@@ -40,28 +40,28 @@ class Method(NamedTuple):
 
 def methods(name: str, table: str, sources: Sequence[str]) -> list[Method]:
     """List the methods that a table compares on a set; `sources` are the sets with a basis."""
-    own = [name] if name in sources else []
+    trained = [name] if name in sources else []
     lent = [LENT[name]] if LENT.get(name) in sources else []
     universal = [NATURAL] if NATURAL in sources and name != NATURAL else []
     plain, count = [Method("gaussianimage")], COMPONENTS[0]
     if table == "ablation":
         pairs = [(color, split) for color in ("ycbcr", "rgb") for split in ("split", "whole")]
-        return [Method("eigengs", name, count, *pair) for _ in own for pair in pairs]
+        return [Method("eigengs", name, count, *pair) for _ in trained for pair in pairs]
     if table == "cross":
         others = [Method("eigengs", source, count) for source in lent + universal]
         return plain + others if others else []
-    bases = [Method("eigengs", source, k) for source in own + universal for k in COMPONENTS]
+    bases = [Method("eigengs", source, k) for source in trained + universal for k in COMPONENTS]
     return [*plain, Method("default"), *bases]
 
 
 def run(task: Task, names: Sequence[str], tables: Sequence[str]) -> list[Row]:
-    """Measure what tables need on sets, image by image, the methods in turn."""
-    found, sources = list[Row](), [name for name in SETS if is_trained(task, name)]
+    """Measure what the tables need on sets, image by image, the methods in turn."""
+    rows, sources = list[Row](), [name for name in SETS if is_trained(task, name)]
     for name in names:
-        wanted = [m for table in tables or TABLES for m in methods(name, table, sources)]
-        jobs = list(_jobs(task, name, list(dict.fromkeys(wanted))))
-        found += task.measure("tables", jobs, name)
-    return found
+        compared = [m for table in tables or TABLES for m in methods(name, table, sources)]
+        jobs = list(_jobs(task, name, list(dict.fromkeys(compared))))
+        rows += task.measure("tables", jobs, name)
+    return rows
 
 
 def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:
@@ -70,7 +70,7 @@ def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:
 
     @cache
     def options_of(method: Method) -> dict[str, Any]:
-        """Return the options of fits; train their model and compile, untimed."""
+        """Return the options of fits, after training their model and compiling, untimed."""
         model, count = None, None if method.source else SETS[name].gaussians
         if method.source:
             split = {"split": True, "whole": False}.get(method.split, "auto")
@@ -106,7 +106,7 @@ ENDS: dict[str, Any] = {
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Make two tables of each kind and number of steps, with all figures and with few.
+    """Make two tables for each kind and number of steps: with all figures, and with few.
 
     A line is a set and a method: psnr_ycbcr by steps, means over the images, and figures of the
     start and of the last step. What the paper prints stands beside it in brackets.
@@ -151,7 +151,7 @@ def _chosen(fits: pd.DataFrame, kind: str) -> pd.DataFrame:
 
 
 def label(method: Method, name: str) -> str:
-    """Name of a method on a set, for a reader."""
+    """Name a method on a set, for readers."""
     if not method.source:
         return method.preset
     basis = {NATURAL: "universal", name: "own"}.get(method.source, method.source)
@@ -174,7 +174,7 @@ SHOWN = (0, 100, 1000, 10000)
 
 
 def _few(fits: pd.DataFrame) -> fr.Table:
-    """Lay out PSNRs by steps and the seconds, of bases with the paper's 300 components."""
+    """Lay out PSNRs by steps, and seconds, for bases with the paper's 300 components."""
     printed = {(ln["set"], ln["source"]): ln for ln in _published("steps").to_dict("records")}
     fits = fits[fits.components.isin([0, COMPONENTS[0]])]
     steps, lines = [n for n in SHOWN if n in set(fits.iteration)], list[tuple[str, ...]]()
@@ -197,13 +197,13 @@ def _few(fits: pd.DataFrame) -> fr.Table:
 
 
 def _sets(fits: pd.DataFrame) -> str:
-    """Name the paper's sets that stand beside ours."""
+    """Name the paper's sets that correspond to ours."""
     printed = _published("steps").drop_duplicates("set")
     return ", ".join(printed[printed.set.isin(fits.set.unique())].images)
 
 
 def _ablation(fits: pd.DataFrame) -> fr.Table:
-    """Lay out colour space and split as in the paper: a line a setting, a column a set."""
+    """Lay out colour space and split as in the paper: a line per setting, a column per set."""
     last, printed = fits[fits.iteration == fits.iterations], _published("ablation")
     names, lines = list(last.set.unique()), []
     for line in printed.to_dict("records"):

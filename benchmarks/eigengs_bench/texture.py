@@ -1,8 +1,8 @@
-"""How fast a texture of Gaussians is in Mitsuba, and what it holds: against a bitmap."""
+"""The speed and memory of a texture of Gaussians in Mitsuba, against a bitmap."""
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -13,15 +13,16 @@ import drjit as dr
 import numpy as np
 
 import eigengs_dr as eg
-from eigengs_bench import poster
+from eigengs_bench import poster, sky
 from eigengs_bench.clock import interleaved
+from eigengs_bench.names import TEXTURE_PARTS
 from eigengs_bench.report import Section, Table, table
-from eigengs_bench.rows import Row, Task
+from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.resize import resample
 from eigengs_dr.storage.npz import sizes_of
 
-SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples a pixel
+SIDE, TEXELS, SPP = 512, 1024, 16  # of the picture, of the bitmap, and samples per pixel
 COUNTS = (500, 5_000, 20_000)  # Gaussians of the textures
 SETTLED = 5_000  # Gaussians of the texture that is also prefiltered and differentiated
 CHANGED = (5_000, 50_000)  # Gaussians of the textures whose parameters change
@@ -30,7 +31,7 @@ HELD = (1_000, 10_000, 100_000)  # Gaussians of the files that are loaded
 PIXELS = 32  # of the picture of a file, for each of its Gaussians
 
 
-def run(task: Task, variant: str) -> list[Row]:
+def run(task: Task, variant: str, parts: Sequence[str] = TEXTURE_PARTS) -> list[Row]:
     """Time a material ball with each texture in turn, in one run; every figure is a median.
 
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_filtered_N` with
@@ -40,19 +41,29 @@ def run(task: Task, variant: str) -> list[Row]:
     `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
     `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
     memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
-    For the other rows see `eigengs_bench.poster`.
+    For the other rows see `eigengs_bench.poster` and `eigengs_bench.sky`.
     """
-    rows = task.measure("texture", poster.jobs(variant, task.data), "posters")
-    job: Row = {"variant": variant, "at": time.time()}  # each call measures anew
-    return rows + task.measure("texture", [(job, partial(measure, variant, task.progress))])
+    ball: Row = {"variant": variant, "at": time.time()}  # each call measures anew
+    jobs: dict[str, Iterable[Job]] = {
+        "posters": poster.jobs(variant, task.data),
+        "lights": sky.jobs(variant),
+        "ball": [(ball, partial(measure, variant, task.progress))],
+    }
+    return [row for part in parts for row in task.measure("texture", jobs[part], part)]
 
 
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay out the figures of the last row of a ball, and what a user of the texture pays."""
-    balls = [row for row in rows if "poster" not in row["job"]]
+    """Lay out the figures of the last row of a ball, and the costs for a user of the texture."""
     posters = [row for row in rows if "poster" in row["job"]]
-    parts = [_posters(posters), _losses(balls, posters)] if posters else []
-    return Section([*_costs(balls), *parts], figures=_figures(balls[-1], posters))
+    lights = [row for row in rows if "light" in row["job"]]
+    balls = [row for row in rows if not {"poster", "light"} & row["job"].keys()]
+    tables = [
+        *(_costs(balls) if balls else []),
+        *([_posters(posters)] if posters else []),
+        *([_losses(balls, posters)] if balls and posters else []),
+        *([_lights(lights)] if lights else []),
+    ]
+    return Section(tables, figures=_figures(balls, posters))
 
 
 def _costs(balls: Sequence[Row]) -> list[Table]:
@@ -101,16 +112,42 @@ def _posters(posters: Sequence[Row]) -> Table:
     return table(caption, columns, lines, name="posters")._replace(rows=posters)
 
 
-def _figures(row: Row, posters: Sequence[Row]) -> dict[str, str]:
+def _lights(lights: Sequence[Row]) -> Table:
+    """Lay out what lights of Gaussians differ by from their bitmaps, and what they cost."""
+    caption = (
+        f"Gaussians for {sky.GOAL:g} dB beside the envmap of a bitmap of {2 * sky.ROWS} x "
+        f"{sky.ROWS} texels: PSNR of lookups in even directions, and of pictures without their "
+        "noise; largest difference of the mean of a channel; variance at equal samples, and time "
+        "of a picture, over those with the envmap; memory"
+    )
+    columns = ["light", "Gaussians", "lookups", "pictures", "mean", "variance", "time"]
+    columns += ["Gaussians hold", "envmap holds"]
+    lines = [
+        (
+            row["job"]["light"],
+            f"{row['gaussians']:,}",
+            *(f"{row[k]:.1f} dB" for k in ("lookups", "images")),
+            f"{row['mean']:.2%}",
+            *(f"{row[k]:.2f}" for k in ("variance", "ratio")),
+            *(f"{row[k] / 1e6:.3g} MB" for k in ("bytes", "bitmap_bytes")),
+        )
+        for row in lights
+    ]
+    return table(caption, columns, lines, name="lights")._replace(rows=lights)
+
+
+def _figures(balls: Sequence[Row], posters: Sequence[Row]) -> dict[str, str]:
     """Return figures of a ball, and medians over the posters but the text, for sentences."""
     pictures = [one for one in posters if one["kind"] != "text"]
     medians = {k: median(one[k] for one in pictures) for k in ("ratio", "ratio_floats") if pictures}
-    timed = {name: row[f"ratio_{name}"] for name in ("prefiltered", "step")}
-    return {name: f"{value:.2f}" for name, value in (medians | timed).items()}
+    timed = {name: row[f"ratio_{name}"] for row in balls[-1:] for name in ("prefiltered", "step")}
+    held = [row[f"held_{count}"] for row in balls[-1:] for count in HELD]
+    range_held = {"held": f"{min(held):.1f} to {max(held):.1f}"} if held else {}
+    return {name: f"{value:.2f}" for name, value in (medians | timed).items()} | range_held
 
 
 def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
-    """Lay out where Gaussians lose: figures over those of a bitmap, and what to use instead."""
+    """Lay out where Gaussians lose to a bitmap, and what to use instead."""
     row, kinds = balls[-1], ("photo", "material", "text")
     ratio = {k: [r["ratio"] for r in posters if r["kind"] == k] for k in kinds}
     floats = [r["ratio_floats"] for r in posters if r["kind"] != "text"]
@@ -156,7 +193,7 @@ LOOKUPS = {
 
 
 def _memory(row: Row) -> Table:
-    """Lay out what textures take in memory, beside bitmaps of the pixels of their pictures."""
+    """Lay out the memory of textures, beside that of bitmaps with the pixels of their pictures."""
     caption = (
         f"Memory of a texture of {PIXELS} pixels a Gaussian; seconds from file to first lookup"
     )
@@ -282,8 +319,8 @@ def _change(mi: Any, texture: Any, name: str) -> Any:
 
 
 def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None) -> Row:
-    """Measure what textures of files hold in memory, and how long their first lookup takes."""
-    found: Row = {}
+    """Measure the memory of textures from files, and the time to their first lookup."""
+    row: Row = {}
     for done, count in enumerate(HELD):
         side = round(math.sqrt(PIXELS * count))
         picture = resample(eg.sample("coffee")[:400, 100:500], side, side)
@@ -293,11 +330,11 @@ def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None)
             for name, given in ((str(count), 0.0), (f"filtered_{count}", angle)):
                 firsts = [_first_lookup(mi, path, given) for _ in range(4)]
                 bytes_held = firsts[0][0]
-                found[f"bytes_{name}"] = bytes_held
-                found[f"held_{name}"] = bytes_held / sum(sizes_of(path).values())
-                found[f"first_{name}_ms"] = 1e3 * median(s for _, s in firsts[1:])  # compiled
+                row[f"bytes_{name}"] = bytes_held
+                row[f"held_{name}"] = bytes_held / sum(sizes_of(path).values())
+                row[f"first_{name}_ms"] = 1e3 * median(s for _, s in firsts[1:])  # compiled
         progress("files", done + 1, len(HELD))
-    return found
+    return row
 
 
 def _first_lookup(mi: Any, path: Path, angle: float) -> tuple[int, float]:

@@ -169,7 +169,7 @@ def _objective(task: PlaceTask | FitTask, settings: Settings) -> Pixels:
 def _density(objective: Pixels, settings: Settings) -> tuple[Canvas, Float, Float]:
     """Return the canvas of a window, the squared Hessian and the density."""
     canvas = Canvas.of(objective.types, objective.grid)
-    return canvas, *density_from_hessian(canvas, objective.shown, settings.spacing)
+    return canvas, *density_from_hessian(canvas, objective.placement_image, settings.spacing)
 
 
 def _mass(canvas: Canvas, density: Float, block: Block) -> float:

@@ -69,6 +69,15 @@ def size(text: str) -> tuple[int, int]:
     return check_pixels(width, height, by_parts=True)
 
 
+def width_or_size(text: str) -> tuple[int, int | None]:
+    """Parse a width in pixels, such as "1024", or width and height, such as "1024x768"."""
+    expected = "a width, or width and height, such as 1024 or 1024x768"
+    width, *rest = _numbers(text, r"\d+(x\d+)?", expected)
+    height = rest[0] if rest else None
+    check_pixels(width, 1 if height is None else height, by_parts=True)
+    return width, height
+
+
 def scale(text: str) -> float:
     """Parse the factor of a size."""
     if not 0 < (factor := float(text)) <= MAX_RENDERED_SIDE:

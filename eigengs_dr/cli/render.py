@@ -19,7 +19,12 @@ from .outputs import check_outputs, lock_outputs, name_outputs
     "--region", "X,Y,W,H", options.region, "Region of the image: left, top, width, height."
 )
 @options.value("--scale", "S", options.scale, "Scale factor of the native size, such as 0.5.")
-@options.value("--size", "WxH", options.size, "Width and height in pixels, such as 1024x768.")
+@options.value(
+    "--size",
+    "W|WxH",
+    options.width_or_size,
+    "Width in pixels, such as 1024, which keeps the aspect ratio; or width and height, 1024x768.",
+)
 @options.number("--first", "Render only the first N Gaussians; for fits with --levels.", minimum=1)
 @options.choice(
     "--bits",
@@ -35,7 +40,7 @@ def render(
     name: str | None,
     region: tuple[int, int, int, int] | None,
     scale: float | None,
-    size: tuple[int, int] | None,
+    size: tuple[int, int | None] | None,
     first: int | None,
     bits: str | None,
 ) -> None:
@@ -49,6 +54,7 @@ def render(
     \b
     Examples:
       eigengs-dr render photo.npz -o photo.png
+      eigengs-dr render photo.npz -o wide.png --size 2048
       eigengs-dr render photo.npz -o large.tif --scale 4
       eigengs-dr render sky.npz -o sky.exr
       eigengs-dr render normals.npz -o normals.png --bits 16
@@ -83,9 +89,11 @@ def render(
             f"{file}: --region {left},{top},{width},{height} is not inside the image of "
             f"{data.size[0]}x{data.size[1]} pixels"
         )
-    if size is None:
-        size = max(1, round(width * (scale or 1))), max(1, round(height * (scale or 1)))
-    options.check_pixels(*size, output.suffix.lower() in TIFF_SUFFIXES)
+    columns, rows = size or (max(1, round(width * (scale or 1))), None)
+    if rows is None:
+        rows = max(1, round(height * (scale or columns / width)))
+    options.check_pixels(columns, rows, output.suffix.lower() in TIFF_SUFFIXES)
     with bar(run.quiet) as show:
-        save_region(output, data, region, size, run.backend, partial(show, output.name), depth)
-    run.tell(f"{file}: {count:,} Gaussians", f"  wrote {output} ({size[0]}x{size[1]})")
+        step = partial(show, output.name)
+        save_region(output, data, region, (columns, rows), run.backend, step, depth)
+    run.tell(f"{file}: {count:,} Gaussians", f"  wrote {output} ({columns}x{rows})")

@@ -3,15 +3,15 @@
 - ``fit``: `fit`, from the image to the result
 - ``loop``: a descent with a trace, which keeps the best set
 - ``descent``: the loop over the steps, the state between them, and the program of one step
-- ``objective``: what a picture shall come near to, and its quadratic model
+- ``objective``: what a picture should match, and its quadratic model
 - ``method``: a method as a value: placement, optimiser, rates, controls
-- ``control``: what adds, moves and removes Gaussians between steps; ``exchange``: how
-- ``place``: where Gaussians start; ``placement``: the one by the image
+- ``control``: adds, moves and removes Gaussians between steps, by means of ``exchange``
+- ``place``: where Gaussians start; ``placement``: the placement by the image
 - ``solve``: colours by linear least squares
 - ``variables``, ``optimizer``: what a step moves, and how far
 - ``fewest``: the smallest number of Gaussians for a PSNR
 - ``levels``: levels of detail
 - ``maps``: several maps as one image of many channels
-- ``options``, ``pixels``, ``start``: what the caller gives, checked
+- ``options``, ``pixels``, ``start``: checks of what the caller gives
 - ``measure``: PSNRs of a set
 """

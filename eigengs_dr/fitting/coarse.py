@@ -24,7 +24,7 @@ from .optimizer import Adam, Optimizer
 from .place import Adaptive
 
 LEAST_SIDE = 4
-"""Shorter side of the coarsest level in texels, at least."""
+"""Smallest length of the shorter side of the coarsest level, in texels."""
 
 
 NOISY = Adam(0.5, 0.999, 1e-8)
@@ -35,7 +35,7 @@ NOISY = Adam(0.5, 0.999, 1e-8)
 class Coarse(Adaptive):
     """Places Gaussians by the picture that a pyramid of texels finds for a loss.
 
-    With an image, it is `Adaptive`.
+    With an image, it places as `Adaptive` does.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ def enlarge(values: Float, coarse: Level, fine: Level) -> Float:
 
 
 def shrink(values: Float, fine: Level, coarse: Level) -> Float:
-    """Return the transpose of `enlarge`: a derivative by the finer level as one by the coarser."""
+    """Return the transpose of `enlarge`: from a derivative by the finer level to the coarser."""
     types = types_of(values)
     row, column, channel = coarse.place(types.UInt)
     total = types.Float(0)
@@ -217,15 +217,15 @@ def coarse_picture(
     values.append(types.Float(np.tile(start, levels[-1].values // len(start))))
     dr.make_opaque(values)
     moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)
-    shown = objective.seen(sums)
+    pictures = objective.seen(sums)
     with freeze_program(advance) as take_step:
         for step in range(steps):
             if ended(step):
                 break
-            slopes = objective.step(shown)
+            slopes = objective.step(pictures)
             falling = 0.5 + 0.5 * math.cos(math.pi * step / steps)
             rate = coarse.rate * unit * (coarse.decay + (1 - coarse.decay) * falling)
             numbers = (dr.opaque(types.Float, number) for number in (rate, step + 1))
-            values, moments, sums, shown = take_step(values, moments, sums, slopes, *numbers)
+            values, moments, sums, pictures = take_step(values, moments, sums, slopes, *numbers)
     ended(steps)
     return sums

@@ -1,9 +1,9 @@
-"""Controls: what adds, moves and removes Gaussians between the steps of a descent.
+"""Controls, which add, move and remove Gaussians between the steps of a descent.
 
 `Retreat` undoes steps that have raised the error, `Surplus` allows more Gaussians than requested,
 `Redistribute` places all anew after the first steps, `Relocate` moves those of least use and lets
-the surplus go, and `Perturb` shakes all. Each acts before steps of its own. Where it changes the
-Gaussians, the optimiser starts anew.
+the surplus go, and `Perturb` adds noise to all. Each acts before its own steps. If it changes
+the Gaussians, the optimiser starts anew.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ EVERY = 45
 UNTIL, MIN_ROUNDS, MAX_ROUNDS = 0.65, 2, 72
 """Rounds end after this share of a descent; their smallest and largest number. In 100 steps more
 steps gain more than rounds would, for the same time. With 5,000 steps, 72 rounds gain 0.07 and 0.1
-dB over 40 (4 training photos, 0.0127 and 0.0254 Gaussians a pixel)."""
+dB over 40 (4 training photos, 0.0127 and 0.0254 Gaussians per pixel)."""
 
 FULL_ROUNDS = 10
 """Number of rounds from which on noise and surplus have their full strength. A short descent does
-not recover from more: with 300 steps and 0.076 Gaussians a pixel, a noise of 4 costs 0.8
-dB. With 0.0127 Gaussians a pixel, a surplus of 0.5 gains 0.24 dB there, and one of 1 0.18 dB."""
+not recover from more: with 300 steps and 0.076 Gaussians per pixel, a noise of 4 costs 0.8
+dB. With 0.0127 Gaussians per pixel, a surplus of 0.5 gains 0.24 dB there, and one of 1 0.18 dB."""
 
 
 def rounds(every: int, iterations: int) -> list[int]:
-    """Return the steps before which rounds come: evenly up to `UNTIL`.
+    """Return the steps before which rounds take place: evenly spaced up to `UNTIL`.
 
     Examples
     --------
@@ -56,7 +56,7 @@ def rounds(every: int, iterations: int) -> list[int]:
 
 
 def _strength(number: int) -> float:
-    """Return the share of the full strength in a descent of so many rounds."""
+    """Return the strength in a descent of so many rounds, as a share of full strength."""
     return min(1, number / FULL_ROUNDS)
 
 
@@ -67,13 +67,13 @@ class Surplus:
     Attributes
     ----------
     share : float
-        Surplus of a long descent, relative to the number requested. With 0.0127 Gaussians a pixel,
-        1,000 steps and 9 training photos, 0.5, 1 and 2 gain 0.23, 0.24 and 0.12 dB.
+        Surplus of a long descent, relative to the number requested. With 0.0127 Gaussians per
+        pixel, 1,000 steps and 9 training photos, 0.5, 1 and 2 gain 0.23, 0.24 and 0.12 dB.
     max_density : float
-        Most Gaussians a pixel of a set with a surplus. Denser sets do not converge in 1,000 steps.
-        On 9 training photos, surpluses up to this density gain 0.24, 0.22 and 0.10 dB with 0.0127,
-        0.0254 and 0.045 Gaussians a pixel. With 0.076 Gaussians a pixel, a surplus of 0.3 costs
-        0.09 dB.
+        Largest number of Gaussians per pixel of a set with a surplus. Denser sets do not converge
+        in 1,000 steps. On 9 training photos, surpluses up to this density gain 0.24, 0.22 and 0.10
+        dB with 0.0127, 0.0254 and 0.045 Gaussians per pixel. With 0.076 Gaussians per pixel, a
+        surplus of 0.3 costs 0.09 dB.
     every : int
         Steps between the rounds of relocation.
     """
@@ -115,7 +115,7 @@ class Redistribute:
     Attributes
     ----------
     after : int
-        Most steps before it.
+        Largest number of steps before it.
     solve_steps : int
         Steps of the colour solve after it.
     """
@@ -132,12 +132,12 @@ class Redistribute:
     """Smallest ratio of the steps of a descent to those before a redistribution."""
 
     MIN_STEPS = 10
-    """Fewest steps before it. With 0.013 and 0.076 Gaussians a pixel, redistribution gains 0.07
+    """Fewest steps before it. With 0.013 and 0.076 Gaussians per pixel, redistribution gains 0.07
     and 0.6 dB in 100 steps (5 photos); in 60 steps, after 6 of them, it gains 0 and 0.3 dB, less
     than more steps would in the same time."""
 
     def steps(self, iterations: int) -> tuple[int, ...]:
-        """Return the step before which it comes; none in a short descent.
+        """Return the step before which it acts; none in a short descent.
 
         Examples
         --------
@@ -249,15 +249,15 @@ class Perturb:
         squares, images = state.squares, objective.grid.images
         if squares is None:
             squares = sum_by_image(squared_error(gaussians, objective), objective.grid)
-        own = range(state.total)
+        movable = range(state.total)
         if objective.part is not None:
-            own = own[objective.part.own]
+            movable = movable[objective.part.movable]
         curvature = objective.model.mean_curvature(objective.grid, objective.channels)
-        error = squares / (curvature * dr.opaque(type(squares), max(1, len(own))))
+        error = squares / (curvature * dr.opaque(type(squares), max(1, len(movable))))
         seed = int(np.random.SeedSequence([key, step]).generate_state(1)[0])
         color = [row + dr.zeros(type(squares), len(gaussians)) for row in gaussians.color]
         mean, factor = perturb(
-            gaussians.mean, gaussians.factor, color, own, error, strength, seed, images
+            gaussians.mean, gaussians.factor, color, movable, error, strength, seed, images
         )
         return state.replaced(replace(gaussians, mean=mean, factor=factor).bounded())
 
@@ -301,7 +301,7 @@ class Retreat:
     def __call__(
         self, state: State, objective: Pixels, step: int, iterations: int, key: int
     ) -> State:
-        """Return the state, or the one to return to.
+        """Return the state, or an earlier one to return to.
 
         Raises
         ------
@@ -324,7 +324,7 @@ class Retreat:
 
 
 class Diverged(Exception):
-    """Images of a batch do not fit together: one has to go back, and the others have not."""
+    """The images of a batch diverge from each other: one must go back, the others must not."""
 
 
 SHAPE_SHARE = 0.5
@@ -338,7 +338,7 @@ def perturb(
     mean: Rows,
     factor: Rows,
     color: list,
-    own: range,
+    movable: range,
     error: Float,
     strength: float,
     seed: int,
@@ -362,7 +362,7 @@ def perturb(
     factor : Array3f, shape (N, 3)
     color : list of Float, shape (N,)
         By channels.
-    own : range
+    movable : range
         The Gaussians of one image that move; the images of a batch have equal noise.
     error : Float, shape (images,)
         Squared error of each image divided by the number of its Gaussians.
@@ -386,7 +386,7 @@ def perturb(
     size = dr.opaque(types.Float, strength) * dr.sqrt(error / (dr.pi * amplitude))
     # The comparison is false where the amplitude is 0.
     size = dr.select(size < MAX_NOISE, size, types.Float(MAX_NOISE))
-    moves = among(lane, own)
+    moves = among(lane, movable)
     size = dr.select(moves, size, 0)
     normal, first = dr.rng(seed).normal(types.Float, 5 * count), dr.opaque(types.UInt, count)
     x, y, u, v, w = (dr.gather(types.Float, normal, lane + k * first) * size for k in range(5))

@@ -64,13 +64,13 @@ class State:
     Attributes
     ----------
     gaussians : Gaussians
-        The current set, of a batch image after image.
+        The current set; for a batch, image after image.
     count : int
         Requested number of Gaussians of an image.
     surplus : int
         How many more a control may place before the last ones have left.
     chosen : bool
-        Whether the user chose the Gaussians: a redistribution then keeps those that are of use.
+        Whether the user chose the Gaussians: a redistribution then keeps them if they are of use.
     squares : Float or None, shape (images,)
         The sums of ``h (p - t)^2`` that a control has measured before this step.
     speed : float
@@ -82,7 +82,7 @@ class State:
     since : int
         The step at which the optimiser started.
     lists : tuple of TileLists
-        Of the current set: one for each level, and one for the whole set.
+        Lists of the current set: one for each level, and one for the whole set.
     until : int
         The step that needs new lists.
     """
@@ -142,7 +142,7 @@ def listed(
     step: int,
     end: int,
 ) -> State:
-    """Make the tile lists of the current set; they last until `end`, or until it moved too far."""
+    """Make the tile lists of the current set, which last until `end` or until it moves too far."""
     assert state.fixed is not None and state.moving is not None
     slowed = [factor * state.speed for factor in factors]
     until, moves = next_build(method, slowed, step, end, state.since)
@@ -171,7 +171,7 @@ def next_build(
     step : int
         The step that needs lists.
     end : int
-        A step that needs no lists, or other ones.
+        A step that needs no lists, or new ones.
     since : int, optional
         The step at which the optimiser started.
 
@@ -218,9 +218,9 @@ def step_program(objective: Pixels, method: Method) -> StepProgram:
         ``step(largest, moving, fixed, model, lists, rates, index) -> moving, gaussians``: it
         descends on the mean of ``h (p - t)^2``, then projects the variables into their bounds. With
         levels it descends on the sum of the logarithms of these means for the prefixes of the set,
-        so that no level suffers for another. `largest` is the largest number of Gaussians so far: a
-        program of its own for each, since Dr.Jit 1.5 writes beyond arrays if a program is replayed
-        for more Gaussians than it was recorded for.
+        so that no level suffers for another. `largest` is the largest number of Gaussians so far:
+        each has its own program, since Dr.Jit 1.5 writes beyond arrays if a program is replayed for
+        more Gaussians than it was recorded for.
     """
     channels, levels = objective.channels, bool(objective.levels)
 
@@ -301,16 +301,16 @@ def _pull_back(
         dr.enable_grad(traced)
         decoded = coordinates.decode(fixed, traced, size)
         rows = [*kernel_shape(decoded), *decoded.color]
-        known = [(row, g) for row, g in zip(rows, gradient, strict=True) if dr.grad_enabled(row)]
-        for row, g in known:
+        pairs = [(row, g) for row, g in zip(rows, gradient, strict=True) if dr.grad_enabled(row)]
+        for row, g in pairs:
             dr.set_grad(row, g)
-        dr.enqueue(dr.ADMode.Backward, [row for row, _ in known])
+        dr.enqueue(dr.ADMode.Backward, [row for row, _ in pairs])
         dr.traverse(dr.ADMode.Backward)
         return {name: dr.grad(value) for name, value in traced.items()}
 
 
 def _prefix(pad: FloatLike, count: int) -> FloatLike:
-    """Return the first `count` entries of an array, or a number as it is."""
+    """Return the first `count` entries of an array; a number stays as it is."""
     if isinstance(pad, float) or dr.width(pad) in (1, count):
         return pad
     return dr.gather(type(pad), pad, dr.arange(dr.uint32_array_t(type(pad)), count))
@@ -332,7 +332,7 @@ def rate_scale_of(color: Sequence[Float], exponent: float, images: int = 1) -> F
 
     The error depends most on bright Gaussians, so they move less. With the length of a colour |c|,
     the factor is ``(mean |c| / |c|)^exponent``, at most `MAX_RATE_SCALE` and at least its inverse.
-    The mean is that of the own image.
+    The mean is over the Gaussians of the same image.
 
     Parameters
     ----------
@@ -351,8 +351,8 @@ def rate_scale_of(color: Sequence[Float], exponent: float, images: int = 1) -> F
     count = dr.width(length) // images
     mean = dr.sum(length)
     if images > 1:
-        own, _ = make_divisor(types, count).divmod(dr.arange(types.UInt, dr.width(length)))
-        mean = dr.gather(types.Float, dr.block_sum(length, count), own)
+        image, _ = make_divisor(types, count).divmod(dr.arange(types.UInt, dr.width(length)))
+        mean = dr.gather(types.Float, dr.block_sum(length, count), image)
     mean *= dr.opaque(types.Float, 1 / count)
     ratio = dr.select(mean > 0, mean / length, types.Float(1))
     bound = MAX_RATE_SCALE ** (1 / exponent)

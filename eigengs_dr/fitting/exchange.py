@@ -1,4 +1,4 @@
-"""Gaussians that leave and Gaussians that are added, by what each is worth to an objective."""
+"""Gaussians that leave and Gaussians that are added, by their worth to an objective."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ROUND = 1 / SIZE, 0.0, 1 / SIZE
 """The factor of an added Gaussian."""
 
 PRUNE_STEPS = 5
-"""Steps of the colour solve in `prune`, after which there may be no descent."""
+"""Steps of the colour solve in `prune`, which no descent may follow."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +67,14 @@ class _Comparison:
     def weigh(self, slope: Float) -> tuple[Float, Unknowns]:
         """Return the removal costs of a set with a known slope, see `removal_cost`.
 
-        Return ``<w_n, h w_n>`` too, of each channel, or of all channels where h has one value.
+        Also return ``<w_n, h w_n>`` for each channel, or for all channels if h has one value.
         """
         color, channels = self.colors[0], len(self.colors[0])
         factors = self.model.curvatures(self.lists.grid)
         dr.eval(factors, slope)
         along, diagonal = weigh(self.shape, slope, channels, self.lists, self.cutoff, factors)
-        own = by_channel(diagonal[0], channels)
-        cost = sum(c * (c * o - 2 * a) for c, o, a in zip(color, own, along, strict=True))
+        squares = by_channel(diagonal[0], channels)
+        cost = sum(c * (c * s - 2 * a) for c, s, a in zip(color, squares, along, strict=True))
         return cost, diagonal
 
     def peaks(self, slope: Float, count: int) -> Peaks:
@@ -84,7 +84,7 @@ class _Comparison:
 
 
 def _compare(gaussians: Gaussians, objective: Pixels, lists: TileLists | None) -> _Comparison:
-    """Compare a set with an objective; list the Gaussians of the tiles if nobody has."""
+    """Compare a set with an objective; list the Gaussians of the tiles unless lists are given."""
     types = types_of(gaussians.mean)
     if lists is None:
         lists = bin_gaussians(gaussians, images=objective.grid.images)
@@ -173,22 +173,22 @@ def exchange(
     Parameters
     ----------
     gaussians : Gaussians
-        Of a batch, the Gaussians of all images, image after image; each image is for itself.
+        For a batch, the Gaussians of all images, image after image; each image is separate.
     objective : Pixels
         With a part, only its Gaussians move, to its pixels; the background stays.
     share : float
         Share of the Gaussians that leave their places, in [0, 1].
     dropped : int, optional
-        How many Gaussians of an image are gone, even if the share says fewer.
+        How many Gaussians of an image are dropped, even if the share is smaller.
     lists : TileLists, optional
         Lists that are valid for the set.
 
     Returns
     -------
     Gaussians
-        As many Gaussians, less those dropped; neighbours in space are so in memory, unless there is
-        a part. Where `residual_peaks` finds too few places, Gaussians of least use stay, with the
-        colour 0.
+        As many Gaussians, less those dropped; neighbours in space are neighbours in memory, unless
+        there is a part. Where `residual_peaks` finds too few places, Gaussians of least use stay,
+        with the colour 0.
     squares : Float, shape (images,)
         ``sum h (p - t)^2`` of the images before.
     """
@@ -196,11 +196,11 @@ def exchange(
         scene, types = _compare(gaussians, objective, lists), types_of(gaussians.mean)
         grid, total, part = scene.lists.grid, len(gaussians), objective.part
         count = total // grid.images
-        own = range(count) if part is None else range(count)[part.own]
-        leaving, inside = max(int(share * len(own)), dropped), None
+        movable = range(count) if part is None else range(count)[part.movable]
+        leaving, inside = max(int(share * len(movable)), dropped), None
         if part is not None:
             inside = _core(objective, part)
-        cost, diagonal, squares = _value(scene, inside, own)
+        cost, diagonal, squares = _value(scene, inside, movable)
         keep, moved = dr.full(types.Float, 1, total), None
         if leaving:
             moved = _least(cost, leaving, grid.images)
@@ -235,7 +235,7 @@ def exchange(
 def in_order(gaussians: Gaussians, images: int = 1) -> Gaussians:
     """Order Gaussians along a Hilbert curve, image after image.
 
-    With 5,000 Gaussians on 256x256 pixels, the steps after 14 rounds else take 8 % longer.
+    With 5,000 Gaussians on 256x256 pixels, the steps after 14 rounds take 8 % longer without it.
     """
     grid = Grid(gaussians.width, gaussians.height, images=images)
     canvas = Canvas.of(types_of(gaussians.mean), grid)
@@ -252,15 +252,17 @@ def _core(objective: Pixels, part: Part) -> Float:
 
 
 @record
-def _value(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float, Unknowns, Float]:
-    """Return the removal costs, infinite for others than the own Gaussians.
+def _value(
+    scene: _Comparison, inside: Float | None, movable: range
+) -> tuple[Float, Unknowns, Float]:
+    """Return the removal costs, infinite for Gaussians that are not movable.
 
     Parameters
     ----------
     scene : _Comparison
     inside : Float, or None
-        Factor of the errors that count, where not all do.
-    own : range
+        Factor of the errors that count, if not all do.
+    movable : range
         The Gaussians of each image that may leave.
 
     Returns
@@ -278,7 +280,7 @@ def _value(scene: _Comparison, inside: Float | None, own: range) -> tuple[Float,
     dr.eval(slope, squares)
     cost, diagonal = scene.weigh(slope)
     if inside is not None:
-        cost = dr.select(among(dr.arange(types.UInt, dr.width(cost)), own), cost, dr.inf)
+        cost = dr.select(among(dr.arange(types.UInt, dr.width(cost)), movable), cost, dr.inf)
         h = scene.model.curvatures_of_values(scene.lists.grid, channels)
         error = dr.select(h > 0, slope / h, 0)
         squares = sum(channel_sums(slope * error * inside, channels, scene.lists.grid))
@@ -299,7 +301,7 @@ def _without_some(
     diagonal : Unknowns
         From `_Comparison.weigh`.
     inside : Float, or None
-        Factor of the errors that count, where not all do. The background then stays.
+        Factor of the errors that count, if not all do. The background then stays.
 
     Returns
     -------
@@ -322,10 +324,10 @@ def _without_some(
     return colors, slope if inside is None else slope * inside
 
 
-def among(number: UInt, own: range) -> Bool:
+def among(number: UInt, numbers: range) -> Bool:
     """Return which numbers are in a range."""
     UInt = type(number)
-    return (number >= dr.opaque(UInt, own.start)) & (number < dr.opaque(UInt, own.stop))
+    return (number >= dr.opaque(UInt, numbers.start)) & (number < dr.opaque(UInt, numbers.stop))
 
 
 def _least(cost: Float, number: int, images: int) -> UInt:
@@ -355,7 +357,7 @@ def _without(gaussians: Gaussians, moved: UInt | None, dropped: int, images: int
 
 
 def exchange_levels(gaussians: Gaussians, objective: Pixels, share: float) -> Gaussians:
-    """Move the Gaussians of least use in each level to where the image up to it has most error.
+    """Move the least useful Gaussians of each level to the largest errors of the image up to it.
 
     A step of the colour solve adapts the colours of a level and of those before it.
 
@@ -367,7 +369,7 @@ def exchange_levels(gaussians: Gaussians, objective: Pixels, share: float) -> Ga
     ----------
     gaussians : Gaussians
     objective : Pixels
-        With levels.
+        An objective with levels.
     share : float
         Share of the Gaussians of a level that leave their places.
 

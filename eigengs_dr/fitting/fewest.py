@@ -38,8 +38,8 @@ TRY_SHARE, FIT_SHARE, POLISH_SHARE = 0.1, 1.0, 0.15
 """Steps of a try, of the fit and of a polish, as fractions of the iterations."""
 
 MAX_LENGTH = 2
-"""Steps of the search, at most, as a multiple of the iterations, if these exceed some ten and
-one fit suffices; else up to a quarter as much again."""
+"""Largest number of steps of the search, as a multiple of the iterations, if these exceed about
+ten and one fit suffices; otherwise up to a quarter more."""
 
 MAX_TRIES = 4
 """Largest number of tries. One alone takes 2 % more Gaussians with 1,000 iterations and 5 %
@@ -50,8 +50,8 @@ MAX_POLISHES = 7
 """Number of polishes after which a search ends if a set meets the goal."""
 
 SURE_POLISHES, SURE_DROPS = 3, 5
-"""Number of polishes that a search may take whatever its steps were before; and if the fit met
-the goal, so that they drop Gaussians."""
+"""Number of polishes that a search may take regardless of its steps so far; and the number if the
+fit met the goal, so that they drop Gaussians."""
 
 DB_PER_DOUBLING = 4.0
 """Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
@@ -75,11 +75,11 @@ MAX_OCTAVES = 4.0
 
 TRY_TOLERANCE, FIT_TOLERANCE = 0.1, 0.6
 """Largest relative difference from the estimated number for the last try, and largest relative
-lack of Gaussians for the fit; a surplus is for the polishes."""
+lack of Gaussians for the fit; the polishes handle a surplus."""
 
 MAX_DROP, DROP_PER_DB, LARGEST_DROP = 0.15, 0.1, 0.3
-"""Largest fraction of the Gaussians that one polish drops near the goal, for each decibel above
-it, and at all. A short search overshoots by decibels: 200 steps of a material fitted 11,122
+"""Largest fraction of the Gaussians that one polish drops: near the goal, for each decibel above
+it, and overall. A short search overshoots by decibels: 200 steps of a material fitted 11,122
 Gaussians with 35.6 dB for 32 dB; a second fit of fewer, in the steps that were left, missed the
 goal."""
 
@@ -91,8 +91,8 @@ POLISH_GAIN, GAIN_DECAY = 0.1, 0.5
 the last; training images gained 0.2 dB."""
 
 FAR = 1.5
-"""Gaussians of the best set over those of a polish that misses the goal, from which on the polish
-adds as if there were no such set: a try may meet the goal with twice the number."""
+"""Ratio of the Gaussians of the best set to those of a polish that misses the goal, above which
+the polish ignores that set: a try may meet the goal with twice the number."""
 
 ENOUGH = 0.02
 """Decibels above the goal that do not justify another polish."""
@@ -104,7 +104,7 @@ def fewest(
     start: Gaussians,
     score: Score,
     goal: tuple[str, float],
-    most: int,
+    max_count: int,
     iterations: int = 1000,
     key: int = 0,
     progress: FitProgress | None = None,
@@ -120,8 +120,8 @@ def fewest(
         A first guess by the placement `Adaptive`, which can be redistributed.
     score : Score
     goal : (str, float)
-        Key of the value in the rows of `score` that shall reach the goal, and the goal in dB.
-    most : int
+        Key of the value in the rows of `score` that must reach the goal, and the goal in dB.
+    max_count : int
         Largest number of Gaussians.
     iterations : int, optional
         Steps of a fit with a known number; the search takes up to about twice as many, and a
@@ -140,14 +140,14 @@ def fewest(
     tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
     planned = MAX_TRIES * tries + fit + MAX_POLISHES * polish
     run = _Run(objective, method, start, score, goal, key, progress, interrupted, planned)
-    estimate = _estimate(run, most, tries)
+    estimate = _estimate(run, max_count, tries)
     if not run.ended() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
         longest = round(MAX_LENGTH * iterations)
-        trial = _fit_estimate(run, estimate, most, fit, longest)
+        trial = _fit_estimate(run, estimate, max_count, fit, longest)
         # If the iterations are few, or two fits have used them up, polish all the same.
         sure = SURE_DROPS if trial.missing <= 0 else SURE_POLISHES
-        most_steps = max(longest, run.step + sure * polish)
-        _polish(run, trial, most, polish, most_steps)
+        max_steps = max(longest, run.step + sure * polish)
+        _polish(run, trial, max_count, polish, max_steps)
     if run.ended():
         _trim(run)
     met = "met" if run.best.missing <= 0 else "out of reach"
@@ -188,7 +188,7 @@ class _Run:
     def descend(
         self, gaussians: Gaussians, steps: int, share: float = 1.0, surplus: int = 0
     ) -> _Trial:
-        """Take some steps at a fraction of the learning rates, and score what is left then."""
+        """Take some steps at a fraction of the learning rates, and score the pruned set."""
         method = self.method.at_rates(share).without(Surplus, Redistribute)
         if share < 1:  # a polish moves Gaussians by itself
             method = method.without(Relocate, Perturb)
@@ -203,9 +203,9 @@ class _Run:
                     self.show(self.trace[-1])
                 if self.ended():
                     break
-        found = dr.detach(current.gaussians)
+        fitted = dr.detach(current.gaussians)
         # An interrupt may come before the last relocation.
-        return self.score(prune(found, self.objective.around(found), current.count))
+        return self.score(prune(fitted, self.objective.around(fitted), current.count))
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Place `count` Gaussians anew, denser where a set leaves more error."""
@@ -217,7 +217,8 @@ class _Run:
         [figures] = self.measure(gaussians)
         row = {"iteration": self.step, "gaussians": len(gaussians), **figures}
         self.trace.append(row)
-        # The PSNR of a set without error is infinite, and differences of two such are no numbers.
+        # The PSNR of a set without error is infinite, and the difference of two such is not a
+        # number.
         trial = _Trial(gaussians, goal - min(figures[figure], MAX_PSNR), row)
         if len(self.trace) == 1 or _better(trial, self.best):
             self.best = trial
@@ -233,12 +234,12 @@ class _Run:
                 self.stopped = True
 
     def ended(self) -> bool:
-        """Return whether somebody has ended the search."""
+        """Return whether the search was ended from outside."""
         return self.stopped or self.interrupted()
 
 
 def _better(a: _Trial, b: _Trial) -> bool:
-    """Return whether a meets the goal with fewer Gaussians than b, or comes nearer to it.
+    """Return whether a meets the goal with fewer Gaussians than b, or comes closer to it.
 
     Of two sets of one size that meet it, the one with the higher PSNR is better.
     """
@@ -254,7 +255,7 @@ class _Estimate(NamedTuple):
     placed: Gaussians
 
 
-def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
+def _estimate(run: _Run, max_count: int, steps: int) -> _Estimate:
     """Estimate the number of Gaussians by tries, each placed where the one before left error."""
     placed, before, last = run.start, run.best, None
     for _ in range(MAX_TRIES):
@@ -264,8 +265,8 @@ def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
         _update_slope(run, last, trial)
         gain = LATE_SHARE * max(0.0, before.missing - trial.missing)
         count = min(
-            most,
-            round(MARGIN * _count_for_gain(run, len(placed), trial.missing - gain, most)),
+            max_count,
+            round(MARGIN * _count_for_gain(run, len(placed), trial.missing - gain, max_count)),
         )
         # The first try was placed by the image, without errors: it does not count as close.
         close = last is not None and abs(count - len(placed)) <= TRY_TOLERANCE * len(placed)
@@ -276,14 +277,16 @@ def _estimate(run: _Run, most: int, steps: int) -> _Estimate:
     return _Estimate(trial.gaussians, placed)
 
 
-def _fit_estimate(run: _Run, estimate: _Estimate, most: int, steps: int, most_steps: int) -> _Trial:
+def _fit_estimate(
+    run: _Run, estimate: _Estimate, max_count: int, steps: int, max_steps: int
+) -> _Trial:
     """Fit the estimated number; if it was far off, fit once more, in the steps that are left."""
     trial, number = _fit(run, estimate, steps), len(estimate.placed)
-    count = _count_for_gain(run, number, trial.missing, most)
+    count = _count_for_gain(run, number, trial.missing, max_count)
     if run.ended() or count - number <= FIT_TOLERANCE * number:
         return trial
     again = _Estimate(trial.gaussians, run.redistribute(trial.gaussians, count))
-    return _fit(run, again, max(1, min(steps, most_steps - run.step)))
+    return _fit(run, again, max(1, min(steps, max_steps - run.step)))
 
 
 def _fit(run: _Run, estimate: _Estimate, steps: int) -> _Trial:
@@ -307,46 +310,46 @@ def _update_slope(run: _Run, last: _Trial | None, trial: _Trial) -> None:
         run.db_per_doubling = min(max((last.missing - trial.missing) / octaves, low), high)
 
 
-def _count_for_gain(run: _Run, count: int, missing: float, most: int) -> int:
+def _count_for_gain(run: _Run, count: int, missing: float, max_count: int) -> int:
     """Return the number of Gaussians that would gain the missing decibels."""
     octaves = min(max(missing / run.db_per_doubling, -MAX_OCTAVES), MAX_OCTAVES)
-    return min(most, max(1, round(count * 2**octaves)))
+    return min(max_count, max(1, round(count * 2**octaves)))
 
 
-def _polish(run: _Run, trial: _Trial, most: int, steps: int, most_steps: int) -> None:
+def _polish(run: _Run, trial: _Trial, max_count: int, steps: int, max_steps: int) -> None:
     """Drop Gaussians while the set meets the goal, else add some; `run` keeps the best set.
 
-    `most_steps` limits the steps of the search: if `densify` finds few places, it would not end.
+    `max_steps` limits the steps of the search: if `densify` finds few places, it would not end.
     """
     least_growth, rounds, gain = 1.02, 0, POLISH_GAIN
-    while run.step + steps <= most_steps and not run.ended():
-        count, found = len(trial.gaussians), run.best
-        if found.missing <= 0 and rounds >= MAX_POLISHES:
+    while run.step + steps <= max_steps and not run.ended():
+        count, best = len(trial.gaussians), run.best
+        if best.missing <= 0 and rounds >= MAX_POLISHES:
             return
         missing = trial.missing - gain
         if trial.missing <= 0:
             drop = min(max(MAX_DROP, -DROP_PER_DB * trial.missing), LARGEST_DROP)
-            wanted = max(
+            new_count = max(
                 _count_for_gain(run, count, missing, count),
                 math.floor((1 - drop) * count),
             )
-            if wanted == count or -missing < ENOUGH:
+            if new_count == count or -missing < ENOUGH:
                 return
-            changed = prune(trial.gaussians, run.objective.around(trial.gaussians), wanted)
-        elif found.missing <= 0 and len(found.gaussians) <= FAR * count:
+            changed = prune(trial.gaussians, run.objective.around(trial.gaussians), new_count)
+        elif best.missing <= 0 and len(best.gaussians) <= FAR * count:
             # The best number lies between this one and that of the best set; or a polish suffices.
-            wanted = max(
-                count, _count_for_gain(run, count, missing, (count + len(found.gaussians)) // 2)
+            new_count = max(
+                count, _count_for_gain(run, count, missing, (count + len(best.gaussians)) // 2)
             )
-            changed = densify(trial.gaussians, run.objective.around(trial.gaussians), wanted)
+            changed = densify(trial.gaussians, run.objective.around(trial.gaussians), new_count)
         else:
-            wanted = max(
-                _count_for_gain(run, count, missing, most), math.ceil(least_growth * count)
+            new_count = max(
+                _count_for_gain(run, count, missing, max_count), math.ceil(least_growth * count)
             )
             changed = densify(
-                trial.gaussians, run.objective.around(trial.gaussians), min(wanted, most)
+                trial.gaussians, run.objective.around(trial.gaussians), min(new_count, max_count)
             )
-            if len(changed) == count:  # `most` is reached, or no Gaussian would reduce the error
+            if len(changed) == count:  # at `max_count`, or none would reduce the error
                 return
             least_growth = 2 * least_growth - 1
         rounds += 1
@@ -366,9 +369,9 @@ def _trim(run: _Run) -> None:
         return
     too_few = _count_for_gain(run, len(above.gaussians), above.missing, len(above.gaussians))
     for _ in range(TRIMS):
-        wanted = (too_few + len(above.gaussians)) // 2
-        if wanted in (too_few, len(above.gaussians)):
+        new_count = (too_few + len(above.gaussians)) // 2
+        if new_count in (too_few, len(above.gaussians)):
             return
         near = run.objective.around(above.gaussians)
-        trial = run.score(prune(above.gaussians, near, wanted))
-        above, too_few = (trial, too_few) if trial.missing <= 0 else (above, wanted)
+        trial = run.score(prune(above.gaussians, near, new_count))
+        above, too_few = (trial, too_few) if trial.missing <= 0 else (above, new_count)

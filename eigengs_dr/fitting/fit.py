@@ -50,15 +50,15 @@ class Fit:
         The fitted set.
     trace : list of dict
         Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb. A search for the number of
-        Gaussians adds the key gaussians. Maps add the key maps, with both PSNR of each, and with
-        goals the key margin: the decibels above its goal of the map that is farthest from it. Row 0
+        Gaussians adds the key gaussians. Maps add the key maps, with both PSNRs of each, and with
+        goals the key margin: the decibels of the worst map above its goal. Row 0
         shows the set before refinement. Seconds count from the call of `fit`; they include
         placement, upload, the colour solve and the measurements.
         A descent may have more Gaussians than requested until two thirds of its steps are taken,
-        see `eigengs_dr.fitting.control.Surplus`; those sets have no rows. With a weight, the
+        see `eigengs_dr.fitting.control.Surplus`; such sets have no rows. With a weight, the
         squared errors of all PSNRs are weighted, by the mean over the channels.
-        With a loss the key is loss, see `eigengs_dr.Loss.judge`; there are PSNRs too where there is
-        an image. Without an image the first row shows the picture of the texels, and rows with the
+        With a loss the key is loss, see `eigengs_dr.Loss.judge`; with an image there are PSNRs
+        too. Without an image the first row shows the picture of the texels, and rows with the
         key gaussians the numbers that were tried.
         With space "data", psnr_ycbcr is the PSNR of the data, with their range as the peak, or 1
         for codes between 0 and 1; psnr_rgb is that of codes after rounding to 8 bits, and NaN for
@@ -157,7 +157,7 @@ def fit(
     loss: Loss | LossFunction | None = None,
     size: tuple[int, int] | None = None,
 ) -> Fit:
-    """Fit an image, or a loss of your own, by a number of Gaussians or as few as a target needs.
+    """Fit an image, or a loss of your own, with a number of Gaussians or as few as a target needs.
 
     Several maps of one size, such as those of a material, share the means and shapes of one set:
     ``result.gaussians["albedo"]`` is the set of one map.
@@ -172,22 +172,22 @@ def fit(
     gaussians : int or sequence of int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
         images; with a start, the number of its Gaussians; without an image, one for 16 pixels, or
-        as many as the judge of the loss says, see `eigengs_dr.Loss`. Several rising numbers such as
-        ``[5000, 7000, 9000]`` are levels of detail, see `level_counts`: the first Gaussians form
-        the image too, and ``result.gaussians[:n]`` is a level. Inside a level, Gaussians with a
-        larger removal cost come first, so that every prefix forms an image.
+        as many as the judge of the loss finds best, see `eigengs_dr.Loss`. Several rising numbers
+        such as ``[5000, 7000, 9000]`` are levels of detail, see `level_counts`: the first Gaussians
+        form the image too, and ``result.gaussians[:n]`` is a level. Inside a level, Gaussians with
+        a larger removal cost come first, so that every prefix forms an image.
     iterations : int, optional
         Largest number of refinement steps; 0 keeps the colours of the solve.
     target_psnr : float or Goal, optional
         PSNR in dB to reach with as few Gaussians as possible, instead of their number. Each map
-        shall reach it, unless it has a goal of its own. A `Goal` says the space of the PSNR and the
-        largest number of Gaussians too. The search takes up to about twice `iterations` steps, see
+        must reach it, unless it has its own goal. A `Goal` also sets the space of the PSNR and the
+        largest number of Gaussians. The search takes up to about twice `iterations` steps, see
         `eigengs_dr.fitting.fewest`.
     start : Gaussians, Fit, path-like or EigenGS, optional
         Instead of a placement, Gaussians to start from, scaled to the size of the image: the set of
         the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
-        that it makes of the image, which suits many images. The set gets the cutoff of the method.
-        A start that turns out to be useless in the first steps is placed anew.
+        that it makes of the image, on shapes that suit many images. The set gets the cutoff of the
+        method. A start that turns out to be useless in the first steps is placed anew.
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
@@ -215,11 +215,11 @@ def fit(
         A callable is called every 10 steps as ``progress(iteration, iterations, row)`` with the
         last row of the trace, or a row of a set with more Gaussians than requested.
     encoding : {"srgb", "linear"}, optional
-        What the pixels of the image are: sRGB codes, or light as in renderings. By default what the
-        image says (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
+        What the pixels of the image are: sRGB codes, or light as in renderings. By default as the
+        image declares (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
         Data are used as they are.
     loss : callable or Loss, optional
-        What to make small instead of the squared error: ``loss(picture, step) -> number``, any
+        What to minimise instead of the squared error: ``loss(picture, step) -> number``, any
         function of the rendered picture (or the dict of maps) that Dr.Jit differentiates. With an
         image, the image places the Gaussians and gives PSNRs.
     size : (int, int), optional
@@ -241,7 +241,7 @@ def fit(
 
     Notes
     -----
-    On one machine and backend, one seed gives the same result bit for bit.
+    On one machine and backend, equal seeds give bit-identical results.
 
     The factors of the errors of maps that the function finds are one over the root mean square
     error after a first colour solve, so that all maps gain alike in decibels; or with goals, one
@@ -293,10 +293,10 @@ def fit(
         return fit_maps(maps, options, factors, started, progress)
     source = os.path.basename(image) if isinstance(image, (str, os.PathLike)) else ""
     try:
-        [found] = fit_images([image], options, factors, progress)
+        [result] = fit_images([image], options, factors, progress)
     except FitInterrupted as stop:
         raise FitInterrupted(replace(stop.result, source=source)) from None
-    return replace(found, source=source)
+    return replace(result, source=source)
 
 
 def fit_images(
@@ -307,15 +307,16 @@ def fit_images(
 ) -> list[Fit]:
     """Fit an image, or several of one size together; see `fit` for results and errors.
 
-    The results of a batch have the bits of single fits on llvm: sums run in the same order, and no
-    image changes the arithmetic of another. The seconds are an equal share of the whole time.
+    On llvm, the results of a batch are bit-identical to single fits: sums run in the same order,
+    and no image changes the arithmetic of another. The seconds are an equal share of the whole
+    time.
     """
     started, source = time.perf_counter(), options.start
     start = None if source is None else load_start(source, options.backend)
     if isinstance(start, Gaussians):
         one_image(start)
-    wanted = options.space or (set_in(start).space if start is not None else "ycbcr")
-    read = [read_pixels(image, wanted, weight, options.encoding) for image in images]
+    requested = options.space or (set_in(start).space if start is not None else "ycbcr")
+    read = [read_pixels(image, requested, weight, options.encoding) for image in images]
     pixels, space = [p for p, _ in read], read[0][1]
     height, width, channels = pixels[0].shape
     options.check_image(width, height, channels)
@@ -325,8 +326,8 @@ def fit_images(
     types, mean_image = types_for(start, options.backend), None
     with defer_interrupts() as interrupted:
         data = [data_of(p, space, weight) for p in pixels]
-        shown = picture(types, space, pixels, data, weight)
-        objective = replace(Pixels.of(data, space, types), pictures=(shown,))
+        display = picture(types, space, pixels, data, weight)
+        objective = replace(Pixels.of(data, space, types), pictures=(display,))
         begun = None
         if start is not None:
             if isinstance(start, Gaussians):
@@ -354,11 +355,11 @@ def fit_images(
             ]
 
         figure = target_key(space, options.goal.space) if options.goal else "margin"
-        found, seconds_init = _refined(
+        refinements, seconds_init = _refined(
             objective, options, begun, score, figure, started, progress, interrupted
         )
     affines = [d.affine for d in data]
-    return _finished(found, affines, mean_image, started, seconds_init)
+    return _finished(refinements, affines, mean_image, started, seconds_init)
 
 
 def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any) -> None:
@@ -368,8 +369,8 @@ def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any) -> None:
             "fit needs an image, or a loss and the size of its picture: "
             "fit(loss=f, size=(width, height))"
         )
-    if np.shape(size) != (2,):
-        raise ValueError(f"size is {size!r}; give (width, height)")
+    if np.shape(size) != (2,) or np.asarray(size).dtype.kind not in "iu":
+        raise ValueError(f"size is {size!r}; give (width, height) in whole pixels")
     if target_psnr is not None or np.ndim(gaussians) > 0:
         raise ValueError(
             "without an image there is no PSNR and there are no levels; give the loss a target"
@@ -406,9 +407,11 @@ def fit_loss(
         start = replace(start.scaled(width, height), cutoff=cutoff, maps=()).bounded()
     with defer_interrupts() as interrupted:
         problem = Problem(options.loss, size, views, types_for(start, options.backend), weight)
-        found, seconds_init = refine_loss(problem, options, start, started, progress, interrupted)
-    found = replace(found, gaussians=replace(found.gaussians, maps=maps))
-    [result] = _finished([found], [Affine()], None, started, seconds_init)
+        refinement, seconds_init = refine_loss(
+            problem, options, start, started, progress, interrupted
+        )
+    refinement = replace(refinement, gaussians=replace(refinement.gaussians, maps=maps))
+    [result] = _finished([refinement], [Affine()], None, started, seconds_init)
     return result
 
 
@@ -419,7 +422,7 @@ def fit_maps(
     started: float,
     progress: FitProgress | None = None,
 ) -> Fit:
-    """Fit maps from `read_maps` by one set; see `fit` for results and errors."""
+    """Fit maps from `read_maps` with one set; see `fit` for results and errors."""
     height, width = images[0].pixels.shape[:2]
     channels, types = sum(i.pixels.shape[2] for i in images), types_for(None, options.backend)
     options.check_image(width, height, channels)
@@ -440,17 +443,19 @@ def fit_maps(
             seconds = time.perf_counter() - started
             return [{"seconds": seconds, **objective.judged(gaussians), **row}]
 
-        [found], seconds_init = _refined(
+        [refinement], seconds_init = _refined(
             objective, options, None, score, "margin", started, progress, interrupted
         )
     maps = tuple(image.map(factor) for image, factor in zip(images, factors, strict=True))
-    whole = scale_channels(found.gaussians, [1 / w for w in channel_weights(maps)])
+    whole = scale_channels(refinement.gaussians, [1 / w for w in channel_weights(maps)])
     offsets = [i.data.affine.offset for i in images for _ in range(i.pixels.shape[2])]
     background = type(whole.background)(
         [row + float(b) for row, b in zip(whole.background, offsets, strict=True)]
     )
     named = replace(whole, background=background, maps=maps)
-    [result] = _finished([replace(found, gaussians=named)], [Affine()], None, started, seconds_init)
+    [result] = _finished(
+        [replace(refinement, gaussians=named)], [Affine()], None, started, seconds_init
+    )
     return result
 
 
@@ -464,10 +469,10 @@ def _refined(
     progress: FitProgress | None,
     interrupted: Callable[[], bool],
 ) -> tuple[list[Refinement], float]:
-    """Fit an objective as the options say: by a given number, in levels, or by the fewest.
+    """Fit an objective as the options say: with a given number, in levels, or with the fewest.
 
-    `figure` is the key of the rows of `score` that a goal means. Return the seconds before
-    refinement too.
+    `figure` is the key in the rows of `score` to which a goal refers. Also return the seconds
+    before refinement.
     """
     method, iterations, key = options.method, options.iterations, options.seed
     (width, height), channels = objective.size, objective.channels
@@ -484,21 +489,21 @@ def _refined(
         begun = method.place_and_solve(objective, count, key)
     seconds_init = (time.perf_counter() - started) / objective.grid.images
     if options.searches:
-        most = options.most_for(width * height, channels)
+        max_count = options.max_count_for(width * height, channels)
         goal = options.goal.psnr if options.goal and figure != "margin" else 0.0
-        found = fewest(
+        refinement = fewest(
             objective,
             method,
             begun,
             score,
             (figure, goal),
-            most,
+            max_count,
             iterations,
             key,
             progress,
             interrupted,
         )
-        return [found], seconds_init
+        return [refinement], seconds_init
     state = begin(begun, objective.grid.images, chosen)
     refined = refine(objective, method, state, iterations, score, key, progress, interrupted)
     if counts:
@@ -508,7 +513,7 @@ def _refined(
 
 
 def _finished(
-    found: Sequence[Refinement],
+    refinements: Sequence[Refinement],
     affines: Sequence[Affine],
     mean_image: NDArray[np.float32] | None,
     started: float,
@@ -522,7 +527,7 @@ def _finished(
         If the refinement of a single image was interrupted.
     """
     results = []
-    for one, gaussians, affine in zip(found, sets_of(found), affines, strict=True):
+    for one, gaussians, affine in zip(refinements, sets_of(refinements), affines, strict=True):
         whole = restored(gaussians, affine)
         rendered = picture_of(whole)
         results.append(
@@ -541,8 +546,8 @@ def _finished(
                 maps=one.row.get("maps", {}),
             )
         )
-    seconds = (time.perf_counter() - started) / len(found)
+    seconds = (time.perf_counter() - started) / len(refinements)
     results = [replace(result, seconds=seconds) for result in results]
-    if found[0].stopped == "interrupted":
+    if refinements[0].stopped == "interrupted":
         raise FitInterrupted(results[0])
     return results

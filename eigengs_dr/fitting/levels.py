@@ -1,6 +1,6 @@
 """Levels of detail: one set whose first N Gaussians already form the image, for several N.
 
-Placement adds one level after the other, with more Gaussians where the residual of the earlier
+Placement adds one level after another, with more Gaussians where the residual of the earlier
 levels has larger second derivatives. Refinement then moves all levels together and minimises the
 sum of the logarithms of their squared errors. In its first two thirds, Gaussians of little use
 relocate inside of their levels. Sorting the Gaussians of a plain fit by their removal cost does not
@@ -24,7 +24,7 @@ from .method import Method
 from .objective import Pixels
 
 STEPS_PER_LEVEL = 50
-"""Most refinement steps between the placements of two levels."""
+"""Largest number of refinement steps between the placements of two levels."""
 
 
 def place_levels(
@@ -35,17 +35,17 @@ def place_levels(
     key: int,
     interrupted: Callable[[], bool],
 ) -> Gaussians:
-    """Place nested sets: each level by the error after some steps of the earlier ones.
+    """Place nested sets: each level by the error after some steps of the earlier levels.
 
     Parameters
     ----------
     objective : Pixels
-        Without levels.
+        An objective without levels.
     method : Method
     counts : sequence of int
         Numbers of Gaussians up to each level.
     iterations : int
-        Steps of the refinement that follows; placement takes at most `STEPS_PER_LEVEL` a level.
+        Steps of the refinement that follows; placement takes at most `STEPS_PER_LEVEL` per level.
     key, interrupted
         See `eigengs_dr.fitting.loop.refine`.
     """
@@ -60,7 +60,7 @@ def place_levels(
                     break
         gaussians = dr.detach(gaussians)
         added = method.place_and_solve(objective.minus(gaussians), count - len(gaussians), key)
-        # The background is one for all levels: a new one would change the earlier levels.
+        # All levels share the background: a new one would change the earlier levels.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
     return gaussians
 
@@ -70,7 +70,7 @@ def sort_levels(gaussians: Gaussians, objective: Pixels, counts: Sequence[int]) 
     order, before = [], 0
     for count in counts:
         value = removal_cost(gaussians[:count], objective)
-        own = np.arange(before, count)
-        order.append(own[np.argsort(-value[own], kind="stable")])
+        indices = np.arange(before, count)
+        order.append(indices[np.argsort(-value[indices], kind="stable")])
         before = count
     return gaussians[np.concatenate(order)]

@@ -37,7 +37,7 @@ def descend(
     state : State
         See `begin`.
     iterations : int
-        Number of steps of the whole descent, by which rates fall and controls act.
+        Number of steps of the whole descent, which sets rates and controls.
     key : int, optional
         All random numbers depend on it and on the step.
     part : range, optional
@@ -157,7 +157,7 @@ class Best:
     ----------
     objective : Pixels
     state : State
-        Before the first step.
+        The state before the first step.
     iterations : int
     score : Score
     progress : callable, optional
@@ -173,7 +173,7 @@ class Best:
         progress: FitProgress | None = None,
     ) -> None:
         self.objective = objective
-        self.found = [Refinement(state.gaussians) for _ in range(objective.grid.images)]
+        self.refinements = [Refinement(state.gaussians) for _ in range(objective.grid.images)]
         self.iterations, self.score, self.progress = iterations, score, progress
         self.marks, self.step, self.state = trace_steps(iterations), 0, state
         self.row = Row()
@@ -187,36 +187,36 @@ class Best:
         if self.progress and (step in self.marks or step % 10 == 0):
             dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
             self.progress(step, self.iterations, self.row)
-        return all(one.stopped == "exact" for one in self.found)
+        return all(one.stopped == "exact" for one in self.refinements)
 
     def judge(self, step: int, gaussians: Gaussians) -> None:
-        """Measure a set. One with more Gaussians than requested does not compare."""
+        """Measure a set. A set with more Gaussians than requested is not compared."""
         rows = self.score(gaussians)
         self.row = {"iteration": step, **rows[0]}
-        if len(gaussians) > len(self.found) * self.state.count:
+        if len(gaussians) > len(self.refinements) * self.state.count:
             figure = self.objective.merit(self.row)
             if self.larger is None or figure > self.larger[0]:
                 self.larger = figure, step, gaussians
             return
         self.larger = None
-        self.found = [
+        self.refinements = [
             one
             if one.stopped == "exact"
             else one.judged(gaussians, {"iteration": step, **row}, self.objective)
-            for one, row in zip(self.found, rows, strict=True)
+            for one, row in zip(self.refinements, rows, strict=True)
         ]
 
     def end_early(self) -> None:
         """Measure the best set with a surplus, and that of the last step, both without it."""
-        if len(self.found) > 1:
+        if len(self.refinements) > 1:
             raise KeyboardInterrupt
         larger = [self.larger] if self.larger else []
         for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
-            if step not in [row["iteration"] for row in self.found[0].trace]:
+            if step not in [row["iteration"] for row in self.refinements[0].trace]:
                 near = self.objective.around(gaussians)
                 self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
-        self.found = [
-            replace(one, stopped="interrupted", iterations=self.step) for one in self.found
+        self.refinements = [
+            replace(one, stopped="interrupted", iterations=self.step) for one in self.refinements
         ]
 
 
@@ -275,9 +275,9 @@ def refine(
         stopped = True
     if stopped:
         best.end_early()
-    batches = {id(one.gaussians): one.gaussians for one in best.found}
+    batches = {id(one.gaussians): one.gaussians for one in best.refinements}
     detached = {name: dr.detach(batch) for name, batch in batches.items()}
-    return [replace(one, gaussians=detached[id(one.gaussians)]) for one in best.found]
+    return [replace(one, gaussians=detached[id(one.gaussians)]) for one in best.refinements]
 
 
 def trace_steps(iterations: int) -> set[int]:
@@ -298,8 +298,8 @@ def split(batch: Gaussians) -> list[Gaussians]:
     return [like(batch, *arrays) for arrays in zip(*parts, backgrounds, strict=True)]
 
 
-def sets_of(found: Sequence[Refinement]) -> list[Gaussians]:
+def sets_of(refinements: Sequence[Refinement]) -> list[Gaussians]:
     """Return the best set of each image of a batch."""
-    batches = {id(one.gaussians): one.gaussians for one in found}
+    batches = {id(one.gaussians): one.gaussians for one in refinements}
     sets = {name: split(batch) for name, batch in batches.items()}
-    return [sets[id(one.gaussians)][k] for k, one in enumerate(found)]
+    return [sets[id(one.gaussians)][k] for k, one in enumerate(refinements)]

@@ -1,8 +1,8 @@
 """A loss of the user's own as an objective: any function of the picture that Dr.Jit differentiates.
 
-A step draws the picture as `eigengs_dr.render` does, asks the function for its derivative by it,
-and hands that to the adjoint. Between steps, the controls see a quadratic model of the loss, as
-they see the squared error of an image.
+A step draws the picture as `eigengs_dr.render` does, differentiates the function with respect to
+it, and passes the derivative to the adjoint. Between steps, the controls see a quadratic model of
+the loss, just as they see the squared error of an image.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from inspect import signature
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import drjit as dr
@@ -37,7 +38,7 @@ LossFunction: TypeAlias = Callable[[Any, int], Any]
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """What a fit makes small, if it is not the squared error of an image.
+    """What a fit minimises, if it is not the squared error of an image.
 
     Attributes
     ----------
@@ -50,21 +51,23 @@ class Loss:
         Smallest and largest value of the picture, such as ``(0, 1)``: the function sees the picture
         clipped, and sums outside are pulled back.
     parameters : optimiser, optional
-        An optimiser of your own, such as a ``drjit.opt.Adam``, that steps along: the derivatives by
-        its parameters are taken too, and then its ``step()`` is called.
+        Your own optimiser, such as a ``drjit.opt.Adam``, that steps along: the derivatives by its
+        parameters are computed too, and then its ``step()`` is called.
     judge : callable, optional
-        ``judge(picture) -> number``: what the rows of the trace measure and the best set has least
-        of, such as the error in photos that the function does not see. By default
+        ``judge(picture) -> number``: what the rows of the trace measure and the best set minimises,
+        such as the error in photos that the function does not see. By default
         ``function(picture, 0)``.
     target : float, optional
         Value to reach with as few Gaussians as possible, instead of their number.
     space : str or mapping of str to str, optional
-        Space of the sums without an image, if `eigengs_dr.fit` gets none.
+        Space of the sums without an image, if `eigengs_dr.fit` is given none.
 
     Raises
     ------
     ValueError
         If the bounds do not rise, or the target is not above 0.
+    TypeError
+        If the function or the judge takes other arguments, or the parameters are no optimiser.
 
     Examples
     --------
@@ -86,8 +89,15 @@ class Loss:
     space: str | Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.function, Loss):
+            raise TypeError(
+                "Loss: the function is a Loss; change one by dataclasses.replace(loss, bounds=...)"
+            )
         if not callable(self.function):
             raise TypeError(f"Loss: {self.function!r} is no function of (picture, step)")
+        _check_arguments("function", self.function, "picture, step")
+        if self.judge is not None:
+            _check_arguments("judge", self.judge, "picture")
         if self.parameters is not None and not hasattr(self.parameters, "step"):
             raise TypeError(
                 f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser, such "
@@ -99,13 +109,28 @@ class Loss:
             raise ValueError(f"Loss: target is {self.target}; it must be finite and above 0")
 
 
+def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:
+    """Raise `TypeError` if a function of the user cannot be called with some arguments."""
+    try:
+        takes = signature(function)
+    except (TypeError, ValueError):  # of a function in C, which has none
+        return
+    try:
+        takes.bind(*arguments.split(", "))
+    except TypeError:
+        called = getattr(function, "__name__", type(function).__name__)
+        raise TypeError(
+            f"Loss: the {name} {called}{takes} is called with ({arguments}); let it take these"
+        ) from None
+
+
 class View(NamedTuple):
     """What some channels of a set show.
 
     Attributes
     ----------
     name : str
-        Of the map, "" without maps.
+        Name of the map, "" without maps.
     space : str
         Space of the channels, one of `eigengs_dr.image.color.SPACES`.
     channels : range
@@ -124,7 +149,7 @@ class View(NamedTuple):
 def show(views: Sequence[View], sums: Float, channels: int) -> list[Float]:
     """Return the pictures of sums, all as rows of pixels; differentiable.
 
-    Cost: a gather for each channel; none for one picture of sums as they are.
+    Cost: a gather for each channel; none for a single picture of unchanged sums.
     """
     types, pictures = types_of(sums), []
     first = dr.arange(types.UInt, dr.width(sums) // channels) * channels
@@ -150,21 +175,40 @@ AS_THEY_ARE = ("rgb", "linear", "radiance", "data")
 
 @dataclass
 class Calls:
-    """How often a loss was asked for its derivative, and what it has answered since `check`."""
+    """The number of calls of a loss for its derivative, and its values since `check`.
+
+    `broken` is the last step that `check_slopes` looked at, if its derivative was not finite.
+    """
 
     step: int = 0
     checked: int = 0
     total: Any = 0.0
+    broken: int | None = None
 
-    def add(self, value: Any) -> None:
+    def add(self, value: Any, slopes: Sequence[Float]) -> None:
         """Count a call; the first value is checked at once."""
         self.step, self.total = self.step + 1, self.total + value
         dr.schedule(self.total)
         if self.step == 1 or self.step - self.checked >= CHECK_EVERY:
             self.check()
+        if self.step % CHECK_EVERY == 1:
+            self.check_slopes(slopes)
+
+    def check_slopes(self, slopes: Sequence[Float]) -> None:
+        """Raise ValueError if derivatives are not finite, as they were not at the last check.
+
+        The descent recovers from one such step, as of a noisy rendering, and not from all.
+        """
+        step, before = self.step - 1, self.broken
+        self.broken = step if not all(bool(dr.all(dr.isfinite(s))) for s in slopes) else None
+        if self.broken is not None and before is not None:
+            raise ValueError(
+                f"loss: its value is finite, but not its derivative at steps {before} and {step}; "
+                "dr.sqrt has none at 0: take dr.sqrt(x + 1e-8)"
+            )
 
     def check(self) -> None:
-        """Raise ValueError if a value has not been finite."""
+        """Raise ValueError if a value was not finite."""
         if self.step == self.checked:
             return
         total = float(np.asarray(dr.slice(self.total)).reshape(-1)[0])
@@ -175,22 +219,22 @@ class Calls:
 
 
 CHECK_EVERY = 10
-"""Calls after which the values are read back; each reading waits for the device."""
+"""Calls after which the values are read back; each read waits for the device."""
 
 
 TINY = 1e-30
-"""Smallest loss whose logarithm counts."""
+"""Lower bound of a loss before its logarithm."""
 
 NO_ERROR = 1e-20
-"""Squared error of a tile that counts as none."""
+"""Squared error of a tile up to which it counts as zero."""
 
 FLAT = 0.02
-"""Secant of a tile, relative to that of all tiles, below which the loss does not depend on it."""
+"""Secant of a tile, relative to all tiles, below which the loss counts as independent of it."""
 
 LITTLE = 0.1
-"""Squared error of a tile, relative to the mean, that says as much as the secants of all tiles. For
-L1 + 0.2 (1 - SSIM), 1,000 steps and 8 training photos, 0.01 ends with a loss 0 to 1 % lower, and a
-PSNR 0.13 dB lower."""
+"""Squared error of a tile, relative to the mean, at which its secant weighs as much as that of all.
+For L1 + 0.2 (1 - SSIM), 1,000 steps and 8 training photos, 0.01 ends with a loss 0 to 1 % lower,
+and a PSNR 0.13 dB lower."""
 
 PULL = 10.0
 """How strongly sums outside the bounds are pulled back: a tenth of the range outside weighs as much
@@ -199,7 +243,7 @@ as the root mean square of the derivative."""
 
 @dataclass(frozen=True)
 class LossObjective(Pixels):
-    """The loss of a user for a picture, or for several maps as the channels of one.
+    """The loss of a user for a picture, or for several maps as channels of one picture.
 
     Attributes
     ----------
@@ -214,7 +258,7 @@ class LossObjective(Pixels):
 
     @classmethod
     def of_loss(cls, loss: Loss, views: Sequence[View], base: Pixels) -> LossObjective:
-        """Return the objective of a loss near an image: that of the user, or a first guess."""
+        """Return the objective of a loss near an image: the user's image, or a first guess."""
         return cls(**vars(base), loss=loss, views=tuple(views))
 
     @contextmanager
@@ -225,18 +269,20 @@ class LossObjective(Pixels):
             def model_at(state: State) -> Slope:
                 assert state.moving is not None and state.fixed is not None
                 radius, background = kernel_radius(state.fixed.cutoff), state.fixed.background
-                sums, shown = draw(state.moving.packed, list(background), state.lists[-1], radius)
-                return Slope(to_slope(sums, self.step(shown)))
+                sums, pictures = draw(
+                    state.moving.packed, list(background), state.lists[-1], radius
+                )
+                return Slope(to_slope(sums, self.step(pictures)))
 
             yield model_at
 
-    def step(self, shown: Sequence[Float]) -> list[Float]:
-        """Return the derivatives by the pictures of a step; parameters of the user take theirs."""
+    def step(self, pictures: Sequence[Float]) -> list[Float]:
+        """Return the derivatives by the pictures of a step; parameters of the user get theirs."""
         parameters = self.loss.parameters
-        value, slopes = self.derivative(shown, parameters)
+        value, slopes = self.derivative(pictures, parameters)
         if parameters is not None:
             parameters.step()
-        self.calls.add(value)
+        self.calls.add(value, slopes)
         return slopes
 
     def draw(
@@ -248,7 +294,7 @@ class LossObjective(Pixels):
         return sums, self.seen(to_tensor(sums, self.grid, self.channels).array)
 
     def draw_set(self, gaussians: Gaussians) -> tuple[Float, list[Float]]:
-        """Return the sums of a set and what the loss sees, see `draw`; with new tile lists."""
+        """Return the sums of a set and the pictures of the loss, see `draw`, by new lists."""
         lists = bin_gaussians(gaussians, adjoint=False)
         packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
@@ -257,10 +303,10 @@ class LossObjective(Pixels):
 
     def seen(self, sums: Float) -> list[Float]:
         """Return the pictures that the loss sees of sums, both as rows of pixels."""
-        shown = show(self.views, sums, self.channels)
+        pictures = show(self.views, sums, self.channels)
         if self.loss.bounds is None:
-            return shown
-        return [dr.clip(picture, *self.loss.bounds) for picture in shown]
+            return pictures
+        return [dr.clip(picture, *self.loss.bounds) for picture in pictures]
 
     def to_slope(self, sums: Float, slopes: list[Float]) -> Float:
         """Return the derivative by sums in tile layout, see `Slope`, from those by the pictures."""
@@ -273,15 +319,15 @@ class LossObjective(Pixels):
             traced = type(sums)(sums)
             dr.enable_grad(traced)
             rows = to_tensor(traced, self.grid, self.channels).array if in_tiles else traced
-            shown = show(self.views, rows, self.channels)
-            for picture, slope in zip(shown, slopes, strict=True):
+            pictures = show(self.views, rows, self.channels)
+            for picture, slope in zip(pictures, slopes, strict=True):
                 dr.set_grad(picture, self._bounded(dr.detach(picture), slope))
-            dr.enqueue(dr.ADMode.Backward, shown)
+            dr.enqueue(dr.ADMode.Backward, pictures)
             dr.traverse(dr.ADMode.Backward)
             return dr.grad(traced)
 
     def _bounded(self, picture: Float, slope: Float) -> Float:
-        """Return a derivative by a picture that pulls values into the bounds, and none out."""
+        """Return a derivative by a picture that pulls values into the bounds, never out of them."""
         if self.loss.bounds is None:
             return slope
         low, high = self.loss.bounds
@@ -291,15 +337,15 @@ class LossObjective(Pixels):
         return dr.fma(pull, excess, inwards)
 
     def derivative(
-        self, shown: Sequence[Float], parameters: Any = None
+        self, pictures: Sequence[Float], parameters: Any = None
     ) -> tuple[Float, list[Float]]:
         """Return the value of the loss, and its derivatives by the pictures.
 
-        Those by parameters of the user stay in these; no other array gets any. The function may
-        render: if the collector freed another scene meanwhile, the process might end.
+        Derivatives by parameters of the user stay in the parameters; no other array gets any. The
+        function may render: if the collector freed another scene meanwhile, the process might end.
         """
         with dr.resume_grad(), collector_off():
-            leaves = [self._tensor(k, rows) for k, rows in enumerate(shown)]
+            leaves = [self._tensor(k, rows) for k, rows in enumerate(pictures)]
             dr.enable_grad(leaves)
             value = self._number(self.loss.function(self._named(leaves), self.calls.step))
             if not dr.grad_enabled(value):
@@ -323,9 +369,9 @@ class LossObjective(Pixels):
         return {"loss": loss, "margin": 10 * math.log10(self.loss.target / max(loss, TINY))}
 
     def merit(self, row: Record) -> float:
-        """Return the number of a row of which the best set has most: less of its loss.
+        """Return the figure of a row that is largest for the best set: minus its loss.
 
-        The last set is the best where losses do not compare: with parameters, which are those of
+        The last set is the best if losses are not comparable: with parameters, which are those of
         the last step; or with neither an image nor a judge, where steps may see other cameras.
         """
         compares = self.loss.judge is not None or bool(self.pictures)
@@ -333,10 +379,10 @@ class LossObjective(Pixels):
             return float(row["iteration"])
         return -float(row["loss"])
 
-    def judge(self, shown: Sequence[Float]) -> float:
+    def judge(self, pictures: Sequence[Float]) -> float:
         """Return the value by which pictures, as rows of pixels, are compared."""
         with dr.suspend_grad():
-            picture = self._named([self._tensor(k, rows) for k, rows in enumerate(shown)])
+            picture = self._named([self._tensor(k, rows) for k, rows in enumerate(pictures)])
             judge = self.loss.judge
             value = self.loss.function(picture, 0) if judge is None else judge(picture)
             number = float(np.asarray(self._number(value)).reshape(-1)[0])
@@ -379,7 +425,7 @@ class LossObjective(Pixels):
     def around(self, gaussians: Gaussians) -> Pixels:
         """Return the squared error of the image, weighed as the loss weighs it near a set.
 
-        The loss L has the derivative g at the picture p, and next to none at the image t: the
+        The loss L has the derivative g at the picture p, and almost none at the image t: the
         secant ``h = sum g (p - t) / sum (p - t)^2`` of each tile is its curvature in between. For
         the squared error it is exact, for an absolute error it is one over its mean. It is in units
         of the usual secant: the mean, weighed by ``g (p - t)``. Tiles with little error take that,
@@ -387,8 +433,8 @@ class LossObjective(Pixels):
         """
         grid, target = self.grid, self.model.target
         assert target is not None
-        sums, shown = self.draw_set(gaussians)
-        slope = self.pull_back(sums, self.derivative(shown)[1], in_tiles=True)
+        sums, pictures = self.draw_set(gaussians)
+        slope = self.pull_back(sums, self.derivative(pictures)[1], in_tiles=True)
         block, inside = grid.pixels * self.channels, pixels_inside(self.types, grid)
         each = dr.arange(self.types.UInt, dr.width(sums)) // self.channels
         error = (sums - target) * dr.gather(self.types.Float, inside, each)

@@ -35,7 +35,7 @@ MIN_MSE = (1 / 255) ** 2 / 12
 
 @dataclass(frozen=True)
 class Map:
-    """A map of a mapping of images, if it needs more than its pixels.
+    """A map in a mapping of images that needs more than pixels.
 
     Attributes
     ----------
@@ -44,9 +44,9 @@ class Map:
         By default "linear" for albedo, color and the like, "normal" for normals, and "data" for
         other names, see `eigengs_dr.gaussian.channels.usual_space`.
     weight : float
-        Factor of its errors, above 0. It multiplies the one that `eigengs_dr.fit` finds.
+        Factor of its errors, above 0. It multiplies the factor that `eigengs_dr.fit` finds.
     goal : float or None
-        The PSNR in dB that it shall reach; by default that of the fit.
+        The PSNR in dB that it must reach; by default that of the fit.
     """
 
     image: Any
@@ -66,11 +66,11 @@ class MapImage(NamedTuple):
     pixels : ndarray of float32, shape (H, W, C)
         sRGB, normals or data.
     data : Data
-        The same as it would be fitted alone.
+        The image as it would be fitted alone.
     factor : float
         The user's factor of its errors.
     goal : float or None
-        The PSNR in dB that it shall reach.
+        The PSNR in dB that it must reach.
     """
 
     name: str
@@ -100,8 +100,8 @@ def read_maps(
     images = [_read_map(name, m, goal, weight, encoding) for name, m in given.items()]
     sizes = {image.name: f"{image.pixels.shape[1]}x{image.pixels.shape[0]}" for image in images}
     if len(set(sizes.values())) > 1:
-        shown = ", ".join(f"{name} {size}" for name, size in sizes.items())
-        raise ImageError(f"maps differ in size: {shown}; scale them to one size")
+        listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        raise ImageError(f"maps differ in size: {listed}; scale them to one size")
     described = [image.map(1) for image in images]
     try:
         check_maps(described, sum(m.channels for m in described))
@@ -137,7 +137,7 @@ def _read_map(
 
 
 def _without_copies(pixels: Image) -> Image:
-    """Return one channel of data whose three are equal: JPEG files of grey often have three."""
+    """Reduce data with three equal channels to one: grey JPEG files often have three."""
     first = pixels[..., :1]
     if pixels.shape[2] == 3 and (pixels == first).all():
         return np.ascontiguousarray(first)
@@ -156,15 +156,15 @@ def combine(
     """
     parts = [image.data for image in images]
     values = _join([d.values for d in parts], factors)
-    shown = _join([d.shown for d in parts], factors)
+    placement_images = _join([d.placement_image for d in parts], factors)
     curvature = weight
     if any(d.curvature is not None for d in parts):
         layers = [np.ones_like(d.values) if d.curvature is None else d.curvature for d in parts]
         curvature = np.concatenate(layers, axis=2)
         if weight is not None:
             curvature *= np.atleast_3d(weight)
-    objective = Pixels.of(Data(values, shown, curvature), "data", types)
-    firsts = [own.start for own in slices([image.map(1) for image in images])]
+    objective = Pixels.of(Data(values, placement_images, curvature), "data", types)
+    firsts = [channels.start for channels in slices([image.map(1) for image in images])]
     pictures = [
         picture(types, image.space, [image.pixels], [image.data], weight, first, factor)
         for image, first, factor in zip(images, firsts, factors, strict=True)
@@ -173,11 +173,11 @@ def combine(
 
 
 def views_of(images: Sequence[MapImage], factors: Sequence[float]) -> list[View]:
-    """Return what the channels of `combine` show."""
+    """Return the views of the channels of `combine`."""
     maps = [image.map(1) for image in images]
     return [
-        View(m.name, m.space, range(own.start, own.stop), a.scale / factor, a.offset)
-        for m, own, a, factor in zip(
+        View(m.name, m.space, range(channels.start, channels.stop), a.scale / factor, a.offset)
+        for m, channels, a, factor in zip(
             maps, slices(maps), (image.data.affine for image in images), factors, strict=True
         )
     ]
@@ -239,13 +239,13 @@ def _first_errors(
 def score_maps(
     gaussians: Gaussians, objective: Pixels, images: Sequence[MapImage], space: str = "rgb"
 ) -> Row:
-    """Measure a set of all channels, each times the factor of its map.
+    """Measure a set of all channels, each multiplied by the factor of its map.
 
     Returns
     -------
     dict
         psnr_ycbcr and psnr_rgb, means over the maps that have them; maps, with both of each map;
-        and with goals, margin: how far the map that is farthest from its goal is above it, in dB.
+        and with goals, margin: the decibels of the worst map above its goal.
     """
     figures = psnrs(gaussians, objective.pictures)[..., 0]
     by_name = {

@@ -1,7 +1,7 @@
 """The rows of a trace: PSNRs of a set of Gaussians, from sums in one kernel.
 
-A lane converts some pixels of a rendering to what people look at, and compares them with the image.
-A few bytes go to the host.
+A lane converts some pixels of a rendering to display values (sRGB), and compares them with the
+image. Only a few bytes go to the host.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Row: TypeAlias = Record
 
 
 def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float64]:
-    """Compute the PSNRs of a set, as `eigengs_dr.psnr` does of its picture.
+    """Compute the PSNRs of a set, as `eigengs_dr.psnr` does for its picture.
 
     Cost: tile lists, and a rendering.
 
@@ -76,9 +76,9 @@ def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float
         dr.eval(sums)
     *squares, areas = np.split(np.array([s.numpy() for s in sums]), 3, axis=0)
     mse = np.stack(squares, axis=1) / areas[:, None]
-    found: NDArray[np.float64] = np.vectorize(psnr_from_mse)(mse)
-    found[[not p.has_codes for p in pictures], 1] = np.nan
-    return found
+    decibels: NDArray[np.float64] = np.vectorize(psnr_from_mse)(mse)
+    decibels[[not p.has_codes for p in pictures], 1] = np.nan
+    return decibels
 
 
 @record
@@ -114,15 +114,15 @@ def _squared_errors(
         for k, seen in enumerate(read(image)):
             sums = pixels[k][first : first + len(seen)]
             if rendered_as(space) is None and space != "normal":
-                # Differences of the values as they are fitted keep their digits.
+                # Differences of the fitted values keep their digits.
                 error = sum(dr.square((s - v) * a) for s, v in zip(sums, seen, strict=True))
-                shown, seen = ([dr.fma(v, a, b) for v in pixel] for pixel in (sums, seen))
+                rendering, seen = ([dr.fma(v, a, b) for v in pixel] for pixel in (sums, seen))
             else:
-                shown = show(space, [dr.fma(s, a, b) for s in sums], light)
+                rendering = show(space, [dr.fma(s, a, b) for s in sums], light)
                 if bases is not None:
-                    shown = [s + v for s, v in zip(shown, bases[k], strict=True)]
-                error = squared_difference(shown, seen, float_space(space))
-            errors = error, squared_difference(shown, seen, "rgb"), types.Float(len(seen))
+                    rendering = [s + v for s, v in zip(rendering, bases[k], strict=True)]
+                error = squared_difference(rendering, seen, float_space(space))
+            errors = error, squared_difference(rendering, seen, "rgb"), types.Float(len(seen))
             f = factors[k][0]
             totals = [t + dr.select(f > 0, e * f, 0) for t, e in zip(totals, errors, strict=True)]
         Double = dr.float64_array_t(types.Float)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Control(Protocol):
-    """What changes the Gaussians between steps of a descent: they are added, moved, or leave."""
+    """A change of the Gaussians between steps of a descent: it adds, moves or removes some."""
 
     def steps(self, iterations: int) -> Collection[int]:
         """Return the steps of a descent before which the control acts."""
@@ -41,7 +41,7 @@ class Control(Protocol):
 
 @runtime_checkable
 class Model(Protocol):
-    """What makes a set of an image at once, as `eigengs_dr.EigenGS` does."""
+    """Makes a set from an image at once, as `eigengs_dr.EigenGS` does."""
 
     @property
     def gaussians(self) -> Gaussians:
@@ -53,7 +53,7 @@ class Model(Protocol):
         """Return the set of an image at the size of the image."""
 
     def dense_mean(self, width: int, height: int) -> NDArray[np.float32]:
-        """Return the pixels (height, width, C) that a set of the mean "dense" lacks."""
+        """Return the pixels (height, width, C) that a set lacks if the mean is "dense"."""
 
 
 Kind = TypeVar("Kind")
@@ -66,7 +66,7 @@ class Method:
     Attributes
     ----------
     place : Placement
-        Where Gaussians start that have no other start.
+        Where Gaussians start without a given start.
     controls : tuple of Control
         What adds, moves and removes Gaussians, in this order.
     optimizer : Optimizer
@@ -75,7 +75,7 @@ class Method:
         and factor are relative to the size of the Gaussian, and the unit of color is white, or the
         range of data.
     coordinates : Coordinates
-        The variables.
+        The variables that steps move.
     warm_up : int
         Steps over which the rates rise after each start of the optimiser: at the first step, and
         after a control has changed Gaussians. The moments start at 0 there, and the first steps of
@@ -152,7 +152,7 @@ class Method:
     def rate_factors(self, iterations: int, chosen: bool = False) -> list[float]:
         """Return the factors of the learning rates at all steps: half a cosine down to `decay`.
 
-        The steps before a redistribution have a cosine of their own, which gains 0.03 to 0.1 dB;
+        The steps before a redistribution have their own cosine, which gains 0.03 to 0.1 dB;
         but not if the user chose the Gaussians, which then mostly stay.
         """
         first, factors = 0 if chosen else self.first_phase(iterations), []
@@ -184,9 +184,9 @@ class Method:
         return placed if self.place.has_colors else solve(placed, objective, self.solve_steps)
 
     def start_from(self, objective: Pixels, gaussians: Gaussians) -> Gaussians:
-        """Return a set with better colours for the image: the solve goes on from its own.
+        """Return a set with better colours for the image: the solve starts from its colours.
 
-        A method whose placement has colours solves for none here either.
+        A method whose placement has colours skips the solve here too.
         """
         if self.place.has_colors:
             return gaussians
@@ -199,9 +199,9 @@ class Method:
 
         At another size or cutoff the exact colours of the model are not the best.
         """
-        found, native = replace(model.encode(pixels), cutoff=float(self.cutoff)), model.gaussians
+        encoded, native = replace(model.encode(pixels), cutoff=float(self.cutoff)), model.gaussians
         same = (native.width, native.height, native.cutoff) == (*objective.size, self.cutoff)
-        return objective, found if same else self.start_from(objective, found)
+        return objective, encoded if same else self.start_from(objective, encoded)
 
 
 DEFAULT = Method(

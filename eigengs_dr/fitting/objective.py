@@ -3,7 +3,7 @@
 An objective gives a quadratic model around a picture p: ``1/2 sum_x h(x) (p(x) - t(x))^2`` up to a
 constant, with a curvature ``h >= 0`` for every pixel. The derivative by the picture, the colour
 solve, the cost of a removal, the gain of an added Gaussian and the noise follow from the model, and
-none of them asks whether there are weights. For the squared error with weights, `Pixels`, the
+none of them needs to know about weights. For the squared error with weights, `Pixels`, the
 model is exact: t is the image and h the weight, for all pictures.
 """
 
@@ -45,7 +45,7 @@ class Quadratic(NamedTuple):
         The picture t at which the model is least, in the tile layout of
         `eigengs_dr.raster.kernels`; None for 0.
     curvature : Float, shape (pixels,) or (pixels * channels,), or None
-        h for all channels of a pixel, or for each; None is 1 for all pixels of the image.
+        h for all channels of a pixel, or for each; None stands for 1 at all pixels of the image.
     """
 
     target: Float | None
@@ -61,7 +61,7 @@ class Quadratic(NamedTuple):
         return residual(packed, background, lists, radius, self.target, self.curvature)
 
     def curvatures(self, grid: Grid) -> Float:
-        """Return the curvature of every pixel, 0 outside the image: one value, or one a channel."""
+        """Return the curvature of every pixel: one value, or one per channel; 0 outside."""
         if self.curvature is None:
             assert self.target is not None
             return pixels_inside(types_of(self.target), grid)
@@ -75,7 +75,7 @@ class Quadratic(NamedTuple):
         return dr.gather(types.Float, h, value // (channels // number))
 
     def mean_target(self, grid: Grid, channels: int) -> list:
-        """Return the mean of the target weighed by the curvature: a Float (images,) a channel."""
+        """Return the mean of the target weighed by the curvature: a Float (images,) per channel."""
         assert self.target is not None
         types = types_of(self.target)
         if self.curvature is None:
@@ -91,9 +91,9 @@ class Quadratic(NamedTuple):
         types = types_of(self.target)
         if self.curvature is None:
             return dr.full(types.Float, 1, grid.images)
-        own = dr.width(self.curvature) // (grid.tiles * grid.pixels)
-        sums = channel_sums(self.curvature, own, grid)
-        return sum(sums) * dr.opaque(types.Float, 1 / (own * grid.width * grid.height))
+        number = dr.width(self.curvature) // (grid.tiles * grid.pixels)
+        sums = channel_sums(self.curvature, number, grid)
+        return sum(sums) * dr.opaque(types.Float, 1 / (number * grid.width * grid.height))
 
 
 class Slope(NamedTuple):
@@ -132,9 +132,9 @@ class Picture(NamedTuple):
     weight : Float, shape (pixels,), or None
         Factor of the squared errors, in tile layout.
     base : Float or None
-        RGB that comes on top of the rendering, in tile layout.
+        RGB that is added to the rendering, in tile layout.
     has_codes : bool
-        Whether the values are shown as 8 bits: colours, normals, and data between 0 and 1.
+        Whether the values are displayed in 8 bits: colours, normals, and data between 0 and 1.
     """
 
     space: str
@@ -153,13 +153,13 @@ class Part(NamedTuple):
 
     Attributes
     ----------
-    own : slice
+    movable : slice
         The Gaussians that may move.
     core : (slice, slice)
         The rows and columns to which they may move.
     """
 
-    own: slice
+    movable: slice
     core: tuple[slice, slice]
 
 
@@ -176,15 +176,15 @@ class Data(NamedTuple):
     Attributes
     ----------
     values : ndarray of float32, shape (H, W, C)
-        As they are fitted.
-    shown : ndarray of float32, shape (H, W, C)
-        What places Gaussians: linear light would put too few of them into dark parts.
+        The values that are fitted.
+    placement_image : ndarray of float32, shape (H, W, C)
+        The image that places Gaussians: linear light would put too few of them into dark parts.
     curvature : ndarray of float32, shape (H, W) or (H, W, C), or None
     affine : Affine
     """
 
     values: Image
-    shown: Image
+    placement_image: Image
     curvature: Image | None = None
     affine: Affine = Affine()
 
@@ -200,24 +200,24 @@ class Pixels:
     grid : Grid
     channels : int
     space : str
-        Space of the sets; "data" for maps, whose own spaces their pictures know.
+        Space of the sets; "data" for maps, whose pictures hold their spaces.
     model : Quadratic
         ``h (p - t)^2`` with the image t and the weight h.
-    shown : Float
+    placement_image : Float
         The image whose second derivatives place Gaussians, in tile layout.
     pictures : tuple of Picture
-        What people look at, for the PSNRs of a trace.
+        The images as displayed, for the PSNRs of a trace.
     levels : tuple of int
-        Numbers n: the first n Gaussians shall form the image too.
+        Numbers n: the first n Gaussians must form the image too.
     part : Part or None
-        What may move, where not all does.
+        What may move, if not everything.
     """
 
     grid: Grid
     channels: int
     space: str
     model: Quadratic
-    shown: Float
+    placement_image: Float
     pictures: tuple[Picture, ...] = ()
     levels: tuple[int, ...] = ()
     part: Part | None = None
@@ -241,8 +241,8 @@ class Pixels:
             return batch_to_tiles(types, stacked if stacked.ndim > 2 else stacked[..., None])
 
         values = upload([d.values for d in batch])
-        same = all(d.shown is d.values for d in batch)
-        shown = values if same else upload([d.shown for d in batch])
+        same = all(d.placement_image is d.values for d in batch)
+        placement_image = values if same else upload([d.placement_image for d in batch])
         curvature = None
         if batch[0].curvature is not None:
             # 2-D weights are one for all channels
@@ -250,7 +250,7 @@ class Pixels:
             assert len(layers) == len(batch)
             curvature = upload(layers)
         grid = Grid(width, height, images=len(batch))
-        return cls(grid, channels, space, Quadratic(values, curvature), shown)
+        return cls(grid, channels, space, Quadratic(values, curvature), placement_image)
 
     @classmethod
     def plain(cls, values: Image, gaussians: Gaussians) -> Pixels:
@@ -275,15 +275,15 @@ class Pixels:
         yield lambda state: self.model
 
     def around(self, gaussians: Gaussians) -> Pixels:
-        """Return the squared error that stands for the objective near a set: this one."""
+        """Return the squared error that stands for the objective near a set: itself."""
         return self
 
     def judged(self, gaussians: Gaussians) -> dict[str, float]:
-        """Return what a row of a trace has beside PSNRs: nothing."""
+        """Return what a row of a trace holds besides PSNRs: nothing."""
         return {}
 
     def merit(self, row: Record) -> float:
-        """Return the number of a row of a trace of which the best set has most: its PSNR."""
+        """Return the figure of a row that is largest for the best set: its PSNR."""
         return float(row["psnr_ycbcr"])
 
     def minus(self, gaussians: Gaussians) -> Pixels:
@@ -291,12 +291,12 @@ class Pixels:
         lists = bin_gaussians(gaussians, adjoint=False)
         packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
-        drawn = forward(packed, background, lists, radius)
-        pixel = dr.arange(self.types.UInt, dr.width(drawn)) // self.channels
+        rendering = forward(packed, background, lists, radius)
+        pixel = dr.arange(self.types.UInt, dr.width(rendering)) // self.channels
         inside = dr.gather(self.types.Float, pixels_inside(self.types, self.grid), pixel)
-        left = self.model.target - drawn * inside
+        left = self.model.target - rendering * inside
         dr.eval(left)
-        return replace(self, model=self.model._replace(target=left), shown=left)
+        return replace(self, model=self.model._replace(target=left), placement_image=left)
 
     def picture(self, values: Float) -> Tensor:
         """Return an image in tile layout as a tensor (H, W, C)."""
@@ -315,10 +315,10 @@ errors of sRGB codes, whose weight is about the square of it. With 5,000 Gaussia
 suits light above 1 too. Three made-up environments of 512x256 pixels, with a sun of 5,000, end at
 31.2 dB in PU21, at 29.6 without weights, at 31.5 with ``(I + 0.01)^-1``, at 29.9 and 25.5 dB
 with relative errors (0.1 and 0.01 added to I), and at 27.0 dB with the slope of PU21. Steep weights
-let bright spots vanish, which costs at most 1 a pixel, rather than spill on dark pixels."""
+let bright spots vanish, which costs at most 1 per pixel, rather than spill on dark pixels."""
 
 GREY = 0.18
-"""Mean of light as it is fitted where it may exceed 1: photographic mid-grey."""
+"""Mean of fitted light that may exceed 1: photographic mid-grey."""
 
 
 def values_in(pixels: Image, space: str) -> Image:
@@ -338,7 +338,7 @@ def values_in(pixels: Image, space: str) -> Image:
 def data_of(
     pixels: Image, space: str, weight: Image | None = None, affine: Affine | None = None
 ) -> Data:
-    """Convert pixels (H, W, C) to the space of the colours, in units in which all images are alike.
+    """Convert pixels (H, W, C) to the space of the colours, in units common to all images.
 
     Errors of light weigh more in the dark.
 
@@ -357,8 +357,10 @@ def data_of(
     if affine != Affine():
         values = (values - np.float32(affine.offset)) / np.float32(affine.scale)
     if space in LIGHT:
-        shown = pixels if affine == Affine() else by_strips(to_coded, values)
-        return Data(values, shown, _product(by_strips(dark_weight, values), weight), affine)
+        placement_image = pixels if affine == Affine() else by_strips(to_coded, values)
+        return Data(
+            values, placement_image, _product(by_strips(dark_weight, values), weight), affine
+        )
     return Data(values, values, weight, affine)
 
 
@@ -372,12 +374,12 @@ class Extent(NamedTuple):
 
     @classmethod
     def of(cls, values: Image) -> Extent:
-        """Return that of an array."""
+        """Return the extent of an array."""
         total = float(values.sum(dtype=np.float64))
         return cls(float(values.min()), float(values.max()), total, values.size)
 
     def joined(self, other: Extent) -> Extent:
-        """Return that of both."""
+        """Return the extent of both."""
         low, high = min(self.low, other.low), max(self.high, other.high)
         return Extent(low, high, self.total + other.total, self.number + other.number)
 
@@ -392,7 +394,7 @@ class Extent(NamedTuple):
             return Affine(mean / GREY) if mean > 0 else Affine()
         if space not in ("data", "log"):
             return Affine()
-        # A constant image has no range; what rounding makes of its mean is none either.
+        # A constant image has no range, and rounding of its mean does not make one.
         flat = width <= 1e-6 * max(abs(self.low), abs(self.high))
         return Affine(1.0 if flat else width, mean)
 
@@ -403,11 +405,11 @@ class Extent(NamedTuple):
 
 
 VISIBLE = 100.0
-"""Means of light that may exceed 1 are shown as they are if they are at most so much brighter or
-darker than `GREY`: others are out of the range of a display, and would all look alike."""
+"""Light that may exceed 1 is displayed unchanged if its mean is at most so much brighter or darker
+than `GREY`: other light is out of the range of a display, and would all look alike."""
 
 MIN_CODE = 0.1
-"""Smallest maximum of data that count as codes between 0 and 1, as those of textures."""
+"""Smallest maximum of data that count as codes between 0 and 1, as in textures."""
 
 
 def picture(
@@ -419,7 +421,7 @@ def picture(
     first: int = 0,
     factor: float = 1.0,
 ) -> Picture:
-    """Return what an image, or a batch of images, shows, for the PSNRs.
+    """Return the display values of an image, or of a batch of images, for the PSNRs.
 
     Data are measured with their range as the peak, or 1 if they are codes, see `is_codes`. Light
     that may exceed 1 is exposed if its mean is far from `GREY`, see `VISIBLE`.
@@ -431,7 +433,7 @@ def picture(
     pixels : sequence of ndarray of float32, shape (H, W, C)
         sRGB, normals or data.
     data : sequence of Data
-        The same as they are fitted.
+        The same images in the units of the fit.
     weight : ndarray of float32, shape (H, W) or (H, W, C), optional
         Factor of the squared errors.
     first : int, optional
@@ -439,18 +441,18 @@ def picture(
     factor : float, optional
         Factor of the channels in the set.
     """
-    affines, shown, codes = [d.affine for d in data], list(pixels), True
+    affines, images, codes = [d.affine for d in data], list(pixels), True
     if space == "data":
-        shown = [d.values * np.float32(factor) for d in data]
+        images = [d.values * np.float32(factor) for d in data]
         codes = all(map(is_codes, pixels))
         if not codes:
             affines = [Affine(1.0, a.offset / a.scale) for a in affines]
-    exposures = [1.0] * len(shown)
+    exposures = [1.0] * len(images)
     if space in UNBOUNDED:
-        exposures = [exposure_of(p) for p in shown]
-        lit = zip(shown, exposures, strict=True)
-        shown = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
-    batch = np.stack(shown) if len(shown) > 1 else shown[0]
+        exposures = [exposure_of(p) for p in images]
+        lit = zip(images, exposures, strict=True)
+        images = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
+    batch = np.stack(images) if len(images) > 1 else images[0]
     weights = None
     if weight is not None:
         weights = batch_to_tiles(types, np.atleast_3d(weight).mean(axis=2, keepdims=True))
@@ -467,13 +469,13 @@ def picture(
 
 
 def exposure_of(pixels: Image) -> float:
-    """Return the factor with which light (H, W, C), in sRGB, comes into the range of a display."""
+    """Return the factor that brings light (H, W, C), in sRGB, into the range of a display."""
     mean = float(to_linear(pixels).mean(dtype=np.float64))
     return 1.0 if mean <= 0 or 1 / VISIBLE <= mean / GREY <= VISIBLE else GREY / mean
 
 
 def is_codes(data: Image) -> bool:
-    """Return whether data are codes between 0 and 1, as those of textures."""
+    """Return whether data are codes between 0 and 1, as in textures."""
     return Extent.of(data).is_of_codes
 
 

@@ -15,7 +15,7 @@ class Optimizer(Protocol):
     """The type of optimisers: settings without state, and a step as a pure function.
 
     The state of a variable is its value and a tuple of arrays of the same type, its moments; and
-    all variables have the time since their start. One kernel then computes the gradients and the
+    all variables share the time since their start. One kernel then computes the gradients and the
     steps of all variables.
     """
 
@@ -62,7 +62,7 @@ def debias(beta: float, time: Float) -> Float:
 
 @dataclass(frozen=True)
 class Adam:
-    """Adam of Kingma and Ba, "Adam: A Method for Stochastic Optimization" (2015).
+    """Adam by Kingma and Ba, "Adam: A Method for Stochastic Optimization" (2015).
 
     With the gradient g, and moving averages with the decay factors beta::
 

@@ -38,7 +38,7 @@ Levels = int | Sequence[int]
 """A number of levels of detail, or the number of Gaussians up to each level in ascending order."""
 
 LEVEL_RATIO = 4
-"""Ratio of the numbers of Gaussians up to a level and up to the level before it; 4 halves their
+"""Ratio of the numbers of Gaussians up to a level and up to the previous level; 4 halves their
 spacing."""
 
 Start: TypeAlias = "Gaussians | Model | str | os.PathLike[str]"
@@ -48,22 +48,22 @@ Start: TypeAlias = "Gaussians | Model | str | os.PathLike[str]"
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def refuse_unknown(given: Collection[str], known: Collection[str]) -> None:
-    """Raise TypeError for an option that is unknown, with the name that it resembles."""
+def refuse_unknown(given: Collection[str], names: Collection[str]) -> None:
+    """Raise TypeError for an unknown option, and name the option that it resembles."""
     for name in given:
-        if name not in known:
-            [*close] = get_close_matches(name, known, 1)
-            advice = f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(known)}"
+        if name not in names:
+            [*close] = get_close_matches(name, names, 1)
+            advice = f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(names)}"
             raise TypeError(f"unknown option {name!r}; {advice}")
 
 
 def named_options(function: Function) -> Function:
     """Decorate a function whose unknown keywords `refuse_unknown` reports."""
-    known = list(signature(function).parameters)
+    names = list(signature(function).parameters)
 
     @wraps(function)
     def call(*arguments: Any, **options: Any) -> Any:
-        refuse_unknown(options, known)
+        refuse_unknown(options, names)
         return function(*arguments, **options)
 
     return call  # type: ignore[return-value]
@@ -79,7 +79,7 @@ class Goal:
         In dB, above 0 and at most 100.
     space : {"rgb", "ycbcr"}
         Whether it is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light above 1 have
-        one PSNR alone, see `eigengs_dr.image.metrics.float_space`.
+        only one PSNR, see `eigengs_dr.image.metrics.float_space`.
     max_gaussians : int or None
         Largest number of Gaussians. By default they have at most as many parameters as the image
         has numbers: 3 Gaussians for 8 pixels in colour.
@@ -158,7 +158,7 @@ class FitOptions:
         self._check_nested()
 
     def _check_nested(self) -> None:
-        """Raise ValueError where a search or levels need what the other options take away."""
+        """Raise ValueError if other options exclude what a search or levels need."""
         places = self.method.place == Adaptive() and self.start is None
         if self.levels and not (places and not self.method.needs_model):
             raise ValueError("levels need the placement Adaptive and no start; leave them out")
@@ -187,7 +187,7 @@ class FitOptions:
 
     @property
     def searches(self) -> bool:
-        """Whether the number of Gaussians is the smallest that reaches something."""
+        """Whether the number of Gaussians is searched: the smallest that reaches a target."""
         return self.goal is not None or (self.loss is not None and self.loss.target is not None)
 
     @property
@@ -208,21 +208,23 @@ class FitOptions:
 
     @property
     def count(self) -> int | None:
-        """Number of Gaussians, if the user gives one; of all levels."""
+        """Number of Gaussians, if the user gives one; with levels, of all."""
         return self.levels[-1] if self.levels else self.gaussians  # type: ignore[return-value]
 
     def count_for(self, pixels: int) -> int:
-        """Return the number of Gaussians for so many pixels, if the fit does not search it."""
+        """Return the number of Gaussians for so many pixels, if the fit does not search for it."""
         return self.count or default_count(pixels)
 
-    def most_for(self, pixels: int, channels: int) -> int:
+    def max_count_for(self, pixels: int, channels: int) -> int:
         """Return the largest number of Gaussians that a search tries."""
         limit = self.goal.max_gaussians if self.goal else None
         return limit or max_gaussians_for(pixels, channels)
 
     def first_try(self, pixels: int, channels: int) -> int:
         """Return the number of Gaussians with which a search starts."""
-        return min(self.most_for(pixels, channels), max(1, pixels // PIXELS_PER_FIRST_GAUSSIAN))
+        return min(
+            self.max_count_for(pixels, channels), max(1, pixels // PIXELS_PER_FIRST_GAUSSIAN)
+        )
 
 
 def default_count(pixels: int) -> int:
@@ -269,11 +271,11 @@ def level_counts(count: int, levels: Levels) -> list[int]:
         raise ValueError(f"count is {count}; it must be at least 1")
     if not isinstance(levels, (int, np.integer)):
         return _check_counts(count, levels)
-    most = 1
-    while count >= LEVEL_RATIO**most:
-        most += 1
-    if not 1 <= levels <= most:
-        raise ValueError(f"levels is {levels}; {count} Gaussians make 1 to {most}")
+    max_levels = 1
+    while count >= LEVEL_RATIO**max_levels:
+        max_levels += 1
+    if not 1 <= levels <= max_levels:
+        raise ValueError(f"levels is {levels}; {count} Gaussians make 1 to {max_levels}")
     return [count // LEVEL_RATIO**k for k in reversed(range(levels))]
 
 

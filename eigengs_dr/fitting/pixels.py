@@ -1,4 +1,4 @@
-"""The pixels of a fit: an image of the user, checked, and its weights."""
+"""The pixels of a fit: the image of the user after its checks, and its weights."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ WHITE = 1.001
 """Largest sRGB code of light that counts as bounded by white; renderings exceed 1 by rounding."""
 
 BRIGHT = {"ycbcr": "log", "rgb": "log", "linear": "radiance"}
-"""Space of a fit of light above 1 for the space asked for: textures clamp sums in the others."""
+"""Space of a fit of light above 1, by the requested space: textures clamp sums in the others."""
 
 
 def read_pixels(
     image: PixelsOrPath, space: str, weight: Image | None = None, encoding: str | None = None
 ) -> tuple[Image, str]:
-    """Check an image, and convert it to what people look at.
+    """Check an image, and convert it to display values (sRGB).
 
     Parameters
     ----------
@@ -37,7 +37,8 @@ def read_pixels(
         See `eigengs_dr.fit`.
     space : str
     weight : ndarray, shape (H, W) or (H, W, C), optional
-        From `check_weight`. Pixels without any weight get the value of the nearest that has some.
+        From `check_weight`. Pixels without any weight get the value of the nearest pixel with
+        weight.
     encoding : {"srgb", "linear"}, optional
 
     Returns
@@ -45,7 +46,7 @@ def read_pixels(
     pixels : ndarray of float32, shape (H, W, 3) or (H, W, 1)
         sRGB, above 1 for light above 1; or the data. They may be the image itself.
     space : str
-        Another space if the image is light above 1, see `BRIGHT`.
+        The given space, or another if the image is light above 1, see `BRIGHT`.
 
     Raises
     ------
@@ -53,13 +54,13 @@ def read_pixels(
         If the image is unusable.
     """
     data = rendered_as(space) is None
-    found = read_image(image, data, encoding)
+    encoded = read_image(image, data, encoding)
     if weight is not None:
-        found = found._replace(pixels=_filled(found, weight))
+        encoded = encoded._replace(pixels=_filled(encoded, weight))
     if data:
-        return _read_data(found, space), space
-    pixels = check_image(found, copy=False)
-    if found.encoding == "linear" and pixels.max() > WHITE:
+        return _read_data(encoded, space), space
+    pixels = check_image(encoded, copy=False)
+    if encoded.encoding == "linear" and pixels.max() > WHITE:
         space = BRIGHT.get(space, space)
     return pixels, space
 
@@ -86,7 +87,7 @@ def check_normals(pixels: Image) -> None:
 
 
 def check_channels(weight: Image | None, channels: int) -> None:
-    """Raise ValueError unless weights (H, W) or (H, W, C) are those of so many channels."""
+    """Raise ValueError unless weights (H, W) or (H, W, C) fit the number of channels."""
     if weight is not None and weight.ndim == 3 and weight.shape[2] not in (1, channels):
         raise ValueError(
             f"weight has {weight.shape[2]} channels, but the fit has {channels}; give (H, W), or "
@@ -95,7 +96,7 @@ def check_channels(weight: Image | None, channels: int) -> None:
 
 
 def _filled(image: EncodedImage, weight: Image) -> Values:
-    """Return pixels in which those without any weight have the value of the nearest others."""
+    """Return pixels in which those without weight have the value of the nearest others."""
     pixels = np.asarray(image.pixels)
     if pixels.ndim not in (2, 3) or pixels.shape[:2] != weight.shape[:2]:
         height, width = weight.shape[:2]

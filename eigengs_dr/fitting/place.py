@@ -1,7 +1,7 @@
-"""Placements: where Gaussians start that have no other start, before their colours are known.
+"""Placements: where Gaussians start without a given start, before their colours are known.
 
-`Adaptive` follows the second derivatives of the image; `Grid` and `Random` see its size alone.
-`lattices` makes sets without an image, for losses of one's own.
+`Adaptive` follows the second derivatives of the image; `Grid` and `Random` use only its size.
+`lattices` makes sets without an image, for your own losses.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Placement(Protocol):
     """Makes the first set of Gaussians for an objective."""
 
     has_colors: bool
-    """Whether its colours stay; else they are 0, and a solve finds the best."""
+    """Whether its colours stay; otherwise they are 0, and a solve finds the best ones."""
 
     def __call__(self, objective: Pixels, count: int, cutoff: float, seed: int) -> Gaussians:
         """Return `count` Gaussians for each image of a batch, image after image."""
@@ -53,7 +53,7 @@ class Adaptive:
 
 @dataclass(frozen=True)
 class Grid:
-    """Round Gaussians in rows, of which every second one is shifted by half a distance."""
+    """Round Gaussians in rows, every second one shifted by half a distance."""
 
     has_colors = False
 
@@ -64,7 +64,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Random:
-    """Means uniform in the image, and shapes of about a pixel, as GaussianImage starts."""
+    """Uniform means in the image, and shapes of about a pixel, as in GaussianImage."""
 
     has_colors = False
 
@@ -81,7 +81,7 @@ grow."""
 
 
 def grid_of(size: tuple[int, int], count: int) -> Shapes:
-    """Return round Gaussians in rows, of which every second one is shifted by half a distance.
+    """Return round Gaussians in rows, every second one shifted by half a distance.
 
     The count may be any number: rows differ by at most one Gaussian.
     """
@@ -120,7 +120,7 @@ def lattices(
         Native width and height in pixels.
     sides : sequence of int
         Number of Gaussians of each lattice along the longer side, such as ``(16, 40, 100)``. Along
-        the other side there are as many as make the distances most alike, and at least one.
+        the other side, their number makes the distances as equal as possible, and is at least one.
     background : array_like, shape (C,), optional
         What the set shows: the colours of its Gaussians are 0. In units of the space, so that the
         default is a grey in "ycbcr" and "rgb".
@@ -140,7 +140,7 @@ def lattices(
     Raises
     ------
     ValueError
-        If `sides` are no whole numbers above 0, or another value is not as above.
+        If `sides` are not whole numbers above 0, or another value is not as above.
 
     Examples
     --------
@@ -195,7 +195,7 @@ def gaussians_at(
     cutoff: float,
     color: NDArray[np.floating] | None = None,
 ) -> Gaussians:
-    """Return Gaussians of these places and shapes for each image of a batch, bounded.
+    """Return bounded Gaussians with these means and shapes for each image of a batch.
 
     Their colours are 0 by default.
     """

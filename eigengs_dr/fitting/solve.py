@@ -64,11 +64,11 @@ def solve(
     Parameters
     ----------
     gaussians : Gaussians
-        Of a batch, those of all images, image after image, equally many for each.
+        For a batch, those of all images, image after image, equally many for each.
     objective : Pixels
-        The image and its weights. A batch of images has step lengths for each.
+        The image and its weights. Each image of a batch has its own step lengths.
     steps : int, optional
-        Number of steps. Few steps regularise the colours of Gaussians that overlap much.
+        Number of steps. Few steps regularise the colours of Gaussians that overlap strongly.
     warm_start : bool, optional
         Start from the colours and background of the set instead of zero and the mean of the image.
     background : sequence of C floats, optional
@@ -77,7 +77,7 @@ def solve(
     Returns
     -------
     Gaussians
-        The set with the new colours and background; that of a batch has a value for each image. A
+        The set with the new colours and background; for a batch, a background for each image. A
         step never adds to the error ``sum h (A c - D)^2``, except by rounding.
 
     Raises
@@ -99,7 +99,7 @@ def solve(
         dr.make_opaque(shape, x)
         held = background is not None
         inverse, enough, state = _begin(shape, x, model, held, lists, cutoff)
-        release_memory(values)  # what the lists and the start took would stay reserved
+        release_memory(values)  # memory of the lists and the start would stay reserved
         for _ in range(steps):
             state = _step(shape, state, model.curvature, enough, inverse, lists, cutoff)
         (color, free), FloatX = state[0], types_of(gaussians.mean).FloatX
@@ -303,13 +303,13 @@ def weigh(
     F holds factors of the squares of errors, one for all channels or one for each. Cost: one pass
     over the lists.
     """
-    found = correlate(shape, delta, channels, lists, cutoff, factors)
-    diagonal = found[channels:]
-    return found[:channels], (diagonal, channel_sums(factors, len(diagonal), lists.grid))
+    products = correlate(shape, delta, channels, lists, cutoff, factors)
+    diagonal = products[channels:]
+    return products[:channels], (diagonal, channel_sums(factors, len(diagonal), lists.grid))
 
 
 def by_channel(values: list, channels: int) -> list:
-    """Return a value for each channel, where there is one for all or one for each."""
+    """Return a value for each channel, from one for all or one for each."""
     return values * (channels // len(values))
 
 

@@ -1,4 +1,4 @@
-"""What a fit starts from: a set of the user, the file of one, or a model."""
+"""What a fit starts from: a set of the user, the file of a set, or a model."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ def load_start(start: Start | Fitted, backend: str | None) -> Gaussians | Model:
     Raises
     ------
     ValueError
-        If the set is on another backend, or its file is none.
+        If the set is on another backend, or its file holds no set.
     TypeError
         If the start is something else.
     """
     if isinstance(start, (str, os.PathLike)):
         return Gaussians.load(start, backend)
-    found = start if isinstance(start, Model) else dr.detach(set_of(start))
-    current = types_of(set_in(found).mean).backend
+    loaded = start if isinstance(start, Model) else dr.detach(set_of(start))
+    current = types_of(set_in(loaded).mean).backend
     if backend not in (None, current):
         raise ValueError(
             f"the start is on backend {current!r}, not on {backend!r}; load it with "
             f"backend={backend!r}, or leave the backend out"
         )
-    return found
+    return loaded
 
 
 def set_in(start: Gaussians | Model) -> Gaussians:
@@ -92,7 +92,7 @@ def start_from(
     objective : Pixels
     method : Method
     pixels : ndarray of float32, shape (H, W, C)
-        What a model encodes.
+        The image that a model encodes.
     moves : bool
         Whether a descent follows, which needs means inside of the image.
     """

@@ -22,7 +22,7 @@ class Coordinates(Protocol):
     """A change of variables, differentiable by Dr.Jit.
 
     `fixed` is the set that was encoded; fields without a variable keep its values. `size` is the
-    width and the height of `fixed`, in arrays if the program shall serve every size.
+    width and the height of `fixed`, in arrays if the program is to serve every size.
     """
 
     def encode(self, gaussians: Gaussians) -> Variables:
@@ -35,7 +35,7 @@ class Coordinates(Protocol):
         """Return the variables, moved back into their bounds."""
 
     def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[FloatLike, float]:
-        """Return how far ellipses reach, in pixels and as a factor, if variables move so far."""
+        """Return how far ellipses reach, in pixels and as a factor, if variables move this far."""
 
 
 MOVE_SHARE, GROWTH_SHARE = 0.17, 0.07

@@ -147,7 +147,7 @@ def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | Non
     kind = MATERIAL if data.maps else FORMAT
     with np.errstate(over="ignore"):  # the check rejects infinity
         members: Arrays = {name: np.asarray(a, np.float32) for name, a in data.arrays.items()}
-    with _errors_of(path):
+    with file_errors(path):
         check(data._replace(arrays=members))
     members["size"] = np.array(data.size, np.int64)
     members["cutoff"] = np.array(data.cutoff, np.float64)
@@ -187,19 +187,23 @@ def read_head(path: Path) -> SetHead:
     kind, version, layout = _layout_of(path)
     small = {name: field for name, field in layout.items() if name not in ARRAYS}
     shape = npz.read_shapes(path, kind, version, {"color": LAYOUT["color"]})["color"]
-    with _errors_of(path):
+    with file_errors(path):
         size, space, cutoff, maps = _properties(npz.read(path, kind, version, small))
         _check_properties(shape[1], size, space, cutoff, maps)
     return SetHead(shape[0], shape[1], size, space, cutoff, maps)
 
 
 @contextmanager
-def _errors_of(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the name of a file before error messages about its values."""
+def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Put the name of a file before error messages, about its values or of the system."""
     try:
         yield
     except BadValue as error:
         raise ValueError(f"{path}: {error}") from None
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: no such file; check the path") from None
+    except IsADirectoryError:
+        raise IsADirectoryError(f"{path}: is a folder; give a file in it") from None
 
 
 def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
@@ -254,7 +258,7 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
         names = ", ".join(m.name for m in maps)
         raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
     data = read(path)
-    with _errors_of(path):
+    with file_errors(path):
         return data if name is None else data.map_data(name)
 
 
@@ -273,7 +277,7 @@ def read_figures(path: Path) -> FitFigures | None:
 
 def read(path: Path, sections: int | None = None) -> SetData:
     """Read and check a set; parameters and errors as for `eigengs_dr.Gaussians.load`."""
-    with _errors_of(path):
+    with file_errors(path):
         if packed.is_packed(path):
             data = packed.read_set(path, sections)
         elif sections is not None:

@@ -329,7 +329,7 @@ class Gaussians:
             If the file has another format or a newer version, is damaged, has fewer sections, or
             holds invalid values. One line names the file and the key.
         OSError
-            If the file cannot be opened.
+            If there is no such file, it is a folder, or it cannot be opened.
         """
         return cls.from_data(read(Path(path), sections), backend, dtype)
 
@@ -456,7 +456,8 @@ def set_of(source: Gaussians | Fitted) -> Gaussians:
         return source
     if not hasattr(source, "trace") or not hasattr(source, "gaussians"):
         raise TypeError(
-            f"{type(source).__name__} is not a set of Gaussians; pass Gaussians or a Fit"
+            f"{type(source).__name__} is not a set of Gaussians; pass Gaussians, which "
+            "Gaussians.load reads from a file, or a Fit"
         )
     if source.mean_image is not None:
         raise ValueError("the fit has a mean image of pixels, which its set lacks; use .gaussians")

@@ -56,15 +56,16 @@ def open_picture(path: Path) -> Iterator[Image]:
         prefix = file.read(16)
         for name in Image.ID:
             factory, accepts = Image.OPEN[name]
-            known = accepts is None or accepts(prefix)
-            if known and not isinstance(known, str):
-                file.seek(0)
-                try:
-                    image = factory(file, str(path))
-                except (SyntaxError, IndexError, TypeError, struct.error):  # as Image.open
+            try:
+                known = accepts is None or accepts(prefix)  # of short files it raises struct.error
+                if not known or isinstance(known, str):
                     continue
-                yield image
-                return
+                file.seek(0)
+                image = factory(file, str(path))
+            except (SyntaxError, IndexError, TypeError, struct.error):  # as Image.open
+                continue
+            yield image
+            return
     raise UnidentifiedImageError(f"cannot identify image file {path}")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +21,7 @@ from ..plugins.versions import Properties, texture_kind
 import mitsuba as mi
 
 TWO_VALUES = 0.95
-"""Share of pixels that are black or white from which on an image counts as a mask."""
+"""Share of black or white pixels from which on an image counts as a mask."""
 
 KEPT = ("to_uv", "wrap_mode")
 """Properties of a bitmap that a ``gaussian_texture`` has too."""
@@ -33,7 +33,7 @@ GAUSSIANS, SKY = "gaussian_texture", "gaussian_environment"
 """Names of the plugins in scenes."""
 
 UDIM = re.compile(r"<udim>|<uvtile>|%\(udim\)d", re.IGNORECASE)
-"""What stands for the number of a tile in names of files, by Mari, Mudbox and Houdini."""
+"""Placeholders of Mari, Mudbox and Houdini for the number of a tile in file names."""
 
 
 class Use(NamedTuple):
@@ -48,7 +48,7 @@ class Use(NamedTuple):
     slot : str
         Property of that node.
     file : str
-        Absolute path of the image; for pixels in memory, a name of their own.
+        Absolute path of the image; for pixels in memory, a unique name.
     raw : bool
         Whether the values are data.
     wrap : str
@@ -56,7 +56,7 @@ class Use(NamedTuple):
     is_height : bool
         Whether a bump map uses it.
     name : str
-        How a report calls it.
+        Its name in reports.
     """
 
     node: int
@@ -89,7 +89,7 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
     Raises
     ------
     ValueError
-        If the root is no scene, or a file name stands for UDIM tiles.
+        If the root is not a scene, or a file name stands for UDIM tiles.
     RuntimeError
         Mitsuba's error, if the scene does not parse.
     """
@@ -121,16 +121,16 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
 def _own_resolver() -> Iterator[mi.FileResolver]:
     """Use a copy of Mitsuba's file resolver in a block."""
     before = mi.file_resolver()
-    own = mi.FileResolver(before)
-    mi.set_file_resolver(own)
+    resolver = mi.FileResolver(before)
+    mi.set_file_resolver(resolver)
     try:
-        yield own
+        yield resolver
     finally:
         mi.set_file_resolver(before)
 
 
 def _make_absolute(props: Properties) -> None:
-    """Look files up as Mitsuba does: in the folders of ``<path>``, then beside the scene."""
+    """Look up files as Mitsuba does: in the folders of ``<path>``, then beside the scene."""
     for key in file_keys(props):
         path = Path(str(mi.file_resolver().resolve(props[key])))
         if path.exists():
@@ -149,14 +149,22 @@ def file_keys(props: Properties) -> list[str]:
     return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 
 
-def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
+def uses_of(
+    parsed: Parsed, key_of: Callable[[int, str], str | None]
+) -> tuple[list[Use], list[tuple[str, str]]]:
     """Find the bitmaps of a scene that may become Gaussians.
+
+    Parameters
+    ----------
+    parsed : Parsed
+    key_of : callable
+        Returns the name in `mitsuba.traverse` of what a slot of a node holds, if it has one.
 
     Returns
     -------
     list of Use
     list of (str, str)
-        The name of what stays as it is, and why.
+        Names of the bitmaps that stay, and the reasons.
     """
     nodes = parsed.state.nodes
     parents: dict[int, list[tuple[int, str]]] = {}
@@ -172,7 +180,9 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
         # A texture with an id is a child of the scene too, where it has no use.
         above = [(p, s) for p, s in parents.get(index, []) if nodes[p].type != mi.ObjectType.Scene]
         parent, slot = above[0] if above else (0, "")
-        name = label(props, nodes[parent].props, slot)
+        owner = nodes[parent].props
+        key = key_of(parent, slot) if above else None
+        name = label(props, key or f"{owner.id() or owner.plugin_name()}.{slot}")
         parents_of = [nodes[p].props.plugin_name() for p, _ in above]
         if reason := _reason(props, parents_of):
             left.append((name, reason))
@@ -184,7 +194,7 @@ def uses_of(parsed: Parsed) -> tuple[list[Use], list[tuple[str, str]]]:
 
 
 def environment_of(parsed: Parsed) -> int | None:
-    """Return the index of the environment map of a scene, which has one at most."""
+    """Return the index of the environment map of a scene, which has at most one."""
     names = [node.props.plugin_name() for node in parsed.state.nodes]
     return names.index("envmap") if "envmap" in names else None
 
@@ -194,16 +204,14 @@ def is_bitmap(node: mi.parser.SceneNode) -> bool:
     return node.type == texture_kind() and node.props.plugin_name() == "bitmap"
 
 
-def label(props: Properties, parent: Properties | None, slot: str) -> str:
+def label(props: Properties, place: str) -> str:
     """Name a bitmap by its file and where it is."""
     file = Path(str(props["filename"])).name if "filename" in props else "a bitmap in memory"
-    if parent is None:
-        return f"{file} (environment)"
-    return f"{file} ({parent.id() or parent.plugin_name()}.{slot})"
+    return f"{file} ({place})"
 
 
 def _reason(props: Properties, parents: list[str]) -> str:
-    """Say why a bitmap stays a bitmap by its properties and the plugins that use it, or nothing."""
+    """Return why the properties or users of a bitmap require a bitmap, or nothing."""
     if not parents:
         return "nothing uses it"
     if "bumpmap" in parents and len(set(parents)) > 1:
@@ -249,8 +257,8 @@ def space_of(pixels: NDArray[np.float32], data: bool) -> str:
         raise Unsuitable(f"values from {low:g} to {high:g}, beyond 0 and 1")
     if high > 1.001:
         return "radiance"
-    shown = pixels if data else to_coded(pixels)
-    extreme = float(((shown <= 0.02) | (shown >= 0.98)).all(axis=2).mean())
-    if extreme >= TWO_VALUES and np.ptp(shown) > 0.5:
+    display = pixels if data else to_coded(pixels)
+    extreme = float(((display <= 0.02) | (display >= 0.98)).all(axis=2).mean())
+    if extreme >= TWO_VALUES and np.ptp(display) > 0.5:
         raise Unsuitable("a mask of two values: Gaussians would soften its edges")
     return "data" if data else "linear"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -51,12 +52,13 @@ NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directl
 
 
 class ConvertedTexture(NamedTuple):
-    """An image, as bitmaps and as Gaussians.
+    """An image as bitmaps and as Gaussians.
 
     Attributes
     ----------
     names : tuple of str
-        Its uses: the file, and in brackets what uses it.
+        Its uses: the file, and in brackets its name in `mitsuba.traverse`; under a shape without an
+        id, which has none that lasts, the plugin and the slot.
     file : str
         The new file, relative to the folder; "" if the bitmap stayed.
     width, height, channels : int
@@ -102,12 +104,12 @@ class ConvertedScene(NamedTuple):
     better : list of ConvertedTexture
         Bitmaps that stayed, since they take less memory or time than Gaussians.
     left : list of (str, str)
-        What else stayed as it was, and why.
+        What else stayed, and why.
     psnr : list of float
         psnr_rgb in dB between the renderings of each camera; both have the same random numbers.
     noise : list of float
-        psnr_rgb between two renderings of the scene as it was, with other random numbers. Empty if
-        its environment map stays: the directions of another one are others.
+        psnr_rgb between two renderings of the original scene with different random numbers. Empty
+        if its environment map stays, since only a new one is sampled differently.
     """
 
     scene: Path
@@ -127,7 +129,7 @@ class ConvertedScene(NamedTuple):
 
 
 NOISE = 0.5
-"""Decibels by which renderings of other random numbers may differ more than others do."""
+"""Decibels by which renderings with other random numbers may vary."""
 
 
 @shows_progress
@@ -165,7 +167,7 @@ def convert_scene(
     parameters : mapping of str to str, optional
         Values for the defaults of an XML file.
     replace_all : bool, optional
-        Whether better bitmaps are replaced too: Gaussians are differentiable, and have no texels.
+        Whether to replace better bitmaps too: Gaussians are differentiable, and have no texels.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         ``progress(label, done, total)``.
@@ -179,6 +181,8 @@ def convert_scene(
     ValueError
         If no variant of Mitsuba is set, an argument is out of range, the folder has files in it, or
         the scene cannot be written as XML.
+    TypeError
+        If the scene is loaded already.
     RuntimeError
         Mitsuba's error, if the scene does not parse.
     OSError
@@ -187,7 +191,7 @@ def convert_scene(
     Warns
     -----
     UserWarning
-        If a rendering after misses `target_psnr` against the one before.
+        If a rendering after the conversion misses `target_psnr` against the one before.
 
     Examples
     --------
@@ -198,6 +202,8 @@ def convert_scene(
     """
     if not mi.variant():
         raise ValueError("no variant is set; call mi.set_variant('llvm_ad_rgb') first")
+    if isinstance(scene, mi.Scene):
+        raise TypeError("convert_scene: scene is loaded; give its XML file or its dictionary")
     if not 0 < target_psnr < 60:
         raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
     refuse_url(output)
@@ -227,7 +233,7 @@ class Settings(NamedTuple):
 
 
 def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
-    """Raise ValueError if there is something in a folder to write."""
+    """Raise ValueError if the output folder is not empty."""
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{output}: exists and is not empty; choose another folder")
 
@@ -245,29 +251,29 @@ def _convert_into(
 ) -> ConvertedScene:
     """Write a scene and its files into a folder that becomes the target; `make` parses it."""
     again = make()
-    uses, left = uses_of(again)
     original = Original(make, settings.spp)
+    uses, left = uses_of(again, original.key_of)
     result = ConvertedScene(work / SCENE, [], [], left, [], [])
-    made = dict[int, str]()
+    replacements = dict[int, str]()
     groups: dict[tuple[str, bool, bool], list[Use]] = {}
     on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
-        if any(original.textures([use])[0] in found for found in on_shapes):
+        if any(original.textures([use])[0] in hierarchy for hierarchy in on_shapes):
             groups.setdefault((use.file, use.raw, use.is_height), []).append(use)
         else:
             left.append((use.name, NO_SHAPE))
     sky = environment_of(again)
     total = len(groups) + (sky is not None)
 
-    def add(found: ConvertedTexture | str, nodes: dict[int, str]) -> None:
-        """Add what has become of an image, whose nodes have names."""
-        if isinstance(found, str):
-            left.extend((name, found) for name in nodes.values())
-        elif not found.file:
-            result.better.append(found)
+    def add(outcome: ConvertedTexture | str, nodes: dict[int, str]) -> None:
+        """Record the outcome for an image, with the names of its nodes."""
+        if isinstance(outcome, str):
+            left.extend((name, outcome) for name in nodes.values())
+        elif not outcome.file:
+            result.better.append(outcome)
         else:
-            result.textures.append(found)
-            made.update(dict.fromkeys(nodes, found.file))
+            result.textures.append(outcome)
+            replacements.update(dict.fromkeys(nodes, outcome.file))
 
     for number, group in enumerate(groups.values()):
         progress("textures", number, total)
@@ -275,24 +281,25 @@ def _convert_into(
             group[0].file, group[0].raw, {texture.file for texture in result.textures}
         )
         pixels = read_pixels(again.state.nodes[group[0].node].props)
-        found = _convert(original, group, pixels, file, settings)
-        add(found, {use.node: use.name for use in group})
+        outcome = _convert(original, group, pixels, file, settings)
+        add(outcome, {use.node: use.name for use in group})
     if sky is not None:
         progress("textures", len(groups), total)
         props = again.state.nodes[sky].props
-        name = label(props, None, "")
+        name = label(props, original.keys.get(original.scene.environment(), "environment"))
         path = str(props["filename"]) if "filename" in props else "sky"
         file = work / _file_name(path, False, {texture.file for texture in result.textures})
         add(_convert_sky(original, name, read_pixels(props), file, settings), {sky: name})
     progress("textures", total, total)
-    _rewrite(again, made, work, target)
+    _mark_integrator(original, again)
+    _rewrite(again, replacements, work, target)
     result.scene.write_text(_to_xml(again), encoding="utf-8")
     if settings.spp != 0:
         progress("renderings", 0, 2)
         after = pictures(mi.load_file(str(result.scene)), settings.spp)
         progress("renderings", 1, 2)
         result.psnr.extend(compare(original.pictures, after, work))
-        if sky in made:
+        if sky in replacements:
             others = pictures(original.scene, settings.spp, seed=1 << 16)
             result.noise.extend(map(psnr, original.pictures, others))
         progress("renderings", 2, 2)
@@ -311,7 +318,7 @@ def _convert(
 ) -> ConvertedTexture | str:
     """Fit the image of some uses and save the set, or return why it must stay.
 
-    Where the bitmap is better, there is no file.
+    If the bitmap is better, there is no file.
     """
     use, asked = group[0], (settings.target_psnr, settings.iterations)
     try:
@@ -376,29 +383,37 @@ def _chosen(
     )
 
 
-def _file_name(image: str, raw: bool, taken: set[str]) -> str:
-    """Name the file of a set by its image."""
+def _file_name(image: str, raw: bool, used: set[str]) -> str:
+    """Name the file of a set after its image."""
     stem = Path(image).stem
     names = [f"{stem}.npz", f"{stem}-data.npz", *(f"{stem}-{k}.npz" for k in range(2, 1000))]
-    return next(name for name in names[raw and f"{stem}.npz" in taken :] if name not in taken)
+    return next(name for name in names[raw and f"{stem}.npz" in used :] if name not in used)
 
 
 # --- The scene -----------------------------------------------------------------------------------
 
 
-def _rewrite(parsed: Parsed, made: dict[int, str], work: Path, target: Path) -> None:
+def _mark_integrator(original: Original, parsed: Parsed) -> None:
+    """Give the integrator its type, which Mitsuba's writer does not know of one in Python: prb."""
+    instances, nodes = original.parsed.state.root.props, parsed.state.nodes
+    for slot in instances.keys():  # noqa: SIM118  it is no mapping
+        if isinstance(instances[slot], mi.Integrator):
+            nodes[parsed.state.root.props[slot].index()].type = mi.ObjectType.Integrator
+
+
+def _rewrite(parsed: Parsed, replacements: dict[int, str], work: Path, target: Path) -> None:
     """Put the sets in the place of the bitmaps, and name other files relative to the folder.
 
-    `made` holds the new file for the index of each node that was a bitmap. Bitmaps that stay, and
-    sets that were there, become files too if they are in memory.
+    `replacements` holds the new file for the index of each node that was a bitmap. Bitmaps that
+    stay, and sets that were there already, become files too if they are in memory.
     """
     for index, node in enumerate(parsed.state.nodes):
         props = node.props
-        if index in made:
-            replace_bitmap(props, made[index])
+        if index in replacements:
+            replace_bitmap(props, replacements[index])
             continue
         if props.plugin_name() == GAUSSIANS and "to_uv" in props:
-            props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML lacks
+            props["to_uv"] = to_uv(props)  # it may be a transform of arrays, which XML cannot hold
         is_set = props.plugin_name() in (GAUSSIANS, SKY)
         if is_set and ("mean" in props or "coefficients" in props):
             _save_set(props, work, f"gaussians-{index}.npz")
@@ -425,10 +440,19 @@ def _save_set(props: Properties, folder: Path, file: str) -> None:
 
 
 def _to_xml(parsed: Parsed) -> str:
+    """Write a parsed scene as XML.
+
+    Mitsuba writes what a dictionary calls "floor" as ``name="floor"``. Only of an ``id`` does
+    `mitsuba.traverse` make a name.
+    """
     try:
-        return str(mi.parser.write_string(parsed.state))
+        root = ElementTree.fromstring(mi.parser.write_string(parsed.state))
     except RuntimeError as error:
         reason = str(error).partition("] ")[2] or str(error)
         raise ValueError(
             f"the scene cannot be written as XML ({reason}); give meshes and volumes by files"
         ) from None
+    for child in root:
+        if "type" in child.attrib and "name" in child.attrib and "id" not in child.attrib:
+            child.set("id", child.attrib.pop("name"))
+    return ElementTree.tostring(root, encoding="unicode")

@@ -1,4 +1,4 @@
-"""What textures and environments cost a renderer: bytes that they hold, and time of a lookup."""
+"""The cost of textures and environments to a renderer: memory, and the time of a lookup."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ ROUNDS = 20
 """Timings of each texture, of which the fastest counts; the textures take turns."""
 
 NEGLIGIBLE = 1 << 14
-"""Bytes that nobody saves: the smallest images take less."""
+"""Bytes that are not worth saving: the smallest images take less."""
 
 SLOWEST = 8.0
-"""Time of a lookup, in lookups of the bitmap, from which on the bitmap is better. Lookups are a
+"""Ratio of the lookup times of Gaussians and bitmap above which the bitmap is better. Lookups are a
 small part of a rendering: the picture of a coated ball takes 1.07 to 1.12 times as long where they
 take two to three times as long. On a busy machine, figures differ by a factor of two."""
 
 
 class Cost(NamedTuple):
-    """What the textures of an image cost.
+    """The cost of the textures of an image.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Cost(NamedTuple):
     nanoseconds: float
 
     def is_better_than(self, other: Cost) -> bool:
-        """Return whether bitmaps of this cost are better than Gaussians of the other one."""
+        """Return whether bitmaps of this cost are better than Gaussians of another."""
         is_smaller = other.bytes - self.bytes > NEGLIGIBLE
         return is_smaller or other.nanoseconds > SLOWEST * self.nanoseconds
 
@@ -67,8 +67,8 @@ def costs_of(kinds: Sequence[Sequence[Any]], look: Callable[[Any, Interaction], 
     points = _grid()
     fastest = [float("inf")] * len(kinds)
     for _ in range(1 + ROUNDS):  # the first round compiles
-        taken = [_time(look, plugin, points) for plugin in firsts]
-        fastest = [min(pair) for pair in zip(fastest, taken, strict=True)]
+        seconds = [_time(look, plugin, points) for plugin in firsts]
+        fastest = [min(pair) for pair in zip(fastest, seconds, strict=True)]
     held = [sum(map(resident_bytes, plugins)) for plugins in kinds]
     return [Cost(b, 1e9 * t / SIDE**2) for b, t in zip(held, fastest, strict=True)]
 
@@ -107,5 +107,5 @@ def of_texture(raw: bool, channels: int) -> Callable[[Texture, Interaction], Any
 
 
 def of_environment(emitter: mi.Emitter, points: Interaction) -> Any:
-    """Look an environment up, and sample a direction."""
+    """Look up an environment, and sample a direction."""
     return emitter.eval(points), emitter.sample_direction(points, points.uv)

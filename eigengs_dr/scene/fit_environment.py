@@ -1,8 +1,8 @@
 """Gaussians for an environment map: as cameras see it, and as it lights a scene.
 
-A renderer picks other directions of a set than of a bitmap, so renderings of few samples differ by
-their noise, and cannot judge. The pictures are compared instead, twice: as 8-bit sRGB, which is how
-cameras and mirrors see them, and as the light that white surfaces get, for all their normals.
+A renderer samples other directions from a set than from a bitmap, so renderings with few samples
+differ by their noise and cannot judge. Instead the pictures are compared, twice: as 8-bit sRGB,
+which is how cameras and mirrors see them, and as the light on white surfaces, for all normals.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from skimage.transform import resize_local_mean
 
 from ..fitting.fit import fit
 from ..fitting.options import Goal
-from ..gaussian.gaussians import Gaussians
-from ..image.color import to_coded
+from ..gaussian.gaussians import Gaussians, with_colors
+from ..image.color import LOG_SLOPE, from_log, to_coded, to_log
 from ..image.metrics import psnr
 from ..plugins.cone import pixel_angle
 from ..raster.render import render
@@ -32,11 +32,14 @@ the fit. Without points between, a set of 5,000 Gaussians in logarithms had 1.6 
 its bitmap: nothing saw them beside the texels."""
 
 CLOSER = (-6.0, 0.0, 8.0)
-"""PSNR of the fit above the goal, in dB: one after the other is tried, since the fit compares light
-with another weight than cameras do."""
+"""PSNR of the fit above the goal, in dB, tried in turn, since the fit weighs light differently from
+cameras."""
 
 BYTES = 100
-"""Bytes of a Gaussian in memory, at least: more Gaussians than a bitmap has memory for are none."""
+"""Fewest bytes of a Gaussian in memory; they limit a set to the memory of its bitmap."""
+
+NEWTON, TINY = 4, 1e-30
+"""Steps of `with_mean_of`, and a divisor for black maps."""
 
 BLOCKS, NORMALS = (32, 64), (9, 16)
 """Rows and columns of the directions of light, and of the normals of surfaces."""
@@ -47,29 +50,29 @@ def fit_environment(
     pixels: NDArray[np.float32],
     target_psnr: float,
     iterations: int,
-    most_bytes: int,
+    max_bytes: int,
 ) -> tuple[Gaussians, float]:
-    """Find as few Gaussians as show an environment map at a PSNR.
+    """Find the fewest Gaussians that show an environment map at a PSNR.
 
     Parameters
     ----------
     scene : mitsuba.Scene
-        Its cameras say how fine the map is seen; texels of less than half a pixel are halved.
+        Its cameras decide how fine the map must be; texels smaller than half a pixel are merged.
     pixels : ndarray of float32, shape (H, W, 3)
         Linear light.
     target_psnr : float
-        Of what cameras see, and of the light.
+        Goal for what cameras see, and for the light.
     iterations : int
         Steps of the fits.
-    most_bytes : int
-        Memory beyond which no set is wanted.
+    max_bytes : int
+        Largest memory of a set.
 
     Returns
     -------
     gaussians : Gaussians
         Of the size of the map.
     psnr : float
-        The lower one of the two, in dB.
+        The lower of the two, in dB.
 
     Raises
     ------
@@ -84,10 +87,12 @@ def fit_environment(
     target = np.repeat(pixels.clip(0), 3 // pixels.shape[2], axis=2)
     target = _as_seen(target, scene)
     spaces = ("log", "radiance") if target.max() > 1 + 1e-3 else ("linear",)
-    most, reached = max(1, most_bytes // BYTES), list[str]()
+    max_count, reached = max(1, max_bytes // BYTES), list[str]()
     for space, more in product(spaces, CLOSER):
-        goal = Goal(min(target_psnr + more, 99.0), max_gaussians=min(most, target[..., 0].size))
-        found = fit(
+        goal = Goal(
+            min(target_psnr + more, 99.0), max_gaussians=min(max_count, target[..., 0].size)
+        )
+        result = fit(
             target,
             target_psnr=goal,
             iterations=iterations,
@@ -95,11 +100,53 @@ def fit_environment(
             encoding="linear",
             progress=False,
         )
-        kept = closeness(_means(found.gaussians), target)
+        balanced = with_mean_of(target, result.gaussians)
+        kept = closeness(_means(balanced), target)
         if kept >= target_psnr:
-            return found.gaussians.scaled(width, height), kept
-        reached.append(f"{kept:.1f} dB with {len(found.gaussians):,} Gaussians")
+            return balanced.scaled(width, height), kept
+        reached.append(f"{kept:.1f} dB with {len(balanced):,} Gaussians")
     raise Unsuitable(f"an environment map: {', '.join(reached)} for a goal of {target_psnr:g} dB")
+
+
+def with_mean_of(target: NDArray[np.float32], gaussians: Gaussians) -> Gaussians:
+    """Return a set whose light has the mean of a map over the sphere, in each channel.
+
+    A sun has most of the light of a map and few of its texels, so a fit of logarithms may miss the
+    mean by a few percent. Light is multiplied by a factor. Logarithms c become ``c + g c + s``: of
+    all g and s that give the mean, those with the smallest ``sum of (g c + s)^2``, by Newton steps.
+
+    Parameters
+    ----------
+    target : ndarray of float32, shape (H, W, 3)
+        Linear light.
+    gaussians : Gaussians
+        Of three channels, near the target, in the space "linear", "radiance" or "log".
+
+    Returns
+    -------
+    Gaussians
+        With other colours and another background.
+    """
+    in_logarithms = gaussians.space == "log"
+    codes = np.float64(_means(gaussians))
+    codes = to_log(codes) if in_logarithms else codes
+    area = _areas(target) / _areas(target).sum()
+    arrays = gaussians.to_arrays()
+    rows = np.float64(np.vstack([arrays["color"], arrays["background"].reshape(1, -1)]))
+    for channel, wanted in enumerate(np.einsum("hwc,hw->c", target, area)):
+        code, change = codes[..., channel], np.zeros(1 + in_logarithms)
+        moves = np.stack([code, np.ones_like(code)][: len(change)])
+        metric = np.linalg.pinv(np.einsum("ihw,jhw,hw->ij", moves, moves, area))
+        for _ in range(NEWTON):
+            light = code + np.tensordot(change, moves, 1)
+            light = from_log(light) if in_logarithms else light
+            slope = math.log1p(LOG_SLOPE) * (light + 1 / LOG_SLOPE) if in_logarithms else 1.0
+            rate = np.einsum("ihw,hw->i", moves, slope * area)
+            step = metric @ rate
+            change += step * (wanted - (light * area).sum()) / max(rate @ step, TINY)
+        rows[:, channel] *= 1 + change[0]
+        rows[-1, channel] += change[1:].sum()
+    return with_colors(gaussians, rows, gaussians.space)
 
 
 def _means(gaussians: Gaussians) -> NDArray[np.float32]:
@@ -121,15 +168,20 @@ def _as_seen(pixels: NDArray[np.float32], scene: mi.Scene) -> NDArray[np.float32
     return np.ascontiguousarray(finer[:, FINER:-FINER])
 
 
-def closeness(found: NDArray[np.float32], target: NDArray[np.float32]) -> float:
+def closeness(texels: NDArray[np.float32], target: NDArray[np.float32]) -> float:
     """Return the lower PSNR in dB of two maps, shape (H, W, 3): as pictures, and as light."""
-    theta = (np.arange(len(target)) + 0.5) * (np.pi / len(target))
-    area = np.repeat(np.sin(theta)[:, None], target.shape[1], axis=1)
-    codes = [to_coded(k.clip(0, 1)) for k in (found, target)]
+    area = _areas(target)
+    codes = [to_coded(k.clip(0, 1)) for k in (texels, target)]
     seen = psnr(codes[0], codes[1], weight=area)
-    lights = [_irradiance(k * area[..., None]) for k in (found, target)]
+    lights = [_irradiance(k * area[..., None]) for k in (texels, target)]
     white = max(float(lights[1].max()), 1e-12)
     return min(seen, psnr(*(to_coded((k / white).clip(0, 1)) for k in lights)))
+
+
+def _areas(light: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the areas on the sphere of the texels of a map, but for a factor, shape (H, W)."""
+    theta = (np.arange(len(light)) + 0.5) * (np.pi / len(light))
+    return np.repeat(np.sin(theta)[:, None], light.shape[1], axis=1)
 
 
 def _irradiance(light: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -32,6 +32,7 @@ from ..image.color import to_coded, to_linear
 from ..image.io import check_data, check_image
 from ..image.metrics import psnr as psnr_of
 from ..plugins.cone import PIXEL
+from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
 from ..raster.render import render
 from .bitmaps import Unsuitable
@@ -48,11 +49,11 @@ ENOUGH = 2.0
 """Smallest number of texels per pixel without an enlargement. With fewer texels the image is
 interpolated bilinearly, as bitmaps are; else no sample would show the Gaussians between texels.
 With twice as many and more it is halved, again and again: the cameras see the same, and the fit
-takes a quarter of the time. 1,024 x 1,024 texels at 6 texels a pixel and more: 1,390 instead of
+takes a quarter of the time. 1,024 x 1,024 texels at 6 and more texels per pixel: 1,390 instead of
 1,515 Gaussians for 40 dB, and 46.81 instead of 46.87 dB between the renderings."""
 
 DETAIL = 64
-"""Fewest seen texels a Gaussian in a fit. A target with four times as many is halved, again and
+"""Fewest seen texels per Gaussian in a fit. A target with four times as many is halved, again and
 again: 200 Gaussians show no more of an enlarged image, and a step takes the time of its texels."""
 
 FINER = 3
@@ -138,9 +139,10 @@ def fit_for_scene(
     A scene whose poster has any texture; `examples/fit_for_scene.py` is a complete example::
 
         room = mi.load_file("room.xml")
-        found = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
-        poster = texture_of(found.gaussians)
+        result = eg.fit_for_scene(room, "poster.bsdf.reflectance", eg.load_image("poster.jpg"))
+        poster = texture_of(result.gaussians)
     """
+    check_scene("fit_for_scene", scene)
     if space not in COLORS:
         raise ValueError(f"space {space!r} is unknown; textures hold {' or '.join(COLORS)}")
     if not 0 < target_psnr < 60:  # from 59 dB on, 8-bit values have no error
@@ -156,18 +158,18 @@ def fit_for_scene(
     values = pixels if space == "data" else to_linear(pixels)
     peak = max(1.0, float(values.max())) if space == "radiance" else 1.0
     values, kind = values / np.float32(peak), "data" if space == "data" else "linear"
-    found = visibility(scene, texture, width, height, wrap_mode)
-    texels, box = float(found.footprint.min() / PIXEL), Box(0, 0, width, height)
+    native = visibility(scene, texture, width, height, wrap_mode)
+    texels, box = float(native.footprint.min() / PIXEL), Box(0, 0, width, height)
     if texels < ENOUGH:  # enlarged where it is seen: 8k texels would become 7 GB
-        box = _seen_box(found.seen, margin=1)
+        box = _seen_box(native.seen, margin=1)
         values = zoom(box.of(values), (FINER, FINER, 1), order=1, mode="nearest", grid_mode=True)
         fine_width, fine_height = FINER * width, FINER * height
         box = Box(*(FINER * side for side in box))
     else:
-        values = halved(values, found)
+        values = halved(values, native)
         fine_height, fine_width = values.shape[:2]
         box = Box(0, 0, fine_width, fine_height)
-    fine = found
+    fine = native
     if (fine_height, fine_width) != (height, width):
         fine = visibility(scene, texture, fine_width, fine_height, wrap_mode, box)
     values, fine, corner = _crop_to_seen(values, fine)
@@ -181,8 +183,8 @@ def fit_for_scene(
     target = smoothest_target(values, fine, lambda t: min(seen(t)) >= target_psnr + MARGIN)
     weight = error_weights(fine, target, kind)
 
-    max_gaussians = min(max_gaussians or int(found.seen.sum()), fine.seen.size)
-    looks = np.minimum(PIXEL / found.footprint[found.seen], 1) ** 2  # pixels per texel, at most 1
+    max_gaussians = min(max_gaussians or int(native.seen.sum()), fine.seen.size)
+    looks = np.minimum(PIXEL / native.footprint[native.seen], 1) ** 2  # pixels per texel, at most 1
     first = min(max(1, int(looks.sum()) // PIXELS), max_gaussians)
     objective = _objective(target, weight, fine.seen, first, kind)
     size = fine.seen.shape[1], fine.seen.shape[0]
@@ -207,28 +209,28 @@ def fit_for_scene(
     placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height, space=space)
     tried = [(row["gaussians"], row["psnr_ycbcr"]) for row in search.trace]
     whole = restored(placed.scaled(width, height), Affine(peak))
-    return SceneFit(whole, search.row["psnr"], found, tried)
+    return SceneFit(whole, search.row["psnr"], native, tried)
 
 
 def _objective(
     target: Image, weight: Image, seen: NDArray[np.bool_], count: int, space: str
 ) -> Pixels:
-    """Return the objective of a fit, at `DETAIL` texels a Gaussian; cameras judge all texels."""
+    """Return the objective of a fit, at `DETAIL` texels per Gaussian; cameras judge all texels."""
     times = 2 ** max(0, int(math.log2(max(1.0, seen.sum() / (DETAIL * count))) / 2))
     target, weight = shrunk(target, times), shrunk(weight, times)
-    shown = to_coded(target) if space == "linear" else target
+    placement_image = to_coded(target) if space == "linear" else target
     types = types_in(select(backend_of(mi.variant())))
-    return Pixels.of(Data(target, shown, weight), space, types)
+    return Pixels.of(Data(target, placement_image, weight), space, types)
 
 
-def halved(values: Image, found: Visibility) -> Image:
+def halved(values: Image, view: Visibility) -> Image:
     """Halve an image while pixels are at least `ENOUGH` texels large."""
-    texels = max(float(found.footprint.min() / PIXEL), ENOUGH)
+    texels = max(float(view.footprint.min() / PIXEL), ENOUGH)
     return shrunk(values, 2 ** int(np.log2(texels / ENOUGH)))
 
 
 def shrunk(values: Image, times: int) -> Image:
-    """Return means over so many texels along both sides."""
+    """Return means over blocks of so many texels along both sides."""
     if times == 1:
         return values
     small = tuple(-(-side // times) for side in values.shape[:2])
@@ -245,12 +247,12 @@ def _seen_box(seen: NDArray[np.bool_], margin: int = 0) -> Box:
     return Box(left, top, right - left, bottom - top)
 
 
-def _crop_to_seen(values: Image, found: Visibility) -> tuple[Image, Visibility, Box]:
+def _crop_to_seen(values: Image, view: Visibility) -> tuple[Image, Visibility, Box]:
     """Crop to the bounding box of the seen texels; also return it."""
-    box = _seen_box(found.seen)
-    texels = box.of(np.arange(found.seen.size).reshape(found.seen.shape)).ravel()
-    lookups = [rows[:, texels] for rows in found.pixel_to_texel]
-    cut = Visibility(box.of(found.footprint), lookups)
+    box = _seen_box(view.seen)
+    texels = box.of(np.arange(view.seen.size).reshape(view.seen.shape)).ravel()
+    lookups = [rows[:, texels] for rows in view.pixel_to_texel]
+    cut = Visibility(box.of(view.footprint), lookups)
     return np.ascontiguousarray(box.of(values)), cut, box
 
 

@@ -1,12 +1,13 @@
 """Gaussians for the uses of an image in a scene: pictures as cameras see them, and heights.
 
 Cameras see the slopes of a bump map, not its heights, and bitmaps have facets where Gaussians are
-smooth. So heights are fitted texel by texel, more closely than renderings shall be, and these
+smooth. So heights are fitted texel by texel, more closely than renderings need, and the renderings
 decide.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,13 +27,16 @@ from .rendering import pictures
 from .visibility import visibility
 
 CLOSER = (10.0, 15.0, 20.0)
-"""PSNR of heights above that of the renderings which they shall keep, in dB: one after the other is
-tried. Heights of waves and of smooth noise, 128 x 128 texels on 48 x 48 pixels, kept 41 and 43 dB
-between the renderings where they had 49 and 63 dB themselves, and those of tiles 34 where they had
-57: the slopes of a bitmap jump at its texels."""
+"""PSNR of the heights above that required of the renderings, in dB, tried in turn. Heights of waves
+and of smooth noise, 128 x 128 texels on 48 x 48 pixels, kept 41 and 43 dB between the renderings
+where they had 49 and 63 dB themselves, and those of tiles 34 where they had 57: the slopes of a
+bitmap jump at its texels."""
+
+NUMBERED = re.compile(r"object_\d+")
+"""Name that Mitsuba gives to objects without an id."""
 
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)
-"""Shares of the channels of a colour in a height, as Mitsuba has them."""
+"""Weights of the colour channels in a height, as in Mitsuba."""
 
 
 @dataclass
@@ -42,11 +46,11 @@ class Original:
     Attributes
     ----------
     make : callable
-        Parses it anew: what was instantiated cannot be written or changed.
+        Parses it again: an instantiated scene cannot be written or changed.
     spp : int or None
         Samples per pixel of renderings, by default those of the cameras.
     parsed : Parsed
-        Whose references to textures are their instances.
+        The parsed scene, whose references to textures are their instances.
     scene : mitsuba.Scene
     """
 
@@ -64,12 +68,28 @@ class Original:
         """What each camera sees, in sRGB."""
         return pictures(self.scene, self.spp)
 
+    @cached_property
+    def keys(self) -> dict[mi.Object, str]:
+        """The names of objects in `mitsuba.traverse`.
+
+        Under shapes without an id there are none: Mitsuba numbers them anew at each loading.
+        """
+        owners = {
+            key.rpartition(".")[0]: owner
+            for key, (_, _, owner, _) in mi.traverse(self.scene).properties.items()
+        }
+        return {owner: key for key, owner in owners.items() if not NUMBERED.match(key)}
+
+    def key_of(self, node: int, slot: str) -> str | None:
+        """Return the name of an object in `mitsuba.traverse`, see `keys`."""
+        return self.keys.get(self.parsed.state.nodes[node].props[slot])
+
     def textures(self, uses: list[Use]) -> list[mi.Texture]:
         """Return the instances of bitmaps."""
         return [self.parsed.state.nodes[use.parent].props[use.slot] for use in uses]
 
     def psnr_with(self, file: Path, uses: list[Use]) -> float:
-        """Return the lowest PSNR of a camera where a set alone takes the place of its bitmap."""
+        """Return the lowest PSNR of a camera if only this set replaces its bitmap."""
         other = self.make()
         for use in uses:
             replace_bitmap(other.state.nodes[use.node].props, str(file))
@@ -108,10 +128,10 @@ def fit_picture(
         If it must stay a bitmap.
     """
     use = group[0]
-    # Raw colours are colours all the same; pixels in memory are raw as a rule.
+    # Raw colours are still colours; pixels in memory are usually raw.
     plugin = original.parsed.state.nodes[use.parent].props.plugin_name()
     is_data = pixels.shape[2] == 1 or plugin == "normalmap"
-    found = fit_for_scene(
+    result = fit_for_scene(
         original.scene,
         original.textures(group),
         pixels,
@@ -121,7 +141,7 @@ def fit_picture(
         wrap_mode=[use.wrap for use in group],
         encoding="linear",
     )
-    return found.gaussians, min(found.psnr)
+    return result.gaussians, min(result.psnr)
 
 
 def fit_heights(
@@ -144,10 +164,10 @@ def fit_heights(
     Raises
     ------
     Unsuitable
-        If no set keeps the PSNR between the renderings, or nothing shall be rendered.
+        If no set keeps the PSNR between the renderings, or nothing is to be rendered.
     """
     if original.spp == 0:
-        raise Unsuitable("heights of a bump map: renderings decide, and none is wanted")
+        raise Unsuitable("heights of a bump map: renderings decide, and none was asked for")
     heights = pixels if pixels.shape[2] == 1 else (pixels @ LUMINANCE)[..., None]
     space_of(heights, True)  # it raises where Gaussians cannot hold them
     height, width, _ = heights.shape
@@ -156,7 +176,7 @@ def fit_heights(
     heights, weight = (halved(v, seen) for v in (heights, np.float32(seen.seen)[..., None]))
     reached = list[str]()
     for more in CLOSER:
-        found = fit(
+        result = fit(
             heights,
             target_psnr=min(target_psnr + more, 99.0),
             iterations=iterations,
@@ -164,7 +184,7 @@ def fit_heights(
             weight=weight[..., 0],
             progress=False,
         )
-        gaussians = found.gaussians.scaled(width, height)
+        gaussians = result.gaussians.scaled(width, height)
         gaussians.save(file)
         kept = original.psnr_with(file, group)
         if kept >= target_psnr:

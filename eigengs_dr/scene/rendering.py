@@ -19,8 +19,8 @@ Progress = Callable[[str, int, int], None]
 """``progress(label, done, total)``."""
 
 SAMPLES_PER_PASS = 1 << 24
-"""Most samples in one pass. The state of a sample takes some 20 bytes; progress and Ctrl-C wait
-for the end of a pass."""
+"""Largest number of samples in one pass. The state of a sample takes about 20 bytes; progress and
+Ctrl-C wait for the end of a pass."""
 
 
 class Rendering(NamedTuple):
@@ -44,10 +44,10 @@ class Rendering(NamedTuple):
     def picture(self, names: str = "RGBA") -> NDArray[np.float32]:
         """Return colours, shape (H, W, 1 to 4): those of the names, or Y for R, G and B.
 
-        A depth is no alpha: a channel counts by its name, not by its place.
+        A depth is not alpha: a channel is identified by its name, not by its place.
         """
-        wanted = [*names] if "R" in self.channels else ["Y", *names[3:]]
-        kept = [self.channels.index(name) for name in wanted if name in self.channels]
+        colors = [*names] if "R" in self.channels else ["Y", *names[3:]]
+        kept = [self.channels.index(name) for name in colors if name in self.channels]
         return np.ascontiguousarray(self.pixels[..., kept])
 
 
@@ -59,7 +59,7 @@ def render_in_passes(
     integrator: mi.Integrator | None = None,
     seed: int = 0,
 ) -> Rendering:
-    """Render a scene by one of its cameras; each pass has its own seed.
+    """Render a scene from one of its cameras; each pass has its own seed.
 
     Textures whose prefilter is ``true`` follow the camera.
 
@@ -74,7 +74,7 @@ def render_in_passes(
     integrator : mitsuba.Integrator, optional
         By default that of the scene.
     seed : int, optional
-        Of the first pass.
+        Seed of the first pass.
 
     Warns
     -----
@@ -88,11 +88,11 @@ def render_in_passes(
             emitter.set_scene(scene)
     width, height = sensor.film().crop_size()
     total = spp or sensor.sampler().sample_count()
-    most = max(1, SAMPLES_PER_PASS // (width * height))
+    max_count = max(1, SAMPLES_PER_PASS // (width * height))
     pixels: NDArray[np.float64] = np.zeros(())
     done = 0
     while done < total:
-        count = min(most, total - done)
+        count = min(max_count, total - done)
         part = mi.render(scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done)
         pixels = pixels + count * np.array(part, np.float64)
         done += count
@@ -115,8 +115,8 @@ def _channels(film: mi.Film, integrator: mi.Integrator, count: int) -> list[str]
     inside = {name[:-2]: None for name in aovs if name.endswith(".A")}
     layers = [f"{layer}.{name}" for layer in inside for name in plain]
     others = [name for name in aovs if name[:-2] not in inside]
-    found = [*(plain if inside else []), *layers[len(plain) :], *others]
-    return found if len(found) == count else [f"channel.{k}" for k in range(count)]
+    channels = [*(plain if inside else []), *layers[len(plain) :], *others]
+    return channels if len(channels) == count else [f"channel.{k}" for k in range(count)]
 
 
 LOUDER = 8.0
@@ -147,7 +147,7 @@ def compare(
 
 
 def pictures(scene: mi.Scene, spp: int | None, seed: int = 0) -> list[NDArray[np.float32]]:
-    """Render a scene by each camera in sRGB; equal scenes have the same random numbers.
+    """Render a scene from each camera in sRGB; equal scenes have the same random numbers.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def pictures(scene: mi.Scene, spp: int | None, seed: int = 0) -> list[NDArray[np
 
 
 def _picture(scene: mi.Scene, camera: int, spp: int | None, seed: int) -> NDArray[np.float32]:
-    """Render a scene by a camera in sRGB."""
+    """Render a scene from a camera in sRGB."""
     renderer = scene.integrator() or mi.load_dict({"type": "path"})
     rendering = render_in_passes(scene, camera, spp, integrator=renderer, seed=seed)
     light = rendering.picture("RGB")

@@ -51,8 +51,8 @@ def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
     ndarray of float32, shape (H, W, C)
         Equal to `values` at seen texels.
     """
-    known = seen[..., None]
-    levels = [(np.where(known, values, np.float32(0)), known.astype(np.float32))]
+    mask = seen[..., None]
+    levels = [(np.where(mask, values, np.float32(0)), mask.astype(np.float32))]
     while max(levels[-1][1].shape) > 1:
         mean, share = levels[-1]
         weight = _sum_of_blocks(share)
@@ -61,7 +61,7 @@ def extrapolate(values: Image, seen: NDArray[np.bool_]) -> Image:
     filled = levels[-1][0]
     for mean, share in reversed(levels[:-1]):
         filled = share * mean + (1 - share) * _doubled(filled, *mean.shape[:2])
-    return np.where(known, values, filled)
+    return np.where(mask, values, filled)
 
 
 def _sum_of_blocks(image: Image) -> Image:
@@ -82,14 +82,14 @@ def _doubled(image: Image, height: int, width: int) -> Image:
     return np.asarray(larger[:height, :width], np.float32)
 
 
-def back_project(whole: Image, found: Visibility, share: float) -> Image:
+def back_project(whole: Image, visibility: Visibility, share: float) -> Image:
     """Blur an image by a fraction of its footprints, then restore the details that pixels see.
 
     Parameters
     ----------
     whole : ndarray of float32, shape (H, W, C)
         Image in [0, 1], with the unseen texels from `extrapolate`.
-    found : Visibility
+    visibility : Visibility
     share : float
         Standard deviation of the blur B, as a fraction of that of the footprint.
 
@@ -98,9 +98,9 @@ def back_project(whole: Image, found: Visibility, share: float) -> Image:
     ndarray of float32, shape (H, W, C)
         Texture in [0, 1]. Every step clamps it to this range, as the plugin clamps its sums.
     """
-    blur = _blur_by(np.where(found.seen, found.footprint, np.inf) * share)
+    blur = _blur_by(np.where(visibility.seen, visibility.footprint, np.inf) * share)
     flat = whole.reshape(-1, whole.shape[2])
-    rows = found.pixel_to_texel
+    rows = visibility.pixel_to_texel
     goal = [r @ flat for r in rows]
     weight = np.maximum(sum(np.asarray(r.sum(axis=0)) for r in rows), 1e-9)[:, None]
     target = blur(whole)
@@ -116,7 +116,7 @@ def _blur_by(deviation: NDArray[np.floating]) -> Callable[[Image], Image]:
 
     The blur interpolates between uniform blurs whose standard deviations differ by sqrt(2). Images
     that are blurred by `COARSE` texels are halved, so that the cost does not grow with the
-    deviation. To halve adds the variance 1/4, and to interpolate 3/16 of a coarser texel. Texels
+    deviation. Halving adds the variance 1/4, and interpolating 3/16 of a coarser texel. Texels
     with an infinite deviation get the largest finite one.
     """
     finite = np.isfinite(deviation)
@@ -177,7 +177,7 @@ def seen_by(texels: Image, rows: csr_array, space: str, peak: float = 1.0) -> ND
     space : {"linear", "data"}
         Whether means of light are coded as sRGB.
     peak : float, optional
-        If it is above 1, light counts as it is and divided by the peak: it lights what cameras see.
+        If it is above 1, light counts as it is and divided by the peak: it also lights the scene.
 
     Returns
     -------
@@ -189,13 +189,15 @@ def seen_by(texels: Image, rows: csr_array, space: str, peak: float = 1.0) -> ND
     return to_coded(looks) if space == "linear" else looks
 
 
-def smoothest_target(values: Image, found: Visibility, is_close: Callable[[Image], bool]) -> Image:
+def smoothest_target(
+    values: Image, visibility: Visibility, is_close: Callable[[Image], bool]
+) -> Image:
     """Find the target of the fit: the smoothest texture that is close enough, or else the image.
 
     Parameters
     ----------
     values : ndarray of float32, shape (H, W, C)
-    found : Visibility
+    visibility : Visibility
     is_close : callable
         Whether a texture looks like the image to all cameras.
 
@@ -203,20 +205,20 @@ def smoothest_target(values: Image, found: Visibility, is_close: Callable[[Image
     -------
     ndarray of float32, shape (H, W, C)
     """
-    whole = extrapolate(values, found.seen)
+    whole = extrapolate(values, visibility.seen)
     for share in BLURS:
-        target = back_project(whole, found, share / PIXEL)
+        target = back_project(whole, visibility, share / PIXEL)
         if is_close(target):
             return target
     return whole
 
 
-def error_weights(found: Visibility, target: Image, space: str) -> Image:
+def error_weights(visibility: Visibility, target: Image, space: str) -> Image:
     """Return factors of the squared errors: each texel's share of the pixels.
 
     Parameters
     ----------
-    found : Visibility
+    visibility : Visibility
     target : ndarray of float32, shape (H, W, C)
     space : {"linear", "data"}
         In linear light dark texels weigh more, see `eigengs_dr.fitting.objective.dark_weight`.
@@ -225,7 +227,7 @@ def error_weights(found: Visibility, target: Image, space: str) -> Image:
     -------
     ndarray of float32, shape (H, W, C)
     """
-    share = gaussian_filter(found.pixels, EVEN) * found.seen
+    share = gaussian_filter(visibility.pixels, EVEN) * visibility.seen
     weight = (share / share.max())[..., None]
     light = dark_weight(target) if space == "linear" else np.ones_like(target)
     return (weight * light).astype(np.float32)

@@ -264,7 +264,7 @@ def visibility(
     width, height : int
         Size in texels: that of the image for the texture.
     wrap_mode : {"repeat", "mirror", "clamp"}, or a sequence of them, optional
-        Wrap mode of each bitmap, which Mitsuba does not tell; a ``gaussian_texture`` uses its own.
+        Wrap mode of each bitmap, which Mitsuba does not expose; a ``gaussian_texture`` has its own.
     part : Box, optional
         The part of the image that is measured, by default all of it. Nothing else may be seen.
 
@@ -317,7 +317,7 @@ def _name(texture: object) -> str:
 
 
 def _find(scene: mi.Scene, texture: str | Texture) -> tuple[Texture, list]:
-    """Find the texture of a name, and the shapes that use it.
+    """Find a texture by its name, and the shapes that use it.
 
     Raises
     ------
@@ -330,8 +330,10 @@ def _find(scene: mi.Scene, texture: str | Texture) -> tuple[Texture, list]:
         nodes = {key.rpartition(".")[0]: entry[2] for key, entry in entries}
         nodes = {key: n for key, n in nodes.items() if isinstance(n, texture_class())}
         if texture not in nodes:
-            known = ", ".join(name for name, t in nodes.items() if t.is_spatially_varying())
-            raise ValueError(f"texture {texture!r} is not in the scene; it has {known or 'none'}")
+            textures = ", ".join(name for name, t in nodes.items() if t.is_spatially_varying())
+            raise ValueError(
+                f"texture {texture!r} is not in the scene; it has {textures or 'none'}"
+            )
         node = nodes[texture]
     shapes = [shape for shape in scene.shapes() if node in mi.traverse(shape).hierarchy]
     if not shapes:

@@ -7,7 +7,7 @@ import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -144,7 +144,7 @@ def _opened(
     """Open a file of a format, up to a version; turn every error in the block into one line."""
     with open(path, "rb") as file:
         try:
-            with zipfile.ZipFile(file) as archive:
+            with _archive(file) as archive:
                 if version is not None:
                     _check_format(archive, name, version)
                 yield archive
@@ -159,6 +159,20 @@ def _opened(
                 f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "
                 "it may be damaged or of another kind"
             ) from None
+
+
+def _archive(file: BinaryIO) -> zipfile.ZipFile:
+    """Return the archive in a file; raise `BadValue` if it is none, or only its start."""
+    try:
+        return zipfile.ZipFile(file)
+    except zipfile.BadZipFile:
+        file.seek(0)
+        if file.read(4) == b"PK\x03\x04":
+            raise BadValue("is truncated; copy or save it again") from None
+        raise BadValue(
+            "not a file of eigengs_dr; give one that it saved ('eigengs-dr fit' makes one of an "
+            "image)"
+        ) from None
 
 
 def _check_format(archive: zipfile.ZipFile, name: str, version: int) -> None:

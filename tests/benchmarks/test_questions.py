@@ -37,6 +37,7 @@ from eigengs_bench.clock import METHODS
 from eigengs_bench.names import SETS, ImageSet
 from eigengs_bench.rows import FILE, read
 from eigengs_dr.fitting.fit import fit
+from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.io import load_image, save_image
 from eigengs_dr.image.resize import resample
 
@@ -429,7 +430,7 @@ def test_kernels(tiny, backend, tmp_path):
 @pytest.mark.mitsuba
 def test_texture(monkeypatch, tmp_path):
     pytest.importorskip("mitsuba")
-    from eigengs_bench import poster, texture
+    from eigengs_bench import poster, sky, texture
 
     small = {"SIDE": 16, "TEXELS": 16, "SPP": 1, "COUNTS": (20,), "SETTLED": 20, "CHANGED": (20,)}
     for name, value in (small | {"STEPS": 2, "ROUNDS": 1, "HELD": (20,)}).items():
@@ -437,8 +438,11 @@ def test_texture(monkeypatch, tmp_path):
     small = {"TEXELS": 64, "PIXELS": 32, "GOAL": 25.0, "PHOTOS": ("coffee",), "MAPS": ("gravel",)}
     for name, value in small.items():
         monkeypatch.setattr(poster, name, value)
+    small = {"ROWS": 32, "PIXELS": 8, "SPP": 4, "GOAL": 25.0, "STEPS": 5, "ROUNDS": 1}
+    for name, value in small.items():
+        monkeypatch.setattr(sky, name, value)
     text = said("bench", "texture", "-o", tmp_path)  # it times the ball anew each time
-    photo, material, letters, ball = read(tmp_path / FILE, "texture")
+    photo, material, letters, *lights, ball = read(tmp_path / FILE, "texture")
     for found, goal in ((photo, 25), (material, 25), (letters, poster.TEXT_GOAL)):
         assert found["psnr"] >= goal and found["psnr_bitmap"] >= goal and found["side"] <= 64
         assert found["filtered_bytes"] > found["bytes"] > 0
@@ -448,6 +452,20 @@ def test_texture(monkeypatch, tmp_path):
     assert ball["bytes_filtered_20"] > ball["bytes_20"] > 0 and ball["first_20_ms"] > 0
     assert ball["ratio_20"] > 0 and ball["ratio_step"] > 0 and ball["maps_3_ms"] > 0
     assert "memory, sharp text" in text and "coffee" in text
+    for light in lights:
+        assert light["mean"] < 0.2 and light["variance"] > 0 and light["ratio"] > 0
+        assert 15 < light["lookups"] < 60 and light["images"] > 20
+        assert light["bitmap_bytes"] > 0 and light["bytes"] > 0
+        assert light["job"]["light"] in text
+
+
+def test_a_psnr_without_noise():
+    from eigengs_bench.sky import psnr_without_noise
+
+    noise = np.random.default_rng(0).normal(0, 0.05, (2, 64, 32, 32, 3))
+    pictures = noise + np.reshape([0.3, 0.32], (2, 1, 1, 1, 1))
+    expected = -20 * np.log10(to_coded(np.array(0.32)) - to_coded(np.array(0.3)))
+    assert psnr_without_noise(pictures[1], pictures[0]) == pytest.approx(expected, abs=0.2)
 
 
 @pytest.mark.mitsuba

@@ -114,7 +114,7 @@ def test_the_commit_is_that_of_the_package(tmp_path):
 
 def test_memory_is_that_of_a_process_alone():
     assert 0.02 < rows.alone("it", rows.peak_gib)() < rows.peak_gib() + 1
-    with pytest.raises(ValueError, match="it: its process was ended"):
+    with pytest.raises(ValueError, match="it: its process was killed"):
         rows.alone("it", sys.modules["os"]._exit, 9)()
 
 

@@ -16,7 +16,13 @@ FEW = ["--gaussians", 200, "--iterations", 30, "--quiet"]
 
 @pytest.mark.parametrize(
     ("options", "size"),
-    [([], (32, 24)), (["--scale", "2"], (64, 48)), (["--size", "10x7"], (10, 7))],
+    [
+        ([], (32, 24)),
+        (["--scale", "2"], (64, 48)),
+        (["--size", "10x7"], (10, 7)),
+        (["--size", "16"], (16, 12)),
+        (["--size", "30", "--region", "4,4,20,10"], (30, 15)),
+    ],
 )
 def test_sizes(fitted, tmp_path, options, size):
     target = tmp_path / "y.png"
@@ -31,7 +37,8 @@ def test_sizes(fitted, tmp_path, options, size):
     [
         ["--scale", "2", "--size", "10x10"],
         *(["--scale", word] for word in ("0", "-1", "nan", "inf", "1e9")),
-        *(["--size", word] for word in ("10", "0x10", "10x-1", "99999999999x10", "25600x25600")),
+        *(["--size", word] for word in ("10x", "0", "0x10", "10x-1", "99999999999x10")),
+        ["--size", "25600x25600"],
         *(["--region", word] for word in ("1,2,3", "a,b,c,d", "0,0,0,5", "-1,0,5,5", "9,0,24,9")),
     ],
 )

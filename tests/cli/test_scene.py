@@ -182,7 +182,7 @@ BROKEN = [
     ('<shape type="sphere"><float name="size" value="$x"/></shape>', ["undefined", "$x"]),
     (
         '<texture type="gaussian_texture"><string name="filename" value="no.npz"/></texture>',
-        ["No such file or directory", "no.npz"],
+        ["no.npz: no such file; check the path"],
     ),
     (
         '<texture type="gaussian_texture"><float name="prefilter" value="1"/></texture>',

@@ -255,6 +255,10 @@ def test_pytorch():
         (lambda p, s: np.float32(1), "does not depend on the picture|returned float32"),
         (lambda p, s: squares(p) * (np.nan if s == 3 else 1), "nan at steps 1-9"),
         (lambda p, s: squares(p) / 0, "its value is inf for a picture"),
+        (
+            lambda p, s: squares(p) + dr.mean(dr.sqrt(p - p)),
+            "derivative at steps 0 and 10; dr.sqrt",
+        ),
     ],
 )
 def test_what_is_no_loss_ends_in_one_line(loss, message):
@@ -273,6 +277,7 @@ def test_what_is_no_loss_ends_in_one_line(loss, message):
         ({"loss": squares, "size": (8, 8), "space": {"a": "hsv"}}, "'hsv' is unknown"),
         ({"loss": squares, "size": (8, 8), "space": {"1a": "rgb"}}, "starts with a letter"),
         ({"loss": squares, "size": 8}, r"give \(width, height\)"),
+        ({"loss": squares, "size": (8.0, 8.0)}, r"give \(width, height\) in whole pixels"),
         ({"loss": squares, "size": (8, 8), "gaussians": [2, 4]}, "no levels"),
         ({"loss": squares, "size": (8, 8), "weight": np.ones((8, 9))}, "9x8 pixels, but size is"),
         ({"loss": squares, "size": (8, 8), "weight": np.ones((8, 8, 2))}, "2 channels, but the"),
@@ -286,8 +291,14 @@ def test_options_that_do_not_fit_are_refused(options, message):
     for arguments, text in (({"bounds": (1, 0)}, "smaller"), ({"target": 0}, "above 0")):
         with pytest.raises(ValueError, match=text):
             eg.Loss(squares, **arguments)
+    with pytest.raises(TypeError, match=r"is a Loss; change one by dataclasses\.replace"):
+        eg.Loss(eg.Loss(squares), bounds=(0, 1))
     with pytest.raises(TypeError, match="no function"):
         eg.Loss(3)
+    with pytest.raises(TypeError, match=r"<lambda>\(p\) is called with \(picture, step\)"):
+        eg.fit(IMAGE, 20, 10, loss=lambda p: squares(p))
+    with pytest.raises(TypeError, match=r"judge <lambda>\(p, step\) is called with \(picture\)"):
+        eg.Loss(squares, judge=lambda p, step: 0.0)
     with pytest.raises(TypeError, match="give an optimiser"):
         eg.Loss(squares, parameters={"gain": 1})
     with pytest.raises(TypeError, match="unknown option 'loss'"):

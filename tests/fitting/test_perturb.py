@@ -29,13 +29,13 @@ def moves(before, after):
     return np.stack([a * x + b * y, c * y]), np.stack([k / a, (m - k * b / a) / c, n / c])
 
 
-def perturbed(before, error, strength, seed, own=range(COUNT), backend="llvm", images=1):
+def perturbed(before, error, strength, seed, movable=range(COUNT), backend="llvm", images=1):
     """The arrays after `perturb`; the error is that of each image."""
     types = types_in(select(backend), 64)
     mean, factor, color = (upload_rows(types.Float, before[k].T) for k in before)
     errors = upload(types.Float, np.broadcast_to(error, images))
     rows = types.Float2(*mean), types.Float3(*factor), color
-    after = perturb(*rows, own, errors, strength, seed, images)
+    after = perturb(*rows, movable, errors, strength, seed, images)
     return {"mean": after[0].numpy().T, "factor": after[1].numpy().T}
 
 
@@ -83,7 +83,7 @@ def test_the_error_added_to_an_image():
 
     strength, error, added = 0.3, 0.05, []
     for seed in range(200):
-        moved = perturbed(arrays, error, strength, seed, own=range(1))
+        moved = perturbed(arrays, error, strength, seed, movable=range(1))
         added.append(np.square(image(moved["mean"]) - image(arrays["mean"])).sum())
     assert np.mean(added) == pytest.approx(strength**2 * error, rel=0.2)
 

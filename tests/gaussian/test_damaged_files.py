@@ -67,6 +67,19 @@ def test_files_made_by_hand(path):
         check_equal(Gaussians.load(path), arrays_of(random_scene()))
 
 
+def test_what_is_no_file_of_a_set(path):
+    for name, kind, words in (
+        (path, FileNotFoundError, "no such file; check"),
+        (path.parent, IsADirectoryError, "is a folder; give a file"),
+    ):
+        with pytest.raises(kind) as error:
+            Gaussians.load(name)
+        assert str(error.value).startswith(f"{name}: {words}")
+    content = zipped(members())
+    check_refused(path, content[: len(content) // 2], "is truncated; copy or save it again")
+    check_refused(path, b"a photo, or text", "not a file of eigengs_dr; give one that")
+
+
 def test_files_cut_off_anywhere(path):
     content = zipped(members())
     for length in range(0, len(content), 7):

@@ -125,6 +125,7 @@ def test_exif_orientation(tmp_path):
         (None, "no such file"),
         (b"", "empty"),
         (b"some text\n", "not an image"),
+        (b"hi\n", "not an image"),  # shorter than what some decoders unpack to recognise a file
         ("/", "is a folder"),
     ],
 )

@@ -155,9 +155,7 @@ def test_a_fit_works_where_a_set_does(photos, tmp_path):
         == eg.pack(result.gaussians, tmp_path / "b.egs").bytes
     )
     assert "Gaussians" in eg.view(result).html
-    with pytest.raises(
-        TypeError, match="ndarray is not a set of Gaussians; pass Gaussians or a Fit"
-    ):
+    with pytest.raises(TypeError, match="ndarray is not a set of Gaussians; pass Gaussians"):
         eg.render(result.image)
     pixels = eg.load_image(photos / "0.png")
     assert result.psnr_rgb == pytest.approx(eg.psnr(pixels, result.image, space="rgb"), abs=1e-4)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.chi_square import assert_density
 from _helpers.errors import refused
 from _helpers.poster import camera
 from _helpers.skies import HEIGHT, WIDTH, directions, lit, mi, seen, sky, uniform
@@ -223,28 +224,20 @@ class TestSampling:
 
     @pytest.mark.parametrize("name", SETS)
     def test_chi_square(self, name):
-        """Mitsuba's own test, of directions against their density."""
-        from mitsuba.chi2 import ChiSquareTest, SphericalDomain
+        from mitsuba.chi2 import SphericalDomain
 
         emitter = mi.load_dict(environment_of(sky(**SETS[name]), to_world=turn("about all")))
+
+        def sample(numbers):
+            it = dr.zeros(mi.Interaction3f, dr.width(numbers))
+            return emitter.sample_direction(it, numbers)[0].d
 
         def density(d):
             ds = dr.zeros(mi.DirectionSample3f, dr.width(d))
             ds.d = d
             return emitter.pdf_direction(dr.zeros(mi.Interaction3f, dr.width(d)), ds)
 
-        test = ChiSquareTest(
-            domain=SphericalDomain(),
-            sample_func=lambda sample: (
-                emitter.sample_direction(dr.zeros(mi.Interaction3f, dr.width(sample)), sample)[0].d
-            ),
-            pdf_func=density,
-            sample_dim=2,
-            sample_count=100_000,
-            res=64,
-            ires=32,
-        )
-        assert test.run(), test.messages
+        assert_density(sample, density, SphericalDomain(), 100_000, 32)
 
     def test_one_sample_finds_the_light(self):
         """Of a sun 1,000 times as bright as the sky; evenly spread samples have a noise of 20."""

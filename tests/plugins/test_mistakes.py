@@ -5,7 +5,7 @@ import pytest
 
 from _helpers.texture import at, gaussians, mi, texture
 from _helpers.variants import in_variants, on_both
-from eigengs_dr.plugins import texture_of
+from eigengs_dr.plugins import follow, gaussians_of, keep_in_bounds, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -18,6 +18,7 @@ class TestMistakes:
         [
             ({"filename": "nowhere.npz"}, "nowhere.npz"),
             ({"filename": __file__}, r"test_mistakes\.py"),
+            ({"filename": "a.png"}, "a.png: is an image, .* 'eigengs-dr fit', .* plugin bitmap"),
             ({}, "give one of filename"),
             ({"filename": "a.npz", "model": "b.npz"}, "give one of filename"),
         ],
@@ -25,6 +26,10 @@ class TestMistakes:
     def test_of_where_from(self, properties, message):
         with pytest.raises(RuntimeError, match=message):
             mi.load_dict({"type": "gaussian_texture", **properties})
+
+    def test_a_photo_as_environment(self):
+        with pytest.raises(RuntimeError, match=r"is an image, .* the plugin envmap"):
+            mi.load_dict({"type": "gaussian_environment", "filename": "sky.exr"})
 
     @pytest.mark.parametrize(
         ("properties", "message"),
@@ -71,6 +76,20 @@ class TestMistakes:
     def test_scalar_variants(self, variant):
         with pytest.raises(RuntimeError, match="does not support the variant scalar_rgb; use"):
             mi.load_dict({"type": "gaussian_texture", "filename": "x.npz"})
+
+    def test_the_name_of_no_texture(self):
+        parameters = mi.traverse(
+            mi.load_dict({"type": "diffuse", "reflectance": texture_of(gaussians())})
+        )
+        for name in ("reflectance.mean", "bsdf.reflectance"):
+            for function in (gaussians_of, keep_in_bounds):
+                with pytest.raises(ValueError, match=f"no {name}.mean .* mitsuba.traverse"):
+                    function(parameters, name, gaussians())
+
+    def test_no_scene_to_follow_in(self):
+        sensor = mi.load_dict({"type": "perspective"})
+        with pytest.raises(TypeError, match=r"follow: scene is a .*; give a loaded one"):
+            follow(sensor, sensor)
 
     def test_parameters_of_another_shape(self):
         tex = texture(gaussians())

@@ -15,12 +15,12 @@ So the density and the error of one fit give the best density:
 
     rho' ~ k^(1 / (q + 1)) = rho s^(1 / (q + 1)).
 
-Only a fit can tell parts that are hard to fit from parts that just have large second derivatives.
+Only a fit can tell parts that are hard to fit from parts that merely have large second derivatives.
 Neighbouring Gaussians share their errors, see `eigengs_dr.fitting.placement.density.Owners`; in
 what a Gaussian owns, the density follows the second derivatives. The constants were chosen on
 training images of ImageNet classes and of cats, by the error after 1,000 steps.
 
-Images are in tile layout, and all of it runs on the device. A batch of images takes one launch of
+Images are in tile layout, and everything runs on the device. A batch of images takes one launch of
 each kernel; no sum of one depends on another.
 """
 
@@ -82,7 +82,7 @@ def place_adaptive(
 ) -> Gaussians:
     """Place and shape Gaussians by the second derivatives of an image, with the colour 0.
 
-    All of it runs on the device, without a copy to the host.
+    Everything runs on the device, without a copy to the host.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def place_adaptive(
     count : int
         Number of Gaussians of an image, from 1 to W H.
     cutoff : float, optional
-        That of the set, see `eigengs_dr.Gaussians`.
+        Cutoff of the set, see `eigengs_dr.Gaussians`.
     density : callable, optional
         See `Density`.
 
@@ -101,7 +101,7 @@ def place_adaptive(
         Neighbours in memory are close in space.
     """
     types, grid, channels = objective.types, objective.grid, objective.channels
-    mean, factor = _place(Canvas.of(types, grid), objective.shown, count, density)
+    mean, factor = _place(Canvas.of(types, grid), objective.placement_image, count, density)
     color = [dr.zeros(types.Float, grid.images * count) for _ in range(channels)]
     background = [dr.zeros(types.Float, grid.images) for _ in range(channels)]
     dr.make_opaque(color, background)
@@ -109,14 +109,16 @@ def place_adaptive(
     placed = Gaussians(mean, factor, *rows, *objective.size, objective.space, float(cutoff))
     placed = placed.bounded()
     dr.eval(placed)
-    release_memory(dr.width(objective.shown))  # nothing later asks for blocks of these sizes
+    release_memory(
+        dr.width(objective.placement_image)
+    )  # nothing later asks for blocks of these sizes
     return placed
 
 
 def _place(
     canvas: Canvas, image: Float, count: int, density: Density | None, times: int = 1
 ) -> tuple[Rows, Rows]:
-    """Return the means and the factors of `place_adaptive`, of an image that was shrunk before."""
+    """Return the means and the factors of `place_adaptive`, for an image after shrinking."""
     types, grid = canvas.types, canvas.grid
     spacing = math.sqrt(grid.width * grid.height / count)
     smaller = int(spacing / WORKING_SPACING)
@@ -189,18 +191,18 @@ def density_from_hessian(canvas: Canvas, image: Float, spacing: float) -> tuple[
 
 
 def normalize_density(canvas: Canvas, density: Float, count: int) -> Float:
-    """Scale a density to a sum of about `count` an image, with at most one Gaussian per pixel."""
+    """Scale a density to a sum of about `count` per image, with at most one Gaussian per pixel."""
     types, grid = canvas.types, canvas.grid
-    wanted = dr.opaque(types.Float, count)
+    total = dr.opaque(types.Float, count)
     values = types.FloatX(gather_run(types, density, canvas.tile, PIXELS, True))
     image = canvas.sizes.image_of(canvas.tile)
 
     def scaled(factor: Float) -> Float:
         return dr.minimum(values * spread(factor, image), 1)
 
-    factor = wanted / sum_by_image(dr.sum(values, axis=0), grid)
+    factor = total / sum_by_image(dr.sum(values, axis=0), grid)
     for _ in range(4):  # each round moves the excess of full pixels to the others
-        factor *= wanted / sum_by_image(dr.sum(scaled(factor), axis=0), grid)
+        factor *= total / sum_by_image(dr.sum(scaled(factor), axis=0), grid)
     result = dr.empty(types.Float, dr.width(density))
     dr.scatter(result, scaled(factor), canvas.tile)
     dr.eval(result)

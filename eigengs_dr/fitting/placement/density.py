@@ -1,4 +1,4 @@
-"""Where a fit left error: the density of Gaussians for it."""
+"""The density of Gaussians for the error that a fit left."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ ERROR_EXPONENT = 4 / 3
 is 4 dB less, as measured from 1,250 to 20,000 Gaussians on 256x256 pixels."""
 
 MIN_ERROR_SHARE = 1e-3
-"""Smallest error of a Gaussian, relative to the average, so that no part of an image gets empty."""
+"""Smallest error of a Gaussian, relative to the average, so that no part of an image is empty."""
 
 NO_ERROR = 1e-12
 """Smallest squared error of a Gaussian: parts without any error keep some Gaussians too."""
 
 NO_WEIGHT = 1e-6
-"""Sum of weights that counts as none: pixels that no Gaussian reaches take the average."""
+"""Sum of weights that counts as zero: pixels that no Gaussian reaches take the average."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def squared_error(gaussians: Gaussians, objective: Pixels, lists: TileLists | No
     gaussians : Gaussians
     objective : Pixels
     lists : TileLists, optional
-        Those of the set, if they are there.
+        Lists of the set, if available.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def density_ratio(owners: Owners, error: Float, bending: Float) -> Float:
     Returns
     -------
     Float, shape (N,)
-        For what each old Gaussian owns.
+        The ratio for the part that each old Gaussian owns.
     """
     lists = owners.lists
     share, mass = owners.collect(error, bending)
@@ -174,7 +174,7 @@ def target_density(owners: Owners, error: Float, bending: Float) -> Float:
     Parameters
     ----------
     owners : Owners
-        Those of the old set.
+        Parts of the old set.
     error : Float, shape (pixels,)
         Its squared error, in tile layout.
     bending : Float, shape (pixels,)

@@ -30,7 +30,7 @@ Number = TypeVar("Number", Float, UInt, covariant=True)
 
 
 class Line(Protocol[Number]):
-    """The rows of an array of several, of floats or of integers."""
+    """The rows of an array, of floats or of integers."""
 
     def __len__(self) -> int: ...
     def __getitem__(self, row: int, /) -> Number: ...
@@ -45,7 +45,7 @@ class Canvas:
     types : ArrayTypes
     grid : Grid
     sizes : GridArrays
-        Those of `grid`: each costs some microseconds, and many kernels need them.
+        Sizes of `grid`: computing them takes microseconds, and many kernels need them.
     """
 
     types: ArrayTypes
@@ -87,9 +87,9 @@ class Canvas:
         return tile * PIXELS + self.types.UInt((y & 3) * SIDE + (x & 3))
 
     def pixels(self, index: UInt | None = None) -> tuple[UInt, UInt, UInt, Bool]:
-        """Return column, row, first tile of the image, and whether it is inside, of pixels.
+        """Return column, row, first tile of the image, and whether it is inside, for pixels.
 
-        They are those of an index in tile layout, by default all: a lane owns a pixel.
+        The pixels have an index in tile layout, by default all: a lane owns a pixel.
         """
         if index is None:
             index = dr.arange(self.types.UInt, self.grid.tiles * PIXELS)
@@ -102,7 +102,7 @@ class Canvas:
         return column, row, self.first_tile(self.sizes.image_of(tile)), inside
 
     def store(self, values: list[Number]) -> Number:
-        """Write the values of all tiles, a list by pixels and channels; return the image."""
+        """Write the values of all tiles, listed by pixels and channels; return the image."""
         result = dr.empty(type(values[0]), self.grid.tiles * len(values))
         rows = dr.replace_type_t(self.types.FloatX, dr.type_v(result))
         dr.scatter(result, rows(values), self.tile)
@@ -198,7 +198,7 @@ def scan(
         its first line; and whether there is such a tile.
     """
     types, side = canvas.types, canvas.sides()[axis]
-    own = types.Int(canvas.tile)
+    tile = types.Int(canvas.tile)
     here = canvas.corner(canvas.tile)[axis]
     step = (1, canvas.sizes.nx)[axis]
     length = SIDE * canvas.channels(source)
@@ -207,9 +207,9 @@ def scan(
     def look(distance: UInt, state: State) -> tuple[UInt, State]:
         first = here + distance * SIDE
         inside = (first >= 0) & (first < side)
-        start = (own + distance * step) * SIDE
+        start = (tile + distance * step) * SIDE
         lines = [
-            dr.gather(kind, source, types.UInt(start + k), inside, shape=(length, dr.width(own)))
+            dr.gather(kind, source, types.UInt(start + k), inside, shape=(length, dr.width(tile)))
             for k in range(SIDE)
         ]
         return distance + 1, visit(lines, distance * SIDE, first, inside, state)
@@ -265,7 +265,8 @@ def blur(canvas: Canvas, image: Float, deviation: float) -> Float:
     """Return the means of the pixels around each pixel, by Gaussian weights; evaluated.
 
     Only pixels of the image count: near its edges, means are over those inside the window. `image`
-    is as for `weighted_sums`, the deviation in pixels; outside the image are any finite values.
+    is as for `weighted_sums`, the deviation in pixels; outside the image, values are any finite
+    numbers.
     """
     return weighted_sums(canvas, image, Weights.of(canvas.types, deviation), means=True)
 
@@ -305,11 +306,11 @@ def weighted_sums(canvas: Canvas, image: Float, weights: Weights, means: bool = 
                 weight.append(dr.select(dr.abs(away) <= radius, near, 0))
             for k in range(SIDE):
                 counts = inside & (first + k < end)
-                for own in range(SIDE):
-                    w = weight[k - own + SIDE - 1]
-                    sums[own] = dr.fma(w, lines[k], sums[own])
+                for row in range(SIDE):
+                    w = weight[k - row + SIDE - 1]
+                    sums[row] = dr.fma(w, lines[k], sums[row])
                     if means:
-                        totals[own] = totals[own] + dr.select(counts, w, 0)
+                        totals[row] = totals[row] + dr.select(counts, w, 0)
             return sums, totals
 
         zeros = [dr.zeros(types.FloatX, (length, 1)) for _ in range(SIDE)]
@@ -351,7 +352,7 @@ def squared_hessian(canvas: Canvas, image: Float, noise: float) -> tuple[Float, 
     row += inner
 
     def load(step: int) -> list:
-        """Return the values of 6 pixels: those of the row above, of the own or of that below."""
+        """Return the values of 6 pixels: those of its row, or of the row above or below."""
         source = types.Int(lane) + step
         if step:
             leaves = inner == (0 if step < 0 else SIDE - 1)
@@ -372,12 +373,12 @@ def squared_hessian(canvas: Canvas, image: Float, noise: float) -> tuple[Float, 
         return values
 
     FloatX = types.FloatX
-    own = load(0)
-    above = list(dr.select(row > 0, FloatX(load(-1)), FloatX(own)))
-    below = list(dr.select(row + 1 < height, FloatX(load(1)), FloatX(own)))
+    middle_row = load(0)
+    above = list(dr.select(row > 0, FloatX(load(-1)), FloatX(middle_row)))
+    below = list(dr.select(row + 1 < height, FloatX(load(1)), FloatX(middle_row)))
     (up_left, up, up_right), (left, middle, right), (down_left, down, down_right) = (
         [FloatX(v[k * channels : k * channels + length]) for k in range(3)]
-        for v in (above, own, below)
+        for v in (above, middle_row, below)
     )
     # Differences of neighbours first: those of close floats are exact.
     xx, yy = (right - middle) - (middle - left), (down - middle) - (middle - up)
@@ -392,8 +393,8 @@ def squared_hessian(canvas: Canvas, image: Float, noise: float) -> tuple[Float, 
         own_energy = [sums[0] + base, sums[1] + base, sums[2]]
         energy += [dr.select(inside, e, 0) for e in own_energy]
         trace.append(dr.select(inside, own_energy[0] + own_energy[1], 0))
-    found = [dr.empty(types.Float, dr.width(lane) * len(v)) for v in (energy, trace)]
-    for array, values in zip(found, (energy, trace), strict=True):
+    arrays = [dr.empty(types.Float, dr.width(lane) * len(v)) for v in (energy, trace)]
+    for array, values in zip(arrays, (energy, trace), strict=True):
         dr.scatter(array, FloatX(values), lane)
-    dr.eval(found)
-    return found[0], found[1]
+    dr.eval(arrays)
+    return arrays[0], arrays[1]

@@ -6,7 +6,7 @@ one size, and h hardly changes below them: with h of the pixel, ``<w, h w> = h <
 of g over h, and the largest reduction is where ``h c^2`` is largest.
 
 Images are in tile layout. A batch of images takes one launch of each kernel, and each image has
-peaks of its own.
+its own peaks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ...raster.parameters import gather_run
 from .filters import PIXELS, SIDE, Canvas, neighbourhood, radius_of
 
 SIZE = 0.6
-"""Standard deviation of an added Gaussian in pixels. The descent makes it as large as it should be.
+"""Standard deviation of an added Gaussian in pixels. The descent adapts its size.
 Peaks over three sizes in proportion to the mean spacing take four times as long, and have 0.01 to
 0.09 dB less, but 0.05 more with 10,000 Gaussians. 0.4 and 0.9 pixels lose 0.1 to 0.3 dB where
 Gaussians are dense (ten training photos of 256x256 pixels, 832 to 10,000 Gaussians, 300 to 3,000
@@ -83,7 +83,7 @@ def residual_peaks(canvas: Canvas, slope: Float, curvature: Float, count: int) -
     colors, maxima = _maxima(canvas, slope, curvature)
     place = dr.compress(maxima > 0)
     place, image, rank = _ranked(place, maxima, canvas, count)
-    if not dr.width(place):  # Dr.Jit does not compute with no elements
+    if not dr.width(place):  # Dr.Jit does not compute with empty arrays
         none = types.Float()
         return Peaks(types.Float2(none, none), [none] * channels, place, place)
     x, y, *_ = canvas.pixels(place)
@@ -106,12 +106,12 @@ def _maxima(canvas: Canvas, slope: Float, curvature: Float) -> tuple[Float, Floa
     colors = [dr.select(h > 0, b / h, 0) for b, h in zip(blurred, factors, strict=True)]
     terms = [c * b for c, b in zip(colors, blurred, strict=True)]
     gains = [sum(terms[n * channels : (n + 1) * channels]) for n in range(PIXELS)]
-    found = canvas.store(colors), canvas.store(gains)
-    dr.eval(found)
-    rows = neighbourhood(canvas, found[1], 1)
+    arrays = canvas.store(colors), canvas.store(gains)
+    dr.eval(arrays)
+    rows = neighbourhood(canvas, arrays[1], 1)
     maxima = canvas.store([_if_maximum(rows, n % SIDE + 1, n // SIDE + 1) for n in range(PIXELS)])
     dr.eval(maxima)
-    return found[0], maxima
+    return arrays[0], maxima
 
 
 def _blurred(rows: list, channels: int) -> list:
@@ -131,13 +131,13 @@ def _blurred(rows: list, channels: int) -> list:
 
 
 def _if_maximum(rows: list, x: int, y: int) -> Float:
-    """Return a value if it is the largest of 3x3, of equal ones the first; 0 otherwise."""
-    own, largest = rows[y][x], True
+    """Return a value if it is the largest of 3x3, or the first of equal ones; 0 otherwise."""
+    center, largest = rows[y][x], True
     for k in range(9):
         other = rows[y + k // 3 - 1][x + k % 3 - 1]
         if k != 4:
-            largest &= own > other if k < 4 else own >= other
-    return dr.select(largest, own, 0)
+            largest &= center > other if k < 4 else center >= other
+    return dr.select(largest, center, 0)
 
 
 def _ranked(place: UInt, gain: Float, canvas: Canvas, count: int) -> tuple[UInt, UInt, UInt]:

@@ -1,7 +1,7 @@
 """Centres of equal mass: pieces of a Hilbert curve through the pixels, and a Lloyd step.
 
-Masses and moments are sums of integers, in fixed point: they do not depend on the order in which a
-device adds.
+Masses and moments are sums of integers, in fixed point: they do not depend on the order of
+summation.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _curve_in_tile() -> list[tuple[int, int]]:
 
 
 CURVE = _curve_in_tile()
-"""Column and row of the pixels of a tile in the order of the curve, in the state 0."""
+"""Column and row of the pixels of a tile in the order of the curve, for state 0."""
 
 
 def curve_of(canvas: Canvas) -> tuple[UInt, UInt]:
@@ -126,13 +126,13 @@ def stratify_along_hilbert(canvas: Canvas, density: Float, count: int) -> tuple[
     rank, state = curve_of(canvas)
     values = gather_run(types, density, canvas.tile, PIXELS, True)
     mass = fixed(sum(values))
-    own = [mass]
+    tile_moments = [mass]
     lines = [values[k::SIDE] for k in range(SIDE)], [values[k : k + SIDE] for k in (0, 4, 8, 12)]
     for edge, axis in zip(canvas.corner(canvas.tile), lines, strict=True):
         moment = sum(sum(line) * (k + 0.5) for k, line in enumerate(axis))
-        own.append(fixed(moment) + UInt64(edge) * mass)
-    sums = [dr.empty(UInt64, grid.tiles) for _ in own]
-    for array, value in zip(sums, own, strict=True):
+        tile_moments.append(fixed(moment) + UInt64(edge) * mass)
+    sums = [dr.empty(UInt64, grid.tiles) for _ in tile_moments]
+    for array, value in zip(sums, tile_moments, strict=True):
         dr.scatter(array, value, rank)
     where = dr.empty(types.UInt, grid.tiles)
     dr.scatter(where, canvas.tile * 4 + state, rank)
@@ -212,9 +212,9 @@ def _moments_in_tile(
     columns, rows = along(lambda x, y: x + 0.5), along(lambda x, y: y + 0.5)
     moments = types.Float(0), types.Float(0)
     for value, column, row in zip(masses, columns, rows, strict=True):
-        taken = dr.minimum(mass, value)
-        mass -= taken
-        moments = dr.fma(taken, column, moments[0]), dr.fma(taken, row, moments[1])
+        part = dr.minimum(mass, value)
+        mass -= part
+        moments = dr.fma(part, column, moments[0]), dr.fma(part, row, moments[1])
     return moments
 
 
@@ -234,8 +234,8 @@ FRACTION = 30
 """Bits behind the point of a mass."""
 
 LOCAL = dr.ReduceMode.Local
-"""Copies of an array for each thread, which is how Dr.Jit adds to small ones, make a program of its
-size."""
+"""Local mode, because Dr.Jit adds to small arrays in one copy per thread, which would make the
+program depend on their size."""
 
 
 def lloyd_step(
@@ -247,9 +247,9 @@ def lloyd_step(
     steps; of smooth images, 0.9 dB before the first step and 0.6 dB after 30 (8 crops of 96x96
     pixels, 40 and 300 Gaussians). Two searches took 2 and 4 % fewer Gaussians.
 
-    A centre counts as the middle of its pixel; of several in one pixel, only the last moves. The
-    squares of distances along both axes add up. Therefore the nearest centre is found along columns
-    first, and of those found along rows. A key holds the square, and both distances.
+    A centre counts as the middle of its pixel; if a pixel has several, only the last one moves. The
+    squares of distances along both axes add up. Therefore the nearest centres are found along
+    columns first, and the nearest of these along rows. A key holds the square, and both distances.
 
     Parameters
     ----------
@@ -281,14 +281,14 @@ def lloyd_step(
     # The centroids
     x, y, first, _ = canvas.pixels()
     away = [((keys >> shift) & (2 * HALF - 1)) - HALF for shift in (0, BITS)]
-    found = (keys < NONE) & (density > 0)
-    owner = dr.gather(UInt, last, canvas.place(first, x + away[0], y + away[1]), found) - 1
+    counts = (keys < NONE) & (density > 0)
+    owner = dr.gather(UInt, last, canvas.place(first, x + away[0], y + away[1]), counts) - 1
     sums = [dr.zeros(UInt64, count) for _ in range(3)]
     dr.make_opaque(sums)
     mass = UInt64(density * dr.opaque(types.Float, 2.0**FRACTION))
     terms = mass, mass * UInt64(HALF - away[0]), mass * UInt64(HALF - away[1])
     for array, term in zip(sums, terms, strict=True):
-        dr.scatter_reduce(dr.ReduceOp.Add, array, term, owner, found, mode=LOCAL)
+        dr.scatter_reduce(dr.ReduceOp.Add, array, term, owner, counts, mode=LOCAL)
     dr.eval(sums)
     x, y = (
         dr.select(
@@ -310,8 +310,10 @@ def _nearest_along(canvas: Canvas, keys: UInt, tiles: UInt, axis: int) -> UInt:
             for k in (distance + offset for offset in range(1 - SIDE, SIDE))
         ]
         return [
-            reduce(dr.minimum, (lines[k] + cost[k - own + SIDE - 1] for k in range(SIDE)), nearest)
-            for own, nearest in enumerate(state)
+            reduce(
+                dr.minimum, (lines[k] + cost[k - target + SIDE - 1] for k in range(SIDE)), nearest
+            )
+            for target, nearest in enumerate(state)
         ]
 
     start = [dr.full(IntX, NONE, (SIDE, 1)) for _ in range(SIDE)]

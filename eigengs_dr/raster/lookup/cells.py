@@ -1,4 +1,4 @@
-"""Lists of the Gaussians near each cell of an image, in 16 bits an entry.
+"""Lists of the Gaussians near each cell of an image, with 16 bits per entry.
 
 Lists hold numbers, not copies of parameters: a Gaussian stands in some 20 lists, and its parameters
 take 32 bytes. A set of more Gaussians than 16 bits can number is cut into bands, each with rows of
@@ -77,8 +77,8 @@ class CellLists:
         Numbers of 16 bits, in runs of `RUN`: rows of parameters, counted from the first row of the
         band. 0 is the blank row, which fills the last run of a list.
     gaussian : UInt32, shape (rows,), or None
-        Gaussian of each row of parameters; `count` for a blank row. None for one band, where the
-        Gaussians follow the blank row in their order, and where nobody will pack parameters.
+        Gaussian of each row of parameters; `count` for a blank row. None for a single band, whose
+        Gaussians follow the blank row in order, and if parameters are not packed again.
     first : UInt32, shape (bands,)
         First row of each band.
     density : Float, shape (1,)
@@ -163,7 +163,7 @@ def list_cells(
 ) -> CellLists:
     """List the Gaussians of every cell of an image.
 
-    A sort lists the Gaussians of strips, of `COLUMNS` cells each. Then one lane a strip tests
+    A sort lists the Gaussians of strips, of `COLUMNS` cells each. Then one lane per strip tests
     these, twice: to count the runs of its cells, and to write them. Entries of cells are neither
     sorted nor copied to the host, and their order is that of the Gaussians.
 
@@ -233,7 +233,7 @@ class _Strips:
     splat : UInt32, shape (capacity,)
         Gaussians, strip after strip.
     number : UInt32, shape (capacity,), or None
-        Their numbers in the band of the strip; None for one band, where they are one more.
+        Their numbers in the band of the strip; None for a single band, where they are one higher.
     begin, end : UInt32, shape (strips,)
         Range of each strip in `splat`.
     grid, cells : GridArrays

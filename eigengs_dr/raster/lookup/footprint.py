@@ -14,7 +14,7 @@ from .points import Packed, Terms
 
 MAX_FOOTPRINT = 0.4
 """Largest standard deviation of a footprint, in widths and heights of the texture. A footprint that
-has it in all directions gets the mean of a texture that repeats: it would keep at most
+has it in all directions sees the mean of a texture that repeats: it would keep at most
 ``exp(-(2 pi MAX_FOOTPRINT)^2 / 2)`` = 4 % of the coarsest wave of a repeating texture."""
 
 
@@ -128,7 +128,7 @@ def filtered_terms(packed: Packed, footprint: list) -> Terms:
     `eigengs_dr.raster.evaluate.widen` for D.
     """
     fxx, fxy, fyy = kernel_covariance(footprint)
-    own = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
+    determinant = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
     limit = packed.radius * packed.radius
 
     def terms(shape: list, color: list, x: Float, y: Float) -> list:
@@ -137,7 +137,7 @@ def filtered_terms(packed: Packed, footprint: list) -> Terms:
         xy, yy = dr.fma(t, r, fxy), dr.fma(r, r, fyy)
         across = dr.fma(r * r, fxx, t * dr.fma(t, fyy, -2 * r * fxy))
         pp = p * p
-        scale = rsqrt(dr.fma(pp, yy, own + dr.maximum(across, 0)))
+        scale = rsqrt(dr.fma(pp, yy, determinant + dr.maximum(across, 0)))
         along = dr.fma(yy, dx, -xy * dy) * scale
         w = falloff(dr.fma(along, along, dy * dy) * rcp(yy), limit) * scale
         return [w * c for c in color]

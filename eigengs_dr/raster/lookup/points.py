@@ -119,14 +119,14 @@ def fold(x: Float, side: int, wrap: str) -> tuple[Float, Float]:
 def axes_of(wrap: str) -> tuple[str, str]:
     """Return how an image continues along x and along y.
 
-    Of a "sphere" in equirectangular projection, columns repeat, and rows come back beyond a pole:
-    on the other side, which a mirror leaves out. What sees beyond a pole sees all sides of it.
+    On a "sphere" in equirectangular projection, columns repeat, and rows come back beyond a pole:
+    on the other side, which a mirror ignores. A footprint beyond a pole sees all sides of it.
     """
     return ("repeat", "mirror") if wrap == "sphere" else (wrap, wrap)
 
 
 def near_image(x: Float, side: int) -> Float:
-    """Move a coordinate near a clamped image, where footprints see what they see further out.
+    """Move a coordinate close to a clamped image, where footprints see the same as further out.
 
     The longest reach 1.2 sides. What is not finite becomes 0.
 

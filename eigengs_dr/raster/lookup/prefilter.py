@@ -89,8 +89,8 @@ def _shortest_list(
     begin, end = types.UInt(0), types.UInt(0)
     for spread, cells in zip(sizes.spreads, sizes.cells.levels, strict=True):
         small = active & (widest <= spread)
-        found = sizes.cells.range_at(cells, dr.detach(x), dr.detach(y), small)
-        begin, end = dr.select(small, found[0], begin), dr.select(small, found[1], end)
+        bounds = sizes.cells.range_at(cells, dr.detach(x), dr.detach(y), small)
+        begin, end = dr.select(small, bounds[0], begin), dr.select(small, bounds[1], end)
         active = active & ~small
     return begin, end
 
@@ -132,7 +132,7 @@ def _reach(footprint: list) -> list:
 def _at_borders(sizes: SizeClasses, point: tuple, footprint: list) -> tuple[Any, list]:
     """Move footprints that lie beyond a border of a clamped image to it.
 
-    Without their width across the border they see the same, and cells list it.
+    Without their width across the border they see the same, and the lists of cells cover it.
     """
     xx, xy, yy = footprint
     moved, inside = [], []
@@ -146,7 +146,7 @@ def _at_borders(sizes: SizeClasses, point: tuple, footprint: list) -> tuple[Any,
 
 
 def _part(sizes: SizeClasses, v: Float, side: int) -> Any:
-    """Return the number of the copy at a coordinate; of a clamped image -1, 0 or 1."""
+    """Return the number of the copy at a coordinate; for a clamped image -1, 0 or 1."""
     Int = types_of(v).Int
     if sizes.wrap != "clamp":
         return Int(dr.floor(v * (1 / side)))
@@ -275,13 +275,13 @@ def _sum_copies(
         shape, color = packed.gather(gather_index(types, sizes.row, n, here), here)
         px, py, factors = _local(sizes, i, j, x, y)
         seen = [f * k for f, k in zip(scaled, factors, strict=True)]
-        # Of a clamped image, the whole footprint decides how much of it lies in each part.
-        own, center = (scaled, (x, y)) if sizes.wrap == "clamp" else (seen, (px, py))
+        # On a clamped image, the whole footprint decides how much of it lies in each part.
+        metric, center = (scaled, (x, y)) if sizes.wrap == "clamp" else (seen, (px, py))
         shape, amplitude = widen_inverted(shape, seen)
         (w,) = weights(shape, px, py, (1, 1), packed.radius)
         (part,) = where_any(
             crosses,
-            lambda: [_share(sizes, shape, own, (i, j), (px, py), center)],
+            lambda: [_share(sizes, shape, metric, (i, j), (px, py), center)],
             packed,
             [types.Float(1)],
         )

@@ -114,8 +114,8 @@ class GaussianPyramid:
     def halved(self) -> GaussianPyramid:
         """Return the pyramid in half precision; that of double precision stays as it is.
 
-        A value has 11 bits, and a footprint averages 30 or more: what is lost is less than what 8
-        bits show. Values are scaled into the range of half precision.
+        A value has 11 bits, and a footprint averages 30 or more: the loss is smaller than a
+        step of 8 bits. Values are scaled into the range of half precision.
         """
         types = types_of(self.scale)
         if types.bits == 64:

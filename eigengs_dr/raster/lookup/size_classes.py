@@ -96,34 +96,36 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
     spreads, cells = _list_widened(shape, width, height, kernel_radius(cutoff))
     with np.errstate(all="ignore"):
         size = EXP2_SCALE * max_deviation(a, b, c)
-        drawn = np.isfinite(x + y + size) & (a > 0) & (c > 0)
+        visible = np.isfinite(x + y + size) & (a > 0) & (c > 0)
         rank = np.ceil(np.log(size / MIN_CLASS_SIZE) / math.log(CLASS_RATIO))
-    rank = np.where(drawn, np.maximum(rank, 0), 0).astype(np.int64)
+    rank = np.where(visible, np.maximum(rank, 0), 0).astype(np.int64)
     order, counts, table, first = [], [], [], 0
-    for k in np.unique(rank[drawn]):
-        own = np.flatnonzero(drawn & (rank == k))
-        largest = min(float(size[own].max()), 1e12)  # its square must be finite in float32
+    for k in np.unique(rank[visible]):
+        indices = np.flatnonzero(visible & (rank == k))
+        largest = min(float(size[indices].max()), 1e12)  # its square must be finite in float32
         # Means beyond this margin are farther from the image than the cutoff.
         origin = -cutoff * largest
         area = (width - 2 * origin) * (height - 2 * origin)
-        length = max(largest, math.sqrt(area / (2 * len(own))))  # at most two cells a Gaussian
+        length = max(
+            largest, math.sqrt(area / (2 * len(indices)))
+        )  # at most two cells per Gaussian
         columns, rows = (math.ceil((s - 2 * origin) / length) for s in (width, height))
-        column, row = ((v[own] - origin) // length for v in (x, y))
+        column, row = ((v[indices] - origin) // length for v in (x, y))
         near = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         cell = (row * columns + column)[near].astype(np.int64)
-        order.append(own[near][np.argsort(cell, kind="stable")])
+        order.append(indices[near][np.argsort(cell, kind="stable")])
         counts.append(np.bincount(cell, minlength=columns * rows))
         table.append([largest**2, first, columns, rows, 1 / length, origin, 0, 0])
         first += columns * rows
     starts = np.cumsum(np.concatenate([[0], *counts] if counts else [[0, 0]]))
     # gather_index reads pairs: the array must have an even length and must not be empty.
-    found = np.concatenate([*order, [0]]).astype(np.int64)
-    found = np.pad(found, (0, len(found) % 2))
+    entries = np.concatenate([*order, [0]]).astype(np.int64)
+    entries = np.pad(entries, (0, len(entries) % 2))
     return SizeClasses(
         width,
         height,
         wrap,
-        upload(types.UInt, cells.rows_of(found)),
+        upload(types.UInt, cells.rows_of(entries)),
         upload(types.UInt, np.asarray(starts, np.uint32)),
         upload(types.Float, np.asarray(table or np.zeros((1, 8)), np.float32).ravel()),
         spreads,
