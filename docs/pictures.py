@@ -1,60 +1,101 @@
 """Compose pictures of how-to pages: ``python docs/pictures.py`` writes docs/images/how-to-*.jpg.
 
-All of them show fits of photos that scikit-image ships. They take half a minute on two cores.
+``python docs/pictures.py view convert`` writes these alone. All of them show photos that
+scikit-image ships. They take five minutes on two cores; "view" needs Chromium.
 """
 
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import eigengs_dr as eg  # isort: skip  (before Dr.Jit: it finds libLLVM)
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-IMAGES = Path(__file__).parent / "images"
-CELL, GAP = 240, 6  # pixels: side of a picture, and white between two
+from eigengs_dr.image.color import to_coded, to_linear
+from eigengs_dr.image.resize import resample
+from eigengs_dr.image.sheet import text_line
+from eigengs_dr.plugins import follow, keep_in_bounds, texture_of
+
+ROOT = Path(__file__).parent.parent
+IMAGES = ROOT / "docs" / "images"
+WIDTH, GAP = 840, 6  # pixels: of a whole picture, and white between two
+LETTERS = 22  # pixels: they can be read where the picture is shown half as wide
+MAX_BYTES = 60_000
 ERROR_GAIN = 4  # errors are shown as absolute differences of sRGB values, times this
 
+Row = dict[str, np.ndarray]
+"""Pictures side by side, by what is written above them."""
 
-def main() -> None:
+
+def main(names: list[str]) -> None:
     """Make each picture and write it."""
-    cat, portrait = eg.sample("chelsea")[20:260, 90:330], eg.sample("astronaut")
-    write("levels", [levels(cat)])
-    write("number", numbers(cat))
-    write("blocks", [seams(portrait)])
-    write("own-loss", [foveated(cat)])
-    write("weights", [strokes(cat)])
+    mi.set_variant("llvm_ad_rgb")
+    eg.register_plugins()
+    for name in names or PICTURES:
+        write(name, PICTURES[name]())
 
 
-def levels(photo: np.ndarray) -> list[np.ndarray]:
+def cat() -> np.ndarray:
+    """Return the face of a cat, 240 x 240 pixels."""
+    return eg.sample("chelsea")[20:260, 90:330]
+
+
+def error(image: np.ndarray, photo: np.ndarray, gain: float = ERROR_GAIN) -> np.ndarray:
+    """Return the absolute difference of two pictures, magnified."""
+    return gain * abs(image - photo)
+
+
+def levels() -> list[Row]:
     """Render the first 78, 312, 1,250 and 5,000 Gaussians of one set."""
     counts = eg.level_counts(5000, 4)
-    gaussians = eg.fit(photo, counts).gaussians
-    return [eg.picture_of(gaussians[:count]) for count in counts]
+    gaussians = eg.fit(cat(), counts).gaussians
+    return [{f"first {count:,}": eg.picture_of(gaussians[:count]) for count in counts}]
 
 
-def numbers(photo: np.ndarray) -> list[list[np.ndarray]]:
+def numbers() -> list[Row]:
     """Fit three numbers of Gaussians; the second row has their errors."""
-    fits = [eg.fit(photo, count).image.clip(0, 1) for count in (300, 1200, 4800)]
-    return [fits, [ERROR_GAIN * abs(fit - photo) for fit in fits]]
+    fits = {count: eg.fit(cat(), count).image.clip(0, 1) for count in (300, 1200, 4800)}
+    return [
+        {f"{count:,} Gaussians": fit for count, fit in fits.items()},
+        {f"error of {count:,} x {ERROR_GAIN}": error(fit, cat()) for count, fit in fits.items()},
+    ]
 
 
-def seams(photo: np.ndarray) -> list[np.ndarray]:
-    """Fit blocks each for itself, and by `eigengs_dr.fit_large`.
-
-    All pictures show the same 80 x 80 pixels around the corner of four blocks.
-    """
+def seams() -> list[Row]:
+    """Fit blocks each for itself, and by `eigengs_dr.fit_large`, around the corner of four."""
     side, pixels = 128, 150  # of a block, and for each Gaussian
-    alone = np.empty_like(photo)
+    photo = eg.sample("astronaut")
+    alone, borders = np.empty_like(photo), photo.copy()
     for top, left in np.ndindex(4, 4):
         part = np.s_[side * top : side * (top + 1), side * left : side * (left + 1)]
         alone[part] = eg.fit(photo[part], side**2 // pixels, iterations=300).image
+    for start in range(side, 512, side):
+        borders[start - 1 : start + 1] = borders[:, start - 1 : start + 1] = 1
     count = photo[..., 0].size // pixels
-    large = eg.fit_large(photo, gaussians=count, iterations=300, block=side)
-    return [one[88:168, 216:296] for one in (photo, alone, eg.picture_of(large.gaussians))]
+    large = eg.picture_of(
+        eg.fit_large(photo, gaussians=count, iterations=300, block=side).gaussians
+    )
+    near = np.s_[88:168, 216:296]
+    return [
+        {
+            "blocks": borders,
+            "photo": photo[near],
+            "each alone": alone[near],
+            "fit_large": large[near],
+        }
+    ]
 
 
-def foveated(photo: np.ndarray) -> list[np.ndarray]:
+def foveated() -> list[Row]:
     """Fit a photo, and fit it with a foveated loss, like that of the page, around the left eye."""
+    photo = cat()
     y, x = np.indices(photo.shape[:2]) - np.array([110, 70])[:, None, None]
     fovea = np.exp(-(x**2 + y**2) / (2 * 45**2))[..., None].astype(np.float32)
     plain = eg.fit(photo, 600, space="rgb")
@@ -68,24 +109,287 @@ def foveated(photo: np.ndarray) -> list[np.ndarray]:
         return near + 0.2 * dr.mean(dr.square(blocks), axis=None)
 
     sharp = eg.fit(photo, 600, space="rgb", loss=loss)
-    return [photo, np.repeat(fovea, 3, 2), plain.image, sharp.image]
+    weights = np.repeat(fovea, 3, 2)
+    return [
+        {"photo": photo, "weight": weights, "squared error": plain.image, "your loss": sharp.image}
+    ]
 
 
-def strokes(photo: np.ndarray) -> list[np.ndarray]:
+def strokes() -> list[Row]:
     """Hide strokes of a photo, and fit it without them."""
+    photo = cat()
     y, x = np.indices(photo.shape[:2])
     hidden = ((x + y) % 40 < 8) | ((x - y) % 40 < 8)
     weight = np.where(hidden, 0, 1).astype(np.float32)
-    result = eg.fit(np.where(hidden[..., None], np.nan, photo), 3000, weight=weight)
+    result = eg.fit(np.where(hidden[..., None], np.nan, photo), 1500, weight=weight)
     shown = np.where(hidden[..., None], 1, photo)
-    return [shown, np.repeat(weight[..., None], 3, 2), result.image]
+    return [{"photo": shown, "weight": np.repeat(weight[..., None], 3, 2), "fit": result.image}]
 
 
-def write(name: str, rows: list[list[np.ndarray]]) -> None:
-    """Write rows of pictures as one."""
-    lines = [between([np.asarray(cell_of(picture)) for picture in row], axis=1) for row in rows]
+def cutoffs() -> list[Row]:
+    """Render some Gaussians with three cutoffs, and magnify what each cuts off."""
+    photo = cat()
+    gaussians = eg.fit(photo, 40, method=replace(eg.DEFAULT, cutoff=8.0)).gaussians
+    whole = eg.picture_of(gaussians)
+    cut = {c: eg.picture_of(replace(gaussians, cutoff=float(c))) for c in (2, 3, 4)}
+    return [
+        {f"cutoff {c}": picture for c, picture in cut.items()},
+        {f"cut off at {c}, x 10": error(picture, whole, 10) for c, picture in cut.items()},
+    ]
+
+
+def spaces() -> list[Row]:
+    """Fit a photo with dark parts in three spaces of colours; the second row has their errors."""
+    photo = eg.sample("astronaut")[:240, 100:340]
+    fits = {s: eg.fit(photo, 600, space=s).image.clip(0, 1) for s in ("ycbcr", "rgb", "linear")}
+    return [
+        {f'space="{space}"': fit for space, fit in fits.items()},
+        {f"error of {s} x {ERROR_GAIN}": error(fit, photo) for s, fit in fits.items()},
+    ]
+
+
+def many() -> list[Row]:
+    """Fit eight photos in one call."""
+    side = (WIDTH + GAP) // 4 - GAP
+    names = ("astronaut", "brick", "chelsea", "coffee", "hubble", "motorcycle", "retina", "rocket")
+    photos = [resample(square(eg.sample(name)), side, side) for name in names]
+    rows = eg.fit_many(photos, gaussians=2000, iterations=300)
+    fits = [row.result.image for row in rows]
+    return [dict(zip(names[k : k + 4], fits[k : k + 4], strict=True)) for k in (0, 4)]
+
+
+def square(photo: np.ndarray) -> np.ndarray:
+    """Cut the middle of a photo."""
+    side = min(photo.shape[:2])
+    top, left = ((length - side) // 2 for length in photo.shape[:2])
+    return np.ascontiguousarray(photo[top : top + side, left : left + side])
+
+
+def family() -> list[np.ndarray]:
+    """Return 400 views of a cat, shifted and magnified, 64 x 64 pixels each."""
+    photo, random, views = eg.sample("chelsea"), np.random.default_rng(0), []
+    for _ in range(400):
+        side = random.integers(160, 240)
+        top, left = random.integers(0, 300 - side), random.integers(60, 330 - side)
+        view = np.ascontiguousarray(photo[top : top + side, left : left + side])
+        views.append(resample(view, 64, 64))
+    return views
+
+
+def components() -> list[Row]:
+    """Encode a new view of a family with three numbers of components."""
+    new, *known = family()
+    row = {"new image": new}
+    for count in (10, 40, 160):
+        basis = eg.Eigenbasis.from_images(known, size=(64, 64), components=count)
+        model = eg.EigenGS.fit(basis, gaussians=2000)
+        row[f"{count} components"] = eg.picture_of(model.encode(new, colors="projected"))
+    return [row]
+
+
+def split() -> list[Row]:
+    """Encode a new view of a family by a model with a split, and render both sides."""
+    new, *known = family()
+    basis = eg.Eigenbasis.from_images(known, size=(64, 64), components=150)
+    model = eg.EigenGS.fit(basis, gaussians=2000, frequency_aware=True)
+    gaussians = model.encode(new)
+    low, high = gaussians[: model.low], gaussians[model.low :]
+    grey = replace(high, background=type(high.background)(0.5, 0.5, 0.5))
+    return [
+        {
+            "new image": new,
+            f"{len(low)} low": eg.picture_of(low),
+            f"{len(high):,} high": eg.picture_of(grey),
+            "all of them": eg.picture_of(gaussians),
+        }
+    ]
+
+
+def aliasing() -> list[Row]:
+    """Render a floor of photos at a slant: a bitmap, Gaussians at points, and the prefilter."""
+    photo = eg.sample("coffee")[:, 100:500]
+    gaussians = eg.fit(photo, 4000, 300, space="linear").gaussians
+    repeated = mi.ScalarTransform4f().scale([60, -60, 1])
+    texels = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(to_linear(photo).astype(np.float32)),
+        "raw": True,
+        "to_uv": repeated,
+    }
+    points = texture_of(gaussians, to_uv=repeated)
+    bitmap, plain, filtered = (floor(texture) for texture in (texels, points, points))
+    follow(filtered, filtered.sensors()[0])
+    return [
+        {
+            "bitmap": slanted(bitmap, 1),
+            "Gaussians": slanted(plain, 1),
+            "prefilter": slanted(filtered, 1),
+            "1,024 samples": slanted(plain, 1024),
+        }
+    ]
+
+
+def floor(texture: dict) -> "mi.Scene":
+    """Return a floor that shines with a texture, and recedes to the horizon."""
+    view = mi.ScalarTransform4f().look_at([0.3, 0, 1], [0.1, 3, 0.2], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 410, "height": 410, "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f().translate([0, 29, 0]).scale([30, 30, 1])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1},
+            "camera": {"type": "perspective", "fov": 45, "to_world": view, "film": film},
+            "floor": {
+                "type": "rectangle",
+                "to_world": to_world,
+                "emitter": {"type": "area", "radiance": texture},
+            },
+        }
+    )
+
+
+def slanted(scene: "mi.Scene", samples: int) -> np.ndarray:
+    """Render a floor, and cut what lies below the horizon."""
+    passes = range(-(-samples // 16))
+    linear = sum(mi.render(scene, spp=min(samples, 16), seed=k).numpy() for k in passes)
+    return to_coded(linear / len(passes))[84:289, 102:307]
+
+
+def conversion() -> list[Row]:
+    """Convert a scene of three bitmaps."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for photo in ("chelsea", "coffee", "brick"):
+            eg.save_image(folder / f"{photo}.png", resample(square(eg.sample(photo)), 192, 192))
+        eg.convert_scene(room(folder), folder / "converted", replace_all=True)
+        before, after = (
+            eg.load_image(folder / "converted" / f"{name}-1.png") for name in ("before", "after")
+        )
+    return [{"before": before, "after": after, "difference x 10": error(after, before, 10)}]
+
+
+def room(folder: Path) -> dict:
+    """Return a scene with three photos of a folder: on a wall, a floor and a ball."""
+
+    def bsdf(name: str, **properties: object) -> dict:
+        texture = {"type": "bitmap", "filename": str(folder / f"{name}.png"), **properties}
+        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}
+
+    at = mi.ScalarTransform4f()
+    wall = at.translate([0, 2, 1.6]).rotate([1, 0, 0], 90).scale([1.6, -1.6, 1])
+    film = {"type": "hdrfilm", "width": 276, "height": 207}
+    view = at.look_at([0, -6, 2.6], [0, 0, 1], [0, 0, 1])
+    brick = bsdf("brick", to_uv=at.scale([3, 2, 1]))
+    return {
+        "type": "scene",
+        "integrator": {"type": "direct"},
+        "camera": {
+            "type": "perspective",
+            "fov": 42,
+            "to_world": view,
+            "film": film,
+            "sampler": {"type": "independent", "sample_count": 64},
+        },
+        "sky": {"type": "constant"},
+        "floor": {"type": "rectangle", "to_world": at.scale(3), "bsdf": bsdf("coffee")},
+        "wall": {"type": "rectangle", "to_world": wall, "bsdf": bsdf("chelsea")},
+        "ball": {"type": "sphere", "center": [0.9, -1.6, 0.8], "radius": 0.8, "bsdf": brick},
+    }
+
+
+def descent() -> list[Row]:
+    """Descend from the Gaussians of one photo until a wall looks like a rendering of another."""
+    start, other = (
+        eg.fit(resample(square(eg.sample(name)), 192, 192), 2000, 300, space="linear").gaussians
+        for name in ("coffee", "chelsea")
+    )
+    goal = mi.render(wall_of(other), spp=64)
+    scene, key = wall_of(start), "wall.bsdf.reflectance"
+    rates = {f"{key}.mean": 0.5, f"{key}.factor": 0.01, f"{key}.color": 0.03}
+    parameters = mi.traverse(scene)
+    adam = mi.ad.Adam(lr=0.01, params={name: parameters[name] for name in rates})
+    adam.set_learning_rate(rates)
+    row = {"start": mi.render(scene, spp=64)}
+    for step in range(1, 81):
+        parameters.update(adam)
+        picture = mi.render(scene, parameters, spp=8, seed=step)
+        dr.backward(dr.mean(dr.square(picture - goal), axis=None))
+        adam.step()
+        parameters.update(adam)
+        keep_in_bounds(parameters, key, start)
+        adam.update({name: parameters[name] for name in rates})
+        if step in (20, 80):
+            row[f"{step} steps"] = mi.render(scene, spp=64)
+    row["goal"] = goal
+    return [{label: to_coded(picture.numpy()) for label, picture in row.items()}]
+
+
+def wall_of(gaussians: eg.Gaussians) -> "mi.Scene":
+    """Return a wall with Gaussians, seen from the side."""
+    view = mi.ScalarTransform4f().look_at([1.8, 0, 2.6], [0.1, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 205, "height": 205}
+    upright = mi.ScalarTransform4f().translate([0, 1, 0]).scale([1, -1, 1])
+    reflectance = texture_of(gaussians, to_uv=upright)
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "prb"},
+            "sky": {"type": "constant"},
+            "camera": {"type": "perspective", "fov": 40, "to_world": view, "film": film},
+            "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": reflectance}},
+        }
+    )
+
+
+def browser() -> list[Row]:
+    """Take a picture of the page of `eigengs_dr.view` in Chromium, near an eye of the cat."""
+    from playwright.sync_api import sync_playwright
+
+    photo = cat()
+    page = eg.view(eg.fit(photo, 3000), photo, title="A cat")
+    program = shutil.which("chromium")
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with TemporaryDirectory() as folder, sync_playwright() as driver:
+        path = Path(folder) / "cat.html"
+        page.save(path)
+        window = driver.chromium.launch(executable_path=program, args=flags)
+        tab = window.new_page(viewport={"width": WIDTH, "height": 420}, color_scheme="light")
+        tab.goto(path.as_uri())
+        tab.wait_for_timeout(3000)
+        tab.check("#compare")
+        tab.check("#outlines")
+        tab.mouse.move(180, 190)
+        for _ in range(2):
+            tab.mouse.wheel(0, -300)
+            tab.wait_for_timeout(300)
+        tab.wait_for_timeout(2000)
+        shot = np.asarray(Image.open(BytesIO(tab.screenshot())).convert("RGB"))
+        window.close()
+    return [{"": shot / 255}]
+
+
+def write(name: str, rows: list[Row]) -> None:
+    """Write rows of pictures as one, as well as fits in `MAX_BYTES`."""
+    lines = []
+    for row in rows:
+        width = (WIDTH + GAP) // len(row) - GAP
+        cells = [labelled(label, cell_of(picture, width)) for label, picture in row.items()]
+        line = between(cells, axis=1)
+        margin = WIDTH - line.shape[1]
+        lines.append(np.pad(line, ((0, 0), (0, margin), (0, 0)), constant_values=255))
+    picture = Image.fromarray(between(lines, axis=0))
     path = IMAGES / f"how-to-{name}.jpg"
-    Image.fromarray(between(lines, axis=0)).save(path, quality=78, optimize=True)
+    for quality in range(85, 0, -5):
+        picture.save(path, quality=quality, optimize=True)
+        if path.stat().st_size <= MAX_BYTES:
+            break
+
+
+def labelled(label: str, cell: np.ndarray) -> np.ndarray:
+    """Write what a picture is above it."""
+    if not label:
+        return cell
+    return np.concatenate([np.uint8(255 * text_line(label, cell.shape[1], LETTERS)), cell])
 
 
 def between(parts: list[np.ndarray], axis: int) -> np.ndarray:
@@ -96,13 +400,31 @@ def between(parts: list[np.ndarray], axis: int) -> np.ndarray:
     return np.concatenate([one for part in parts for one in (part, gap)][:-1], axis)
 
 
-def cell_of(picture: np.ndarray) -> Image.Image:
-    """Bring a picture to the size of a cell; pixels that are magnified stay squares."""
+def cell_of(picture: np.ndarray, width: int) -> np.ndarray:
+    """Bring a picture to the width of a cell; pixels that are magnified stay squares."""
     codes = Image.fromarray(np.uint8(255 * picture.clip(0, 1) + 0.5))
-    is_magnified = codes.width < CELL
+    is_magnified = codes.width < width
     resampling = Image.Resampling.NEAREST if is_magnified else Image.Resampling.LANCZOS
-    return codes.resize((CELL, CELL), resampling)
+    size = (width, round(codes.height * width / codes.width))
+    return np.asarray(codes.resize(size, resampling))
 
+
+PICTURES: dict[str, Callable[[], list[Row]]] = {
+    "levels": levels,
+    "number": numbers,
+    "blocks": seams,
+    "own-loss": foveated,
+    "weights": strokes,
+    "cutoff": cutoffs,
+    "color": spaces,
+    "many": many,
+    "components": components,
+    "split": split,
+    "prefilter": aliasing,
+    "convert": conversion,
+    "differentiate": descent,
+    "view": browser,
+}
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
