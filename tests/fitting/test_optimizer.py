@@ -59,7 +59,7 @@ def adan_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
         (Adan(), adan_by_hand, (0.98, 0.92, 0.99)),
         (Adan((0.9, 0.5, 0.95)), adan_by_hand, (0.9, 0.5, 0.95)),
     ],
-    ids=str,
+    ids=["adam", "long memory", "no momentum", "adan", "short memory"],
 )
 def test_steps_are_those_of_the_paper(types, optimizer, by_hand, betas):
     """Of a variable whose gradient is always 0 too: it rests."""
