@@ -94,6 +94,7 @@ def test_texture(run, tmp_path):
     check_pictures(tmp_path, "floor_points", "floor_filtered", "floor_truth")
 
 
+@pytest.mark.slow
 def test_photos_of_a_ball(run, tmp_path):
     pytest.importorskip("mitsuba")
     out = run("photos_of_a_ball.py", tmp_path)

@@ -83,6 +83,7 @@ PACKED = {
 """Photo, top and left of a crop, and the recorded psnr_rgb and psnr_ycbcr of its packed fit."""
 
 
+@pytest.mark.slow
 def test_pack(tmp_path):
     """As small files, and as good pictures. One file alone varies by 4 % with the rounding."""
     whole = 0

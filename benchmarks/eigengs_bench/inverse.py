@@ -382,7 +382,7 @@ def _methods(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
         for steps in sorted({steps for curve in methods.values() for steps in curve}):
             found = [methods.get(name, {}).get(steps) for name in METHODS]
             cells = [f"{r['psnr_rgb']:.1f} dB, {r['seconds']:.1f} s" if r else "" for r in found]
-            lines.append((f"{scene}, {cameras} cameras, {spp} samples", f"{steps}", *cells))
+            lines.append((f"{scene}, {cameras} cameras, {spp} spp", f"{steps}", *cells))
     columns = ("photos", "steps", *METHODS)
     return table("psnr_rgb and seconds of a descent", columns, lines, name="methods")
 
@@ -424,7 +424,7 @@ def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
         f"{fit['parameters'] / other['parameters']:.2f}"
         for fit, other in zip(fits, pyramids, strict=True)
     }
-    columns = ("photos", "over", *(f"{steps} steps, {spp} samples" for steps, spp in descents))
+    columns = ("photos", "over", *(f"{steps} steps, {spp} spp" for steps, spp in descents))
     caption = (
         f"psnr_rgb of fit in dB over that of a pyramid at equal seconds; {count} Gaussians have "
         f"{' or '.join(sorted(shares))} of its parameters"
@@ -437,7 +437,7 @@ def _materials(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table
     for (scene, cameras, spp), methods in curves.items():
         for method in METHODS if scene == "material" else ():
             for steps, row in sorted(methods.get(method, {}).items()):
-                name = f"{cameras} cameras, {spp} samples"
+                name = f"{cameras} cameras, {spp} spp"
                 figures = [row["seconds"], row["albedo"], row["roughness"]]
                 cells = [number(value) for value in [*figures, row["roughness_constant"]]]
                 lines.append((name, method, f"{steps}", *cells))

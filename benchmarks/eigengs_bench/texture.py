@@ -194,17 +194,15 @@ LOOKUPS = {
 
 def _memory(row: Row) -> Table:
     """Lay out the memory of textures, beside that of bitmaps with the pixels of their pictures."""
-    caption = (
-        f"Memory of a texture of {PIXELS} pixels a Gaussian; seconds from file to first lookup"
-    )
+    caption = f"Memory of a texture of {PIXELS} pixels a Gaussian; time from file to first lookup"
     columns = ["Gaussians", "arrays of the file", "points", "prefilter", "BC7", "ASTC 6x6"]
-    columns += ["bitmap, mip maps", "points, s", "prefilter, s"]
+    columns += ["bitmap, mip maps", "points, ms", "prefilter, ms"]
     lines = []
     for n in HELD:
         held = [row[f"bytes_{n}"] / row[f"held_{n}"], row[f"bytes_{n}"], row[f"bytes_filtered_{n}"]]
         rivals = [PIXELS * n * bits / 8 for bits in (8, 128 / 36, 4 / 3 * 32 * 3)]
-        seconds = [f"{row[f'first_{name}{n}_ms'] / 1e3:.2f}" for name in ("", "filtered_")]
-        lines.append((f"{n:,}", *(f"{b / 1e6:.3g} MB" for b in held + rivals), *seconds))
+        times = [f"{row[f'first_{name}{n}_ms']:.2g}" for name in ("", "filtered_")]
+        lines.append((f"{n:,}", *(f"{b / 1e6:.3g} MB" for b in held + rivals), *times))
     return table(caption, columns, lines, name="memory")
 
 

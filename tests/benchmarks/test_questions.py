@@ -275,6 +275,7 @@ def test_number(small, tmp_path, backend):
     assert searched["stopped"] in ("met", "out of reach") and "20 dB" in text
 
 
+@pytest.mark.slow
 def test_rate(small, tmp_path, backend, monkeypatch):
     for name, codec in rate.CODECS.items():
         few = codec._replace(settings=codec.settings[5:10:4])
@@ -363,6 +364,7 @@ def test_a_peer_draws_its_own_picture(tmp_path, monkeypatch):
         peers._splatthis(tmp_path, image, 1, "3,2,1")
 
 
+@pytest.mark.slow
 def test_a_peer_has_an_environment_of_its_own(tmp_path):
     programs = peers.environment(tmp_path / "peer", ["pip"])  # is there: nothing is fetched
     [python] = programs.glob("python3")
@@ -469,6 +471,7 @@ def test_a_psnr_without_noise():
 
 
 @pytest.mark.mitsuba
+@pytest.mark.slow
 def test_inverse(monkeypatch, tmp_path):
     pytest.importorskip("mitsuba")
     from eigengs_bench import inverse

@@ -69,6 +69,7 @@ PLACES = ((40, 100), (70, 120), (100, 140), (130, 160), (160, 180), (200, 220), 
 """Corners of parts of a photo: counts of single parts depend on the rounding of a processor."""
 
 
+@pytest.mark.slow
 def test_the_search_finds_about_as_few():
     """Short descents settle less well than one of 200 steps, and single ones by chance."""
     photo, counts = eg.sample("coffee"), []
