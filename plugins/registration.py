@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from .gaussian_environment import gaussian_environment
@@ -22,8 +23,9 @@ PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
 def register_plugins() -> None:
     """Register the plugins with the current variant of Mitsuba and with later ones.
 
-    They are ``gaussian_texture`` and ``gaussian_environment``. Further calls change nothing. In
-    scalar variants, a scene that uses them raises an error.
+    They are ``gaussian_texture`` and ``gaussian_environment``. In scalar variants, a scene that
+    uses them raises an error. Where Dr.Jit has one thread, as on one core, it gets two: with one,
+    Mitsuba 3.9 waits forever as it reads or writes an EXR file.
 
     Raises
     ------
@@ -36,6 +38,7 @@ def register_plugins() -> None:
     >>> mi.set_variant("llvm_ad_rgb")
     >>> eg.register_plugins()
     """
+    dr.set_thread_count(max(2, dr.thread_count()))
     _follow()
     if mi.variant():
         _register(mi.variant())

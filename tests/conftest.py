@@ -1,6 +1,7 @@
 """Backends that tests run on, and what this machine cannot run."""
 
 import gc
+import os
 import signal
 from functools import cache
 
@@ -15,6 +16,9 @@ pytest.register_assert_rewrite("_helpers")
 
 from eigengs_dr.backend.arrays import _types  # noqa: E402
 from eigengs_dr.backend.selection import BackendError, select  # noqa: E402
+
+# isort: split
+import drjit as dr  # noqa: E402
 
 NO_GPU = "no CUDA device: the cuda path was not tested"
 
@@ -60,6 +64,12 @@ def pytest_collection_finish():
     """
     gc.collect()
     gc.freeze()
+
+
+def pytest_runtest_setup():
+    """Leave the other cores to the other processes of pytest-xdist: threads of Dr.Jit spin."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        dr.set_thread_count(1)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -94,6 +94,7 @@ def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:
 #  The tables, and the figures that the paper prints
 # ---------------------------------------------------------------------------------------------
 
+KEY = ["set", "iterations", *Method._fields]
 KINDS = {"main": "Methods", "cross": "Bases of other images", "ablation": "Colour space and split"}
 ENDS: dict[str, Any] = {
     "RGB": ("psnr_rgb", fr.mean),
@@ -117,7 +118,8 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
             chosen = _chosen(fits[fits.iterations == length], kind)
             if chosen.method.nunique() > 1:
                 few = _ablation if kind == "ablation" else _few
-                used = [row for row in rows if _is_shown(row, chosen, length)]
+                shown = set(chosen[KEY].itertuples(index=False, name=None))
+                used = [row for row in rows if tuple(row["job"][k] for k in KEY) in shown]
                 caption = f"{title}, {length:,} steps: PSNR YCbCr / dB by steps"
                 both = [_by_steps(caption, chosen), few(chosen)]
                 names = (f"{kind}_{length}_all", f"{kind}_{length}")
@@ -131,12 +133,6 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
 def _published(name: str) -> pd.DataFrame:
     """Read figures that the paper prints."""
     return pd.read_csv(str(files("eigengs_bench") / f"published_{name}.csv"), dtype=str).fillna("")
-
-
-def _is_shown(row: Row, chosen: pd.DataFrame, length: int) -> bool:
-    job = row["job"]
-    same = (chosen[list(Method._fields)] == [job[k] for k in Method._fields]).all(axis=1)
-    return bool(job["iterations"] == length and (same & (chosen.set == job["set"])).any())
 
 
 def _chosen(fits: pd.DataFrame, kind: str) -> pd.DataFrame:
