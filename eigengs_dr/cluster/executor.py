@@ -6,6 +6,7 @@ A cluster is not changed: neither its plugins and its configuration nor the limi
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import re
 import threading
@@ -191,7 +192,8 @@ class ClusterExecutor:
                     future = next(ended)
                 except StopIteration:
                     return
-                except TimeoutError:  # this time is counted from the first task
+                except asyncio.TimeoutError:  # since Python 3.11, TimeoutError
+                    # The time is counted from the first task.
                     self._require_worker(
                         "no worker is left; start some, and the same call continues the run"
                     )
@@ -215,7 +217,7 @@ class ClusterExecutor:
         """Wait until there is a worker; raise an error with the message if there is none."""
         try:
             self.client.wait_for_workers(1, timeout=NO_WORKER_SECONDS)
-        except TimeoutError:
+        except asyncio.TimeoutError:
             raise ClusterError(message) from None
 
     def _require_package(self) -> None:
