@@ -11,6 +11,9 @@ PHOTO := .venv/lib/python3*/site-packages/skimage/data/coffee.png
 DATA ?= data
 RESULTS := build/report
 
+# A file of tests runs in one of as many processes as there are cores; a process takes about 1 GB.
+ON_ALL_CORES := -n logical --maxprocesses 4 --dist loadfile
+
 # Path of a simulator of the CUDA driver: a program that runs the command it is given.
 CUDASIM ?= $(wildcard ../shared/cudasim/cudasim)
 
@@ -80,7 +83,7 @@ test: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	@$(MAKE) --no-print-directory layers
-	$(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -q $(ON_ALL_CORES)
 
 # In the installed layout: in a checkout the plugins lie beside the package.
 layers: $(READY)
@@ -99,7 +102,7 @@ test-cuda-sim:
 else
 test-cuda-sim: $(READY)
 	CUDASIM_APPROX=1 CUDASIM_PYTHON=$(CURDIR)/$(BIN)/python \
-		$(CUDASIM) $(BIN)/python -m pytest -q -rs --timeout 3000 \
+		$(CUDASIM) $(BIN)/python -m pytest -q -rs --timeout 3000 $(ON_ALL_CORES) \
 		-m 'gpu and not slow and not large'
 endif
 
