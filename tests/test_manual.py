@@ -210,7 +210,7 @@ def test_textures_are_recovered_from_photos(tmp_path, monkeypatch):
     write_balls(mi, to_linear(paint).astype(np.float32))
 
     def smaller(code):
-        return code.replace("256", "32").replace("240", "120").replace("160", "40")
+        return code.replace("256", "32").replace("240", "80").replace("160", "40")
 
     made = run_blocks(FOLDER / "how-to/recover.md", {"__name__": "page"}, smaller)
     assert made["lamp"][made["light"]].numpy() == pytest.approx(12, rel=0.08)

@@ -429,6 +429,7 @@ def test_kernels(tiny, backend, tmp_path):
         assert found[name] > 0 and name in told
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_texture(monkeypatch, tmp_path):
     pytest.importorskip("mitsuba")

@@ -154,6 +154,7 @@ def test_bases_and_models_show_components():
         assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.9
 
 
+@pytest.mark.slow  # 'make docs' runs it, too
 def test_the_notebook_runs():
     nbformat = pytest.importorskip("nbformat", reason="no nbformat")
     client = pytest.importorskip("nbclient", reason="no nbclient")
