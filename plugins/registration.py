@@ -38,7 +38,8 @@ def register_plugins() -> None:
     >>> mi.set_variant("llvm_ad_rgb")
     >>> eg.register_plugins()
     """
-    dr.set_thread_count(max(2, dr.thread_count()))
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)
     _follow()
     if mi.variant():
         _register(mi.variant())
