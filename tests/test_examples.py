@@ -121,7 +121,7 @@ def test_convert_scene(run, tmp_path):
     out = run("convert_scene.py", tmp_path)
     _, psnr = numbers(out, "NUM times the memory; NUM dB between the renderings")
     assert psnr > 30
-    assert out.count("texels") == 4 and "left alone: sky.png (environment)" in out
+    assert out.count("texels") == 5 and "sky.npz" in out and "left alone" not in out
     check_pictures(tmp_path, "converted")
 
 

@@ -182,8 +182,9 @@ def test_a_scheduler_that_goes_away(photos, output, expected, tmp_path, caplog):
 
 
 @pytest.mark.slow
-def test_a_worker_without_memory(photos, output, expected):
+def test_a_worker_without_memory(photos, output, expected, monkeypatch):
     """An image that no worker can hold fails; the others do not."""
+    monkeypatch.setenv("EIGENGS_DR_MAX_FILE_MB", "1000")  # it is small for what it holds
     Image.fromarray(np.zeros((9000, 9000, 3), np.uint8)).save(photos / "05.png", compress_level=1)
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 1}),

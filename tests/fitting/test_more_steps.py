@@ -6,8 +6,8 @@ import pytest
 
 import eigengs_dr as eg
 
-SLACK = 0.05
-"""Decibels by which a longer fit may be worse: rounding decides more than its steps there."""
+SLACK = 0.15
+"""Decibels by which a longer fit may be worse: fits of four seeds differ by up to 0.3."""
 
 CORNERS = {
     "coffee": (100, 200),

@@ -203,10 +203,11 @@ print(int(peak) >> 10)
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="measures by /proc")
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_the_largest_file_that_is_read_takes_less_than_a_gigabyte(suffix, tmp_path):
-    width, height = 6600, 6700  # just within the limit
-    path = tmp_path / f"a{suffix}"
+@pytest.mark.parametrize(
+    ("suffix", "width", "height"), [(".png", 5500, 5700), (".tif", 6600, 6700)]
+)
+def test_the_largest_file_that_is_read_takes_less_than_a_gigabyte(suffix, width, height, tmp_path):
+    path = tmp_path / f"a{suffix}"  # just within the limit
     if suffix == ".png":
         path.write_bytes(png(width, height, 8, 6, [np.zeros(4 * width, np.uint8)] * height))
     else:
