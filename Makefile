@@ -103,7 +103,7 @@ else
 test-cuda-sim: $(READY)
 	CUDASIM_APPROX=1 CUDASIM_PYTHON=$(CURDIR)/$(BIN)/python \
 		$(CUDASIM) $(BIN)/python -m pytest -q -rs --timeout 3000 $(ON_ALL_CORES) \
-		-m 'gpu and not slow and not large'
+		-m 'gpu and not texture_units and not slow and not large'
 endif
 
 $(DOCS_READY): $(READY)

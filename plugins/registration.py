@@ -23,9 +23,11 @@ PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
 def register_plugins() -> None:
     """Register the plugins with the current variant of Mitsuba and with later ones.
 
-    They are ``gaussian_texture`` and ``gaussian_environment``. In scalar variants, a scene that
-    uses them raises an error. Where Dr.Jit has one thread, as on one core, it gets two: with one,
-    Mitsuba 3.9 waits forever as it reads or writes an EXR file.
+    They are ``gaussian_texture`` and ``gaussian_environment``. Further calls change nothing. In
+    scalar variants, a scene that uses them raises an error.
+
+    Where Dr.Jit has one thread, as on one core, it gets two: with one, Mitsuba 3.9 waits forever as
+    it reads or writes an EXR file.
 
     Raises
     ------

@@ -18,7 +18,7 @@ from eigengs_dr.backend.arrays import _types  # noqa: E402
 from eigengs_dr.backend.selection import BackendError, select  # noqa: E402
 
 # isort: split
-import drjit as dr  # noqa: E402
+import drjit as dr  # noqa: E402  (after the package, which finds libLLVM)
 
 NO_GPU = "no CUDA device: the cuda path was not tested"
 

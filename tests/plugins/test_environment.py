@@ -444,9 +444,7 @@ class TestChanges:
 
 
 class TestMemory:
-    """On cuda the texels of an envmap lie in the hardware, which a simulated driver lacks."""
-
-    @in_variants(["llvm_ad_rgb"])
+    @pytest.mark.texture_units
     def test_is_below_that_of_an_envmap(self):
         """A set of 16 bytes for each of its 2,600 texels would be no gain."""
         g = sky(count=500, size=(512, 256), deviation=(3.0, 20.0))
@@ -455,7 +453,7 @@ class TestMemory:
         ]
         assert sizes[0] < 0.2 * sizes[1]
 
-    @in_variants(["llvm_ad_rgb"])
+    @pytest.mark.texture_units
     def test_counts_the_table_of_an_envmap(self):
         """16 bytes of a texel and 4 x 7/3 of the table."""
         held = resident_bytes(mi.load_dict(bake_environment(sky(size=(400, 200)))))

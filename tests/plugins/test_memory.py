@@ -73,11 +73,12 @@ def test_derivatives_count():
     assert resident_bytes(tex) >= held + 4 * number
 
 
+@pytest.mark.texture_units
 @pytest.mark.parametrize(("channels", "padded"), [(1, 1), (3, 4)])
 def test_of_a_bitmap_they_are_those_of_its_texels(channels, padded, capfd):
     """As Dr.Jit stores them from the first rendering on."""
     scene = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((64, 32, channels), np.uint8))}
-    bitmap = mi.load_dict(scene | {"raw": True, "accel": False})
+    bitmap = mi.load_dict(scene | {"raw": True})
     dr.eval(bitmap.eval_1(at(0.2, 0.3)) if channels == 1 else bitmap.eval_3(at(0.2, 0.3)))
     assert resident_bytes(bitmap) == 64 * 32 * padded
     assert 64 * 32 * padded in stored(capfd).values()

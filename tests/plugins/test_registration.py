@@ -40,19 +40,20 @@ class TestFound:
         found = run_python(program)
         assert "give one of filename" in found.stdout, found.stderr
 
-    def test_mitsuba_reads_and_writes_exr_files_where_dr_jit_had_one_thread(self, tmp_path):
-        """As on one core, in a process of its own."""
-        program = (
-            "import eigengs_dr as eg, drjit as dr, mitsuba as mi, numpy as np\n"
-            "dr.set_thread_count(1)\n"
-            "mi.set_variant('llvm_ad_rgb')\n"
-            "eg.register_plugins()\n"
-            f"path = {str(tmp_path / 'x.exr')!r}\n"
-            "mi.Bitmap(np.full((40, 40, 3), 0.5, np.float32)).write(path)\n"
-            "print(np.array(mi.Bitmap(path)).mean())\n"
-        )
-        done = run_python(program)
-        assert done.stdout.strip() == "0.5", done.stderr
+
+def test_mitsuba_reads_and_writes_exr_files_where_dr_jit_had_one_thread(tmp_path):
+    """As on one core, in a process of its own."""
+    program = (
+        "import eigengs_dr as eg, drjit as dr, mitsuba as mi, numpy as np\n"
+        "dr.set_thread_count(1)\n"
+        "mi.set_variant('llvm_ad_rgb')\n"
+        "eg.register_plugins()\n"
+        f"path = {str(tmp_path / 'x.exr')!r}\n"
+        "mi.Bitmap(np.full((40, 40, 3), 0.5, np.float32)).write(path)\n"
+        "print(np.array(mi.Bitmap(path)).mean())\n"
+    )
+    done = run_python(program)
+    assert done.stdout.strip() == "0.5", done.stderr
 
 
 LOAD = """
