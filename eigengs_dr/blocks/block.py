@@ -35,7 +35,7 @@ from ..fitting.method import Method
 from ..fitting.objective import Affine, Extent, Part, Pixels, data_of, values_in
 from ..fitting.options import FitOptions
 from ..fitting.pixels import BRIGHT, WHITE, check_normals
-from ..fitting.placement.adaptive import density_from_hessian, place_by_density
+from ..fitting.placement.adaptive import density_from_hessian, place_by_density, shift_of
 from ..fitting.placement.density import Owners, density_ratio, squared_error
 from ..fitting.placement.filters import Canvas
 from ..fitting.solve import solve
@@ -206,7 +206,8 @@ def place(task: PlaceTask, settings: Settings) -> Arrays:
     for position, part in zip((row, column), task.block.core, strict=True):
         first, last = (dr.opaque(types.Int, edge) for edge in (part.start, part.stop))
         density = dr.select((position >= first) & (position < last), density, 0)
-    mean, factor = place_by_density(canvas, density, energy, count, spacing)
+    shift = shift_of(types, options.seed)
+    mean, factor = place_by_density(canvas, density, energy, count, spacing, shift)
     return {"mean": mean.numpy().T, "factor": factor.numpy().T}
 
 

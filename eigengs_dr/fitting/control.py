@@ -18,9 +18,8 @@ from ..backend.arrays import make_divisor, types_of
 from ..backend.types import Float, Rows
 from ..raster.kernels import sum_by_image
 from .exchange import among, exchange, exchange_levels
-from .placement.adaptive import place_adaptive, redistribute
+from .placement.adaptive import redistribute
 from .placement.density import squared_error
-from .solve import solve
 
 if TYPE_CHECKING:
     from .descent import State
@@ -109,8 +108,7 @@ class Surplus:
 class Redistribute:
     """Places all Gaussians anew after the first steps, denser where these left more error.
 
-    A start that the user chose is kept, unless its error then exceeds that of a fresh placement
-    after three steps of the colour solve.
+    Gaussians that a fit started from are kept, see `eigengs_dr.fitting.start.keep_fitting`.
 
     Attributes
     ----------
@@ -122,11 +120,6 @@ class Redistribute:
 
     after: int = 20
     solve_steps: int = 10
-
-    TRIED_STEPS = 3
-    """Steps of the colour solve of the placement with which a chosen start is compared. Sets of a
-    moved image, of another image and of a model have 0.4 to 1.1 times its squared error, a heap and
-    Gaussians outside of the image 6.8 to 11 times (three training photos, 3,000 Gaussians)."""
 
     MIN_RATIO = 10
     """Smallest ratio of the steps of a descent to those before a redistribution."""
@@ -151,19 +144,10 @@ class Redistribute:
         self, state: State, objective: Pixels, step: int, iterations: int, key: int
     ) -> State:
         """Return the state with a new set and its surplus."""
-        if objective.levels or objective.part:
+        if objective.levels or objective.part or state.chosen:
             return state
         current, count = dr.detach(state.gaussians), state.count + state.surplus
-        if not state.chosen:
-            return state.replaced(redistribute(current, objective, count, self.solve_steps))
-        placed = place_adaptive(objective, state.count, current.cutoff)
-        anew = solve(placed, objective, self.TRIED_STEPS)
-        before, after = (dr.sum(squared_error(g, objective))[0] for g in (current, anew))
-        if before <= after:
-            return state
-        anew = solve(anew, objective, self.solve_steps, warm_start=True)
-        # The start has been judged, not the rates: steps of a useless start may raise its error.
-        return replace(state.replaced(anew), speed=1.0)
+        return state.replaced(redistribute(current, objective, count, self.solve_steps))
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ class State:
     surplus : int
         How many more a control may place before the last ones have left.
     chosen : bool
-        Whether the user chose the Gaussians: a redistribution then keeps them if they are of use.
+        Whether the fit started from Gaussians of the user, which a redistribution keeps.
     squares : Float or None, shape (images,)
         The sums of ``h (p - t)^2`` that a control has measured before this step.
     speed : float
@@ -100,7 +100,10 @@ class State:
     until: int = 0
 
     def replaced(self, gaussians: Gaussians) -> State:
-        """Return the state with another set, from which the optimiser starts anew."""
+        """Return the state with another set, from which the optimiser starts anew.
+
+        A control that changes the number of the result sets `count` too.
+        """
         return replace(self, gaussians=gaussians, squares=None, fixed=None, moving=None, lists=())
 
     @property

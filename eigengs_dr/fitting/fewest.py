@@ -193,7 +193,7 @@ class _Run:
         if share < 1:  # a polish moves Gaussians by itself
             method = method.without(Relocate, Perturb)
         self.planned, before = max(self.planned, self.step + steps), self.step
-        current = replace(begin(gaussians), count=len(gaussians) - surplus)
+        current = replace(begin(gaussians), count=len(gaussians) - surplus, surplus=surplus)
         states = descend(self.objective, method, current, steps, self.key + before)
         with closing(states):
             for step, current in enumerate(states, 1):  # noqa: B007

@@ -49,14 +49,15 @@ class Fit:
     gaussians : Gaussians
         The fitted set.
     trace : list of dict
-        Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb. A search for the number of
-        Gaussians adds the key gaussians. Maps add the key maps, with both PSNRs of each, and with
+        Rows with the keys iteration, gaussians, seconds, psnr_ycbcr and psnr_rgb, of steps 0, 10,
+        20, 50, each 100 and the last. Maps add the key maps, with both PSNRs of each, and with
         goals the key margin: the decibels of the worst map above its goal. Row 0
         shows the set before refinement. Seconds count from the call of `fit`; they include
         placement, upload, the colour solve and the measurements.
         A descent may have more Gaussians than requested until two thirds of its steps are taken,
-        see `eigengs_dr.fitting.control.Surplus`; such sets have no rows. With a weight, the
-        squared errors of all PSNRs are weighted, by the mean over the channels.
+        see `eigengs_dr.fitting.control.Surplus`; the key gaussians says so, and such a set is never
+        the result. With a weight, the squared errors of all PSNRs are weighted, by the mean over
+        the channels.
         With a loss the key is loss, see `eigengs_dr.Loss.judge`; with an image there are PSNRs
         too. Without an image the first row shows the picture of the texels, and rows with the
         key gaussians the numbers that were tried.
@@ -187,7 +188,8 @@ def fit(
         Instead of a placement, Gaussians to start from, scaled to the size of the image: the set of
         the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
         that it makes of the image, on shapes that suit many images. The set gets the cutoff of the
-        method. A start that turns out to be useless in the first steps is placed anew.
+        method. Gaussians that fit the image stay, the others are placed anew: all of them where a
+        placement would end higher. Those of a model, and without steps, all stay.
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
@@ -207,7 +209,7 @@ def fit(
         has those of the papers.
     seed : int, optional
         Seed of all random numbers: of the noise by which means and shapes are perturbed, and of
-        the placements that draw some.
+        where Gaussians are placed. Seeds that are equal modulo 2^32 are equal.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
     progress : bool or callable, optional
@@ -328,12 +330,13 @@ def fit_images(
         data = [data_of(p, space, weight) for p in pixels]
         display = picture(types, space, pixels, data, weight)
         objective = replace(Pixels.of(data, space, types), pictures=(display,))
-        begun = None
+        begun, chosen = None, False
         if start is not None:
             if isinstance(start, Gaussians):
                 start = fitted(start, data[0].affine)
-            moves = options.iterations > 0
-            objective, begun = start_from(start, objective, options.method, pixels[0], moves)
+            objective, begun, chosen = start_from(
+                start, objective, options.method, pixels[0], options.iterations, options.seed
+            )
             base = objective.pictures[0].base
             if base is not None:
                 mean_image = objective.picture(base).numpy()
@@ -356,7 +359,7 @@ def fit_images(
 
         figure = target_key(space, options.goal.space) if options.goal else "margin"
         refinements, seconds_init = _refined(
-            objective, options, begun, score, figure, started, progress, interrupted
+            objective, options, begun, chosen, score, figure, started, progress, interrupted
         )
     affines = [d.affine for d in data]
     return _finished(refinements, affines, mean_image, started, seconds_init)
@@ -444,7 +447,7 @@ def fit_maps(
             return [{"seconds": seconds, **objective.judged(gaussians), **row}]
 
         [refinement], seconds_init = _refined(
-            objective, options, None, score, "margin", started, progress, interrupted
+            objective, options, None, False, score, "margin", started, progress, interrupted
         )
     maps = tuple(image.map(factor) for image, factor in zip(images, factors, strict=True))
     whole = scale_channels(refinement.gaussians, [1 / w for w in channel_weights(maps)])
@@ -463,6 +466,7 @@ def _refined(
     objective: Pixels,
     options: FitOptions,
     begun: Gaussians | None,
+    chosen: bool,
     score: Score,
     figure: str,
     started: float,
@@ -471,12 +475,13 @@ def _refined(
 ) -> tuple[list[Refinement], float]:
     """Fit an objective as the options say: with a given number, in levels, or with the fewest.
 
-    `figure` is the key in the rows of `score` to which a goal refers. Also return the seconds
-    before refinement.
+    `begun` is the set to start from, if there is one, and `chosen` whether it holds Gaussians of
+    the user. `figure` is the key in the rows of `score` to which a goal refers. Also return the
+    seconds before refinement.
     """
     method, iterations, key = options.method, options.iterations, options.seed
     (width, height), channels = objective.size, objective.channels
-    counts, chosen = options.levels, begun is not None
+    counts = options.levels
     if counts or method.place != Adaptive():  # the choice of a placement is not undone
         method = method.without(Surplus, Redistribute)
     if counts:

@@ -16,7 +16,7 @@ from ..image.metrics import MAX_PSNR
 from .descent import State, listed, rate_table, started, step_program
 from .exchange import prune
 from .measure import Row
-from .method import Method
+from .method import Control, Method
 from .objective import Pixels
 
 
@@ -59,7 +59,7 @@ def descend(
             acting = [control for control, steps in acts if step in steps]
             squares = objective.around(state.gaussians) if acting else objective
             for control in acting:
-                state = control(state, squares, step, iterations, key)
+                state = _checked(control(state, squares, step, iterations, key), control)
             if state.moving is None:
                 state = started(state, method, step, objective.grid.images)
             if not state.lists or step >= state.until:
@@ -76,6 +76,26 @@ def descend(
             )
             state = replace(state, moving=moving, gaussians=moved, squares=None)
             yield state
+
+
+def _checked(state: State, control: Control) -> State:
+    """Return what a control returned, if its numbers of Gaussians agree.
+
+    Raises
+    ------
+    TypeError
+        If it is no state.
+    ValueError
+        If the set has fewer Gaussians than the state says, or more without a surplus.
+    """
+    if not isinstance(state, State):
+        raise TypeError(f"{control!r} returned {state!r}; a control returns the state")
+    if not state.count <= state.total <= state.count + state.surplus:
+        raise ValueError(
+            f"{control!r} left {state.total} Gaussians, but the count of the state is "
+            f"{state.count}; return replace(state.replaced(gaussians), count={state.total})"
+        )
+    return state
 
 
 def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussians:
@@ -123,8 +143,7 @@ class Refinement:
     gaussians : Gaussians
         The set with the highest `Pixels.merit` in the trace; the batch with it, if there is one.
     trace : list of dict
-        Rows with the keys iteration, seconds, psnr_ycbcr and psnr_rgb, for sets with as many
-        Gaussians as requested.
+        Rows with the keys iteration, gaussians, seconds, psnr_ycbcr and psnr_rgb.
     iterations : int
         Number of steps.
     stopped : str
@@ -139,15 +158,20 @@ class Refinement:
     stopped: str = "iterations"
     row: Row = field(default_factory=Row)
 
-    def judged(self, gaussians: Gaussians, row: Row, objective: Pixels) -> Refinement:
-        """Return the result with another row of its trace, and the set if it is the best."""
+    def judged(self, gaussians: Gaussians, row: Row, objective: Pixels, count: int) -> Refinement:
+        """Return the result with another row of its trace, and the set if it is the best.
+
+        Sets of `count` Gaussians are compared; the best one of another number is none any more.
+        """
         self.trace.append(row)
-        best = not self.row or objective.merit(row) > objective.merit(self.row)
-        stopped = "exact" if row.get("psnr_ycbcr", 0.0) > MAX_PSNR else self.stopped
-        step = row["iteration"]
-        if best:
-            return replace(self, gaussians=gaussians, row=row, stopped=stopped, iterations=step)
-        return replace(self, stopped=stopped, iterations=step)
+        result = replace(self, iterations=row["iteration"])
+        if row["gaussians"] != count:
+            return result
+        if row.get("psnr_ycbcr", 0.0) > MAX_PSNR:
+            result = replace(result, stopped="exact")
+        if self.row.get("gaussians") == count and objective.merit(row) <= objective.merit(self.row):
+            return result
+        return replace(result, gaussians=gaussians, row=row)
 
 
 class Best:
@@ -191,18 +215,15 @@ class Best:
 
     def judge(self, step: int, gaussians: Gaussians) -> None:
         """Measure a set. A set with more Gaussians than requested is not compared."""
-        rows = self.score(gaussians)
-        self.row = {"iteration": step, **rows[0]}
-        if len(gaussians) > len(self.refinements) * self.state.count:
-            figure = self.objective.merit(self.row)
-            if self.larger is None or figure > self.larger[0]:
-                self.larger = figure, step, gaussians
-            return
-        self.larger = None
+        number, count = len(gaussians) // len(self.refinements), self.state.count
+        rows = [{"iteration": step, "gaussians": number, **row} for row in self.score(gaussians)]
+        self.row, figure = rows[0], self.objective.merit(rows[0])
+        if number == count:
+            self.larger = None
+        elif self.larger is None or figure > self.larger[0]:
+            self.larger = figure, step, gaussians
         self.refinements = [
-            one
-            if one.stopped == "exact"
-            else one.judged(gaussians, {"iteration": step, **row}, self.objective)
+            one if one.stopped == "exact" else one.judged(gaussians, row, self.objective, count)
             for one, row in zip(self.refinements, rows, strict=True)
         ]
 
@@ -212,7 +233,8 @@ class Best:
             raise KeyboardInterrupt
         larger = [self.larger] if self.larger else []
         for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
-            if step not in [row["iteration"] for row in self.refinements[0].trace]:
+            measured = [row["iteration"] for row in self.refinements[0].trace]
+            if step not in measured or len(gaussians) > self.state.count:
                 near = self.objective.around(gaussians)
                 self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
         self.refinements = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields, replace
+from numbers import Real
 from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from .objective import Pixels
 
 
+@runtime_checkable
 class Control(Protocol):
     """A change of the Gaussians between steps of a descent: it adds, moves or removes some."""
 
@@ -35,7 +37,8 @@ class Control(Protocol):
     ) -> State:
         """Return the state with other Gaussians, by `eigengs_dr.fitting.descent.State.replaced`.
 
-        All random numbers depend on `key` and `step`.
+        All random numbers depend on `key` and `step`. A control that changes how many Gaussians the
+        result has sets the `count` of the state too.
         """
 
 
@@ -124,6 +127,7 @@ class Method:
     def __post_init__(self) -> None:
         for name, value in plain_numbers(vars(self), Method.__annotations__).items():
             object.__setattr__(self, name, value)
+        self._check_parts()
         if not 0 < self.cutoff <= MAX_CUTOFF:
             raise ValueError(
                 f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
@@ -135,8 +139,6 @@ class Method:
             )
         if self.solve_steps < 0:
             raise ValueError(f"solve_steps is {self.solve_steps!r}; it must be at least 0")
-        if not self.rates or not all(rate > 0 for rate in self.rates.values()):
-            raise ValueError(f"rates are {dict(self.rates)}; each must be above 0")
         surplus, relocate = self.control(Surplus), self.control(Relocate)
         often = relocate.every if relocate else 0
         if surplus and surplus.every and not 0 < often <= surplus.every:
@@ -144,6 +146,22 @@ class Method:
                 "controls: a Surplus leaves by a Relocate that comes as often; add one, or leave "
                 "the Surplus out"
             )
+
+    def _check_parts(self) -> None:
+        """Raise TypeError or ValueError unless each part has what a fit calls."""
+        kinds = {"place": Placement, "optimizer": Optimizer, "coordinates": Coordinates}
+        parts = [(name, getattr(self, name), kind) for name, kind in kinds.items()]
+        if not isinstance(self.controls, (tuple, list)):
+            raise TypeError(f"Method: controls is {self.controls!r}; give a tuple of controls")
+        for name, part, kind in [*parts, *(("controls", c, Control) for c in self.controls)]:
+            if isinstance(part, type) or not isinstance(part, kind):
+                raise TypeError(
+                    f"Method: {name} holds {part!r}, which lacks what a {kind.__name__} has; see "
+                    f"{kind.__module__}.{kind.__name__}"
+                )
+        rates = self.rates if isinstance(self.rates, Mapping) else {}
+        if not rates or not all(isinstance(r, Real) and r > 0 for r in rates.values()):
+            raise ValueError(f"Method: rates are {self.rates!r}; each must be above 0")
 
     def __repr__(self) -> str:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import drjit as dr
 
 from ..backend.types import Float, Rows
 
 
+@runtime_checkable
 class Optimizer(Protocol):
     """The type of optimisers: settings without state, and a step as a pure function.
 

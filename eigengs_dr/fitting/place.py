@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import index
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -27,6 +27,7 @@ Shapes = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Means (N, 2) in pixels, and factors (N, 3), see `eigengs_dr.Gaussians`."""
 
 
+@runtime_checkable
 class Placement(Protocol):
     """Makes the first set of Gaussians for an objective."""
 
@@ -48,7 +49,7 @@ class Adaptive:
 
     def __call__(self, objective: Pixels, count: int, cutoff: float, seed: int) -> Gaussians:
         """Place Gaussians; see `Placement`."""
-        return place_adaptive(objective, count, cutoff)
+        return place_adaptive(objective, count, cutoff, seed=seed)
 
 
 @dataclass(frozen=True)

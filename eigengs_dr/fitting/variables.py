@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import drjit as dr
 
@@ -18,6 +18,7 @@ ImageSize: TypeAlias = tuple[Float, Float] | None
 """Width and height in arrays, or None for those of the set."""
 
 
+@runtime_checkable
 class Coordinates(Protocol):
     """A change of variables, differentiable by Dr.Jit.
 

@@ -67,17 +67,18 @@ def curve_order(height, width):
     return y[order], x[order]
 
 
-def plain_pieces(density, count):
-    """Centroids (count, 2) of pieces of equal mass of the curve."""
+def plain_pieces(density, count, shift=0):
+    """Centroids (count, 2) of pieces of equal mass of the curve, with its cuts moved back."""
     row, column = curve_order(*density.shape)
     mass = np.asarray(density, np.float64)[row, column]
     before = np.concatenate([[0], np.cumsum(mass)])
     cuts = np.linspace(0, before[-1], count + 1)
+    cuts[1:-1] -= shift * before[-1] / count
     moments = [
         np.interp(cuts, before, np.concatenate([[0], np.cumsum(mass * (place + 0.5))]))
         for place in (column, row)
     ]
-    return np.diff(moments, axis=1).T * (count / before[-1])
+    return np.diff(moments, axis=1).T / np.diff(cuts)[:, None]
 
 
 def plain_lloyd(mean, density):

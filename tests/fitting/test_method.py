@@ -80,6 +80,22 @@ def test_bad_values_are_refused(changed, words):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"place": "random"}, "place holds 'random', which lacks what a Placement has"),
+        ({"place": Grid}, "place holds <class .*Grid'>"),
+        ({"controls": None}, "controls is None; give a tuple of controls"),
+        ({"controls": (print,)}, "controls holds .*see eigengs_dr.fitting.method.Control"),
+        ({"optimizer": 3}, "optimizer holds 3"),
+        ({"coordinates": Adaptive()}, r"coordinates holds Adaptive\(\)"),
+    ],
+)
+def test_parts_are_checked(changed, words):
+    with pytest.raises(TypeError, match=words):
+        replace(eg.DEFAULT, **changed)
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.1, np.nan])
 def test_shares_are_checked(share):
     with pytest.raises(ValueError, match=r"Relocate: share is .*; it must be from 0 to 1"):
@@ -105,6 +121,38 @@ def test_variables_without_a_rate_stay(rates):
         same = np.allclose(before[name], after[name], rtol=1e-5)
         assert same == (name not in rates)
     assert found.psnr_ycbcr > start.psnr_ycbcr
+
+
+@dataclass(frozen=True)
+class Prune:
+    """A control that removes Gaussians, and says so or not."""
+
+    says: bool
+
+    def steps(self, iterations):
+        return range(5, iterations, 10)
+
+    def __call__(self, state, objective, step, iterations, key):
+        pruned = state.replaced(state.gaussians[np.arange(state.total - 3)])
+        return replace(pruned, count=pruned.total) if self.says else pruned
+
+
+def test_a_control_says_how_many_gaussians_it_leaves():
+    image, method = coffee(32), replace(eg.DEFAULT, controls=(Prune(True),))
+    found = eg.fit(image, 40, 30, method=method)
+    assert len(found.gaussians) == 31 and found.iterations == 30
+    assert [row["gaussians"] for row in found.trace] == [40, 37, 34, 31]
+    with pytest.raises(ValueError, match=r"left 37 Gaussians, but the count of the state is 40"):
+        eg.fit(image, 40, 30, method=replace(method, controls=(Prune(False),)))
+
+
+def test_a_control_returns_a_state():
+    class Nothing(Prune):
+        def __call__(self, *state):
+            return None
+
+    with pytest.raises(TypeError, match="returned None; a control returns the state"):
+        eg.fit(coffee(32), 40, 30, method=replace(eg.DEFAULT, controls=(Nothing(True),)))
 
 
 # --- A control and a placement of one's own -----------------------------------------------------
@@ -179,5 +227,5 @@ def test_a_control_is_called_with_the_state_of_its_step():
     assert [c[:3] for c in calls] == [(n, 50, 7) for n in range(0, 50, 10)]
     errors = [c[3] for c in calls]
     assert errors[-1] < errors[0]
-    plain = eg.fit(coffee(32), 40, 50, method=replace(method, controls=()))
+    plain = eg.fit(coffee(32), 40, 50, method=replace(method, controls=()), seed=7)
     np.testing.assert_array_equal(found.image, plain.image)  # looking changes nothing

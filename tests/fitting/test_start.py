@@ -8,9 +8,10 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, family, small_model
-from _helpers.halves import picture
+from _helpers.halves import objective_of, picture
 from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Surplus
 from eigengs_dr.fitting.place import Grid, Random
+from eigengs_dr.fitting.start import keep_fitting
 from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.resize import resample
 from eigengs_dr.paper.eigengs import EIGENGS
@@ -188,3 +189,52 @@ def test_fit_refuses_what_is_no_start(others):
         eg.fit(others[0], start=eg.fit(others[0], 30, 0), method=EIGENGS)
     with pytest.raises(ValueError, match="the start is on backend 'llvm', not on 'cuda'"):
         eg.fit(others[0], start=small_model("llvm"), backend="cuda")
+
+
+def frame(number, shift, side=64):
+    """A frame of a camera that moves, as part of a photo."""
+    x = 60 + shift * number
+    return eg.sample("astronaut")[100 : 100 + side, x : x + side]
+
+
+@pytest.mark.parametrize("shift", [1, 3, 100])
+@pytest.mark.parametrize("steps", [20, 120])
+def test_a_film_ends_no_lower_than_fits_of_their_own(shift, steps):
+    """Of a camera that moves, and of cuts."""
+    start = eg.fit(frame(0, shift), 200, steps)
+    for number in (1, 2):
+        image = frame(number, shift)
+        start, own = eg.fit(image, start=start, iterations=steps), eg.fit(image, 200, steps)
+        assert start.psnr_rgb > own.psnr_rgb - 0.3
+
+
+def test_a_film_of_a_still_scene_gains():
+    image = frame(0, 0)
+    first = eg.fit(image, 200, 20)
+    assert eg.fit(image, start=first, iterations=20).psnr_rgb > first.psnr_rgb + 0.3
+
+
+def test_gaussians_stay_where_the_image_is_still():
+    """Those that an object has left or reached are placed anew."""
+    scene, thing = eg.sample("astronaut")[60:156, 40:136], eg.sample("coffee")[150:170, 200:220]
+    before, after = scene.copy(), scene.copy()
+    before[40:60, 10:30] = after[40:60, 18:38] = thing
+    first = eg.fit(before, 400, 40)
+    begun, kept = keep_fitting(first.gaussians, objective_of(after), eg.DEFAULT, 40, 0)
+    assert kept and len(begun) == 400
+    still, moved = first.gaussians.mean.numpy().T, begun.mean.numpy().T
+    stays = np.array([(np.abs(moved - mean).max(1) < 1e-4).any() for mean in still])
+    reached = ((still > [12, 42]) & (still < [36, 58])).all(1)
+    away = ((still < [4, 34]) | (still > [44, 66])).any(1)
+    assert stays[away].mean() > 0.7 and stays[reached].mean() < 0.4
+
+
+@pytest.mark.parametrize("steps", [0, 15, 110])
+def test_seeds_place_gaussians_elsewhere(steps):
+    """At any number of steps; numbers far apart too."""
+    image = frame(0, 0, 32)
+    colors = [
+        eg.fit(image, 40, steps, seed=s).gaussians.color.numpy() for s in (0, 0, 1, 2**40 + 3)
+    ]
+    np.testing.assert_array_equal(colors[0], colors[1])
+    assert len({color.tobytes() for color in colors}) == 3

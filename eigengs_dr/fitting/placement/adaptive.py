@@ -32,7 +32,7 @@ from dataclasses import replace
 
 import drjit as dr
 
-from ...backend.arrays import release_memory
+from ...backend.arrays import ArrayTypes, release_memory
 from ...backend.recording import record
 from ...backend.types import Float, Rows
 from ...gaussian.file import CUTOFF
@@ -72,13 +72,21 @@ RELATIVE_SIZE = 0.7
 MAX_STRETCH = 3.0
 """Ratio of the standard deviations along and across a straight edge."""
 
+SEED_STEP = 2654435769
+"""Step of the shifts of seeds, of 2^32: the golden ratio spreads them evenly, and 0 shifts nothing
+(Knuth, The Art of Computer Programming 3, 6.4)."""
+
 WORKING_SPACING = 8.0
 """Pixels between Gaussians for placement. Images with at least twice this spacing are shrunk first:
 the constants above were chosen near this spacing, and filters of large images take long."""
 
 
 def place_adaptive(
-    objective: Pixels, count: int, cutoff: float = CUTOFF, density: Density | None = None
+    objective: Pixels,
+    count: int,
+    cutoff: float = CUTOFF,
+    density: Density | None = None,
+    seed: int = 0,
 ) -> Gaussians:
     """Place and shape Gaussians by the second derivatives of an image, with the colour 0.
 
@@ -94,6 +102,8 @@ def place_adaptive(
         Cutoff of the set, see `eigengs_dr.Gaussians`.
     density : callable, optional
         See `Density`.
+    seed : int, optional
+        Moves all means along the curve by the same share of a piece, see `SEED_STEP`.
 
     Returns
     -------
@@ -101,7 +111,8 @@ def place_adaptive(
         Neighbours in memory are close in space.
     """
     types, grid, channels = objective.types, objective.grid, objective.channels
-    mean, factor = _place(Canvas.of(types, grid), objective.placement_image, count, density)
+    canvas, image = Canvas.of(types, grid), objective.placement_image
+    mean, factor = _place(canvas, image, count, density, seed)
     color = [dr.zeros(types.Float, grid.images * count) for _ in range(channels)]
     background = [dr.zeros(types.Float, grid.images) for _ in range(channels)]
     dr.make_opaque(color, background)
@@ -116,7 +127,12 @@ def place_adaptive(
 
 
 def _place(
-    canvas: Canvas, image: Float, count: int, density: Density | None, times: int = 1
+    canvas: Canvas,
+    image: Float,
+    count: int,
+    density: Density | None,
+    seed: int,
+    times: int = 1,
 ) -> tuple[Rows, Rows]:
     """Return the means and the factors of `place_adaptive`, for an image after shrinking."""
     types, grid = canvas.types, canvas.grid
@@ -126,19 +142,24 @@ def _place(
         small = Grid(-(-grid.width // smaller), -(-grid.height // smaller), images=grid.images)
         less = Canvas.of(types, small)
         image = shrunk(canvas, image, less, smaller)
-        mean, factor = _place(less, image, count, density, smaller * times)
+        mean, factor = _place(less, image, count, density, seed, smaller * times)
         scale, inverse = (dr.opaque(types.Float, v) for v in (smaller, 1 / smaller))
         return mean * scale, factor * inverse
     energy, per_pixel = density_from_hessian(canvas, image, spacing)
     del image  # images take most of the memory
     if density:
         per_pixel = density(canvas, per_pixel, times)
-    return place_by_density(canvas, per_pixel, energy, count, spacing)
+    return place_by_density(canvas, per_pixel, energy, count, spacing, shift_of(types, seed))
+
+
+def shift_of(types: ArrayTypes, seed: int) -> Float:
+    """Return the shift of a seed, see `stratify_along_hilbert`; that of seed 0 is 0."""
+    return dr.opaque(types.Float, 0.5 * (seed * SEED_STEP % 2**32) / 2**32)
 
 
 @record
 def place_by_density(
-    canvas: Canvas, density: Float, energy: Float, count: int, spacing: float
+    canvas: Canvas, density: Float, energy: Float, count: int, spacing: float, shift: Float
 ) -> tuple[Rows, Rows]:
     """Return means, an Array2f, and factors, an Array3f, of Gaussians by a density.
 
@@ -153,9 +174,11 @@ def place_by_density(
         Number of Gaussians of an image.
     spacing : float
         Mean distance of Gaussians in pixels.
+    shift : Float, shape (1,)
+        See `stratify_along_hilbert`.
     """
     density = normalize_density(canvas, density, count)
-    mean = stratify_along_hilbert(canvas, density, count)
+    mean = stratify_along_hilbert(canvas, density, count, shift)
     mean = lloyd_step(canvas, mean, density, spacing)
     release_memory(dr.width(energy))  # the blur of the energy takes the most
     factor = shapes_from_hessian(canvas, mean, density, energy, spacing)

@@ -17,9 +17,10 @@ from _helpers.sets import few
 from eigengs_dr.fitting.placement.pieces import curve_of, lloyd_step, stratify_along_hilbert
 
 
-def pieces(density, count, backend="llvm"):
+def pieces(density, count, backend="llvm", shift=0.0):
     canvas, values = to_canvas(density, backend)
-    return centers(*stratify_along_hilbert(canvas, values, count))
+    shift = canvas.types.Float(shift)
+    return centers(*stratify_along_hilbert(canvas, values, count, shift))
 
 
 def relaxed(mean, density, backend="llvm", spacing=None):
@@ -39,14 +40,19 @@ def test_the_curve_visits_tiles_as_a_hilbert_curve_does(backend, height, width):
 
 
 @few
-@given(height=st.integers(1, 40), width=st.integers(1, 40), part=st.floats(0, 1))
-def test_pieces_are_those_of_numpy(backend, height, width, part):
-    """Also where a pixel holds several of them."""
+@given(
+    height=st.integers(1, 40),
+    width=st.integers(1, 40),
+    part=st.floats(0, 1),
+    shift=st.sampled_from([0, 0.3]),
+)
+def test_pieces_are_those_of_numpy(backend, height, width, part, shift):
+    """Also where a pixel holds several of them, and with all cuts but the ends moved back."""
     density = np.random.default_rng(height).uniform(0, 1, (height, width)) ** 4
     count = max(1, round(part * height * width))
     density *= count / density.sum()
-    found = pieces(density, count, backend)
-    np.testing.assert_allclose(found, plain_pieces(density.astype(np.float32), count), atol=1e-3)
+    expected = plain_pieces(density.astype(np.float32), count, shift)
+    np.testing.assert_allclose(pieces(density, count, backend, shift), expected, atol=1e-3)
 
 
 def test_pieces_of_an_even_density_are_squares(backend):
