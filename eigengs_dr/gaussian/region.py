@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from .file import SetData
 
-
 Region = tuple[int, int, int, int]
 """Left, top, width and height, in native pixels of a set."""
 

@@ -91,12 +91,14 @@ def render(
     Notes
     -----
     The order of summation depends only on the input, so renderings on one machine and backend are
-    bit-identical. The average is one of sums, in the colour space of the set: of codes for "ycbcr"
-    and "rgb", of logarithms for "log". It takes each Gaussian for its convolution with a box of a
-    pixel, by moments (`averaged`). A Gaussian is not drawn if its mean or factor is not finite. If its colour is not
+    bit-identical. A Gaussian is not drawn if its mean or factor is not finite. If its colour is not
     finite, pixels of the tiles that it touches may be wrong. `drjit.freeze` cannot record the
     construction of tile lists, which copies sizes to the host: build them with `tile_lists`, and
     pass them to the frozen function as an argument.
+
+    A smaller picture averages the sums of Gaussians, in the colour space of the set: codes for
+    "ycbcr" and "rgb", logarithms for "log". The box of a pixel is taken for a Gaussian of its
+    variance.
 
     Examples
     --------

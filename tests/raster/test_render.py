@@ -309,7 +309,7 @@ def test_a_region_is_the_crop_of_the_whole(backend, scale):
     "region", [(0, 0, 23, 5), (-1, 0, 5, 5), (20, 0, 3, 3), (3, 3, 0, 2), (1, 2, 3), (0.5, 0, 2, 2)]
 )
 def test_regions_that_are_refused(backend, region):
-    with pytest.raises((ValueError, TypeError), match="region|integer"):
+    with pytest.raises((ValueError, TypeError), match=r"region|integer"):
         render(random_scene().on(backend), region=region)
 
 
