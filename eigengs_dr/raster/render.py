@@ -149,10 +149,12 @@ def tile_lists(
     Parameters
     ----------
     gaussians : Gaussians or Fit
-    width, height, cutoff, region, filter : optional
+    width, height, cutoff : optional
         As for `render`, which must get the same values.
     margin : float, optional
         Pixels of the rendering by which Gaussians may move or grow before lists miss a tile.
+    region, filter : optional
+        As for `render`.
 
     Returns
     -------
