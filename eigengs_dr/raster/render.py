@@ -109,11 +109,11 @@ def render(
     """
     gaussians = set_of(gaussians)
     _check_rows(gaussians)
-    view = _view(gaussians, width, height, region, filter)
-    scaled = _seen(gaussians, view, cutoff)
+    frame = _frame(gaussians, width, height, region, filter)
+    scaled = _seen(gaussians, frame, cutoff)
     parameters = decode_parameters(scaled)
     if lists is not None:
-        _check_lists(lists, scaled, view)
+        _check_lists(lists, scaled, frame)
         lists = update_exact_exp(lists, dr.detach(parameters.shape), kernel_radius(scaled.cutoff))
     elif dr.flag(dr.JitFlag.FreezingScope):
         raise ValueError(
@@ -179,9 +179,9 @@ def tile_lists(
     _check_rows(gaussians)
     if not 0 <= margin < np.inf:
         raise ValueError(f"margin is {margin}; it must be finite and at least 0 pixels")
-    view = _view(gaussians, width, height, region, filter)
-    lists = bin_gaussians(_seen(dr.detach(gaussians), view, cutoff), float(margin))
-    return replace(lists, view=view)
+    frame = _frame(gaussians, width, height, region, filter)
+    lists = bin_gaussians(_seen(dr.detach(gaussians), frame, cutoff), float(margin))
+    return replace(lists, frame=frame)
 
 
 @door
@@ -229,8 +229,8 @@ def _check_rows(gaussians: Gaussians) -> None:
             )
 
 
-def _check_lists(lists: TileLists, gaussians: Gaussians, view: View) -> None:
-    """Raise ValueError if lists are for another view, number of Gaussians or cutoff."""
+def _check_lists(lists: TileLists, gaussians: Gaussians, frame: Frame) -> None:
+    """Raise ValueError if lists are for another frame, number of Gaussians or cutoff."""
     assert lists.pieces is not None
     listed = lists.grid.width, lists.grid.height, dr.width(lists.pieces.number)
     expected = gaussians.width, gaussians.height, len(gaussians)
@@ -244,13 +244,13 @@ def _check_lists(lists: TileLists, gaussians: Gaussians, view: View) -> None:
             f"render: the lists are for the cutoff {lists.radius / EXP2_SCALE:g}, the rendering "
             f"has {gaussians.cutoff:g}; rebuild them with tile_lists"
         )
-    if lists.view != view:
+    if lists.frame != frame:
         raise ValueError(
             "render: the lists are for another region or filter; rebuild them with tile_lists"
         )
 
 
-class View(NamedTuple):
+class Frame(NamedTuple):
     """What a rendering shows: a region in native pixels, at a size, averaged if it is smaller."""
 
     region: Region
@@ -258,17 +258,17 @@ class View(NamedTuple):
     filter: bool
 
 
-def _view(
+def _frame(
     gaussians: Gaussians,
     width: int | None,
     height: int | None,
     region: Sequence[int] | None,
     filter: bool,
-) -> View:
+) -> Frame:
     native = gaussians.width, gaussians.height
     part = check_region("region", (0, 0, *native) if region is None else region, native)
     size = _size(part[2:], width, height)
-    return View(part, size, bool(filter) and (size[0] < part[2] or size[1] < part[3]))
+    return Frame(part, size, bool(filter) and (size[0] < part[2] or size[1] < part[3]))
 
 
 def _size(native: tuple[int, int], width: int | None, height: int | None) -> tuple[int, int]:
@@ -285,13 +285,13 @@ def _size(native: tuple[int, int], width: int | None, height: int | None) -> tup
     return index(width), index(height)
 
 
-def _seen(gaussians: Gaussians, view: View, cutoff: float | None) -> Gaussians:
+def _seen(gaussians: Gaussians, frame: Frame, cutoff: float | None) -> Gaussians:
     """Return the set whose native picture, sampled at centres of pixels, is a rendering."""
-    (left, top, columns, rows), (width, height), filter = view
+    (left, top, columns, rows), (width, height), filter = frame
     check_index_range(width, height, gaussians.channels, TILE)
     if filter:
-        gaussians = averaged(gaussians, (columns / width, rows / height))
-    if view.region != (0, 0, gaussians.width, gaussians.height):
+        gaussians = filter_by_box(gaussians, (columns / width, rows / height))
+    if frame.region != (0, 0, gaussians.width, gaussians.height):
         types = types_of(gaussians.mean)
         x, y = (dr.opaque(types.Float, v) for v in (left, top))
         mean = types.Float2(gaussians.mean[0] - x, gaussians.mean[1] - y)
@@ -301,7 +301,7 @@ def _seen(gaussians: Gaussians, view: View, cutoff: float | None) -> Gaussians:
     return scaled if cutoff is None else replace(scaled, cutoff=float(cutoff))
 
 
-def averaged(gaussians: Gaussians, times: tuple[float, float]) -> Gaussians:
+def filter_by_box(gaussians: Gaussians, times: tuple[float, float]) -> Gaussians:
     """Return a set whose values at points are averages over boxes; differentiable.
 
     The mean of k pixels in a row has a variance of ``(k^2 - 1) / 12`` pixels squared. It is added
