@@ -19,7 +19,7 @@ from ..image.color import rendered_as
 from ..image.formats import TIFF_SUFFIXES
 from ..image.io import bits_of, dtype_of, to_file, write_pixels
 from ..image.metrics import float_space, squared_error
-from ..raster.render import picture_of, render
+from ..raster.render import filter_by_box, picture_of, render
 from ..storage.atomic import atomic_write
 from .grid import Block
 from .windows import TILE_SIDE, Source, Window, write_tiles
@@ -64,7 +64,8 @@ def draw_region(
 ) -> Iterator[Picture]:
     """Render a region of a set at any size, in bands of rows from top to bottom.
 
-    The memory is that of a band and of the set.
+    A smaller picture is averaged, as by `eigengs_dr.render`. The memory is that of a band and of
+    the set.
 
     Parameters
     ----------
@@ -85,6 +86,8 @@ def draw_region(
     left, top, native_width, native_height = region
     width, height = size
     scale = width / native_width, height / native_height
+    if min(scale) < 1:  # before a Gaussian that becomes wider is left out
+        data = filter_by_box(_load(data, backend), (1 / scale[0], 1 / scale[1])).data()
     if (native_width, native_height) != data.size:
         data = crop(data, (left, top), (native_width, native_height))
     rows = max(1, BAND_PIXELS // width // TILE_SIDE) * TILE_SIDE

@@ -46,7 +46,8 @@ def render(
 ) -> None:
     """Render a fitted image at any size, or a region of it.
 
-    Without --scale and --size, the picture has the native size of the image or of the region.
+    Without --scale and --size, the picture has the native size of the image or of the region. A
+    smaller picture is an average of the native one, not every n-th pixel.
     Files of 8 and 16 bits hold clamped sRGB; files of floats (.exr, .hdr, .pfm, and .tif with
     --bits 32) hold linear light. A fit of data is written unchanged; one channel gives a grey
     picture. Large pictures are rendered in bands; a .tif file takes no more memory than a band.
@@ -74,6 +75,7 @@ def render(
     select(run.backend)
     from ..blocks.draw import save_region
     from ..gaussian.file import read_map
+    from ..gaussian.region import check_region
 
     data = read_map(file, name, "--map")
     count = len(data.arrays["mean"])
@@ -83,12 +85,8 @@ def render(
         count = first
         parts = {name: data.arrays[name][:first] for name in ("mean", "factor", "color")}
         data = data._replace(arrays=data.arrays | parts)
-    left, top, width, height = region = region or (0, 0, *data.size)
-    if left + width > data.size[0] or top + height > data.size[1]:
-        raise ValueError(
-            f"{file}: --region {left},{top},{width},{height} is not inside the image of "
-            f"{data.size[0]}x{data.size[1]} pixels"
-        )
+    region = check_region(f"{file}: --region", region or (0, 0, *data.size), data.size)
+    width, height = region[2:]
     columns, rows = size or (max(1, round(width * (scale or 1))), None)
     if rows is None:
         rows = max(1, round(height * (scale or columns / width)))

@@ -75,6 +75,38 @@ def outline(factor: Floats, points: int = 25) -> NDArray[np.float64]:
 
 
 # ---------------------------------------------------------------------------------------------
+#  The average over a box, on Dr.Jit arrays
+# ---------------------------------------------------------------------------------------------
+
+
+def add_variances(
+    a: Float, b: Float, c: Float, xx: Float, yy: Float
+) -> tuple[tuple[Float, Float, Float], Float]:
+    """Add variances along x and y to a covariance: ``Sigma' = Sigma + diag(xx, yy)``.
+
+    With ``C = 1 + yy c^2`` and ``D = det Sigma' / det Sigma = 1 + xx a^2 + yy b^2 + yy c^2 +
+    xx yy a^2 c^2``, sums of squares that do not cancel, the new factor is
+    ``a sqrt(C / D), b / sqrt(C D), c / sqrt(C)``.
+
+    Parameters
+    ----------
+    a, b, c : Float, shape (N,)
+    xx, yy : Float, shape (1,)
+        At least 0, in pixels squared if the factors are in 1 / pixels.
+
+    Returns
+    -------
+    factor : tuple of 3 Float, shape (N,)
+    amplitude : Float, shape (N,)
+        ``sqrt(det Sigma / det Sigma')``: a colour times it keeps its integral.
+    """
+    rows = 1 + yy * dr.square(c)
+    columns = 1 + xx * dr.square(a)
+    amplitude, narrower = rsqrt(dr.fma(rows, columns, yy * dr.square(b))), rsqrt(rows)
+    return (a * dr.sqrt(rows) * amplitude, b * narrower * amplitude, c * narrower), amplitude
+
+
+# ---------------------------------------------------------------------------------------------
 #  The matrix logarithm: 1/2 log(F^T F) = [[s + u, v], [v, s - u]]
 # ---------------------------------------------------------------------------------------------
 

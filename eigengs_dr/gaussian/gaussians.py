@@ -177,6 +177,8 @@ class Gaussians:
         return _received, (self.data(), types.backend, kind)
 
     def __repr__(self) -> str:
+        if not self.width:  # `drjit.grad` keeps arrays alone; it makes 0 of sizes and names
+            return f"Gaussians({len(self)}, derivatives)"
         size = f"{len(self)}, {self.width}x{self.height} pixels"
         kind = f"{self.channels} channels, {self.space!r}"
         if self.maps:

@@ -1,11 +1,32 @@
-"""The part of a set inside a region, in NumPy arrays."""
+"""The part of a set inside a region."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from operator import index
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .file import SetData
+
+Region = tuple[int, int, int, int]
+"""Left, top, width and height, in native pixels of a set."""
+
+
+def check_region(name: str, region: Sequence[int], size: tuple[int, int]) -> Region:
+    """Return a region, or raise ValueError unless it is inside an image of (width, height)."""
+    values = [index(v) for v in region]
+    if len(values) != 4:
+        raise ValueError(f"{name} is {values}; expected left, top, width and height in pixels")
+    left, top, width, height = values
+    inside = 0 <= left <= size[0] - width and 0 <= top <= size[1] - height
+    if not inside or min(width, height) < 1:
+        raise ValueError(
+            f"{name} {left},{top},{width},{height} is not inside the image of "
+            f"{size[0]}x{size[1]} pixels"
+        )
+    return left, top, width, height
 
 
 def crop(

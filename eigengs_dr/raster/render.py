@@ -5,9 +5,10 @@ Kernels write an image in tile layout. `render` returns it as rows of pixels, a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import index
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -16,8 +17,10 @@ from ..backend.arrays import ArrayTypes, make_divisor, settle, types_of
 from ..backend.doors import door
 from ..backend.types import Float, FloatLike, Tensor, UInt, Values
 from ..gaussian.channels import display_values, slices
+from ..gaussian.covariance import add_variances
 from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
+from ..gaussian.region import Region, check_region
 from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists, update_exact_exp
@@ -41,11 +44,15 @@ def render(
     height: int | None = None,
     cutoff: float | None = None,
     lists: TileLists | None = None,
+    *,
+    region: Sequence[int] | None = None,
+    filter: bool = True,
 ) -> Tensor:
-    """Render a set of Gaussians at any size.
+    """Render a set of Gaussians, or a region of it, at any size.
 
-    The result is differentiable with respect to mean, factor, color and background, in forward and
-    reverse mode. A set in YCbCr is rendered as RGB, and sets in the spaces "linear", "radiance" and
+    A smaller picture shows the average of the native one over each of its pixels. The result is
+    differentiable with respect to mean, factor, color and background, in forward and reverse mode.
+    A set in YCbCr is rendered as RGB, and sets in the spaces "linear", "radiance" and
     "log" as linear light (`picture_of` encodes it as sRGB); data is not converted. Values are not
     clamped.
 
@@ -53,14 +60,20 @@ def render(
     ----------
     gaussians : Gaussians or Fit
     width, height : int, optional
-        Size of the image in pixels; by default the native size. If only one is given, the native
-        aspect ratio gives the other.
+        Size of the picture in pixels; by default the native size of the set or of the region. If
+        only one is given, the native aspect ratio gives the other.
     cutoff : float, optional
         Standard deviations at which a Gaussian ends, in (0, 12]; by default the cutoff of the set.
     lists : TileLists, optional
-        The result of `tile_lists` for this set, size and cutoff, possibly of a few steps ago. The
-        Gaussians may have shrunk since by any factor. By default new lists are built, which
-        `drjit.freeze` cannot record.
+        The result of `tile_lists` for this set, size, cutoff, region and filter, possibly of a few
+        steps ago. The Gaussians may have shrunk since by any factor. By default new lists are
+        built, which `drjit.freeze` cannot record.
+    region : sequence of 4 int, optional
+        Left, top, width and height in native pixels of the set: render this part alone.
+    filter : bool, optional
+        Whether an axis with fewer pixels than the native picture is averaged. False samples at the
+        centres of pixels, which shows needles and patterns that the native picture does not have.
+        At the native size and above, nothing is averaged.
 
     Returns
     -------
@@ -70,9 +83,10 @@ def render(
     Raises
     ------
     ValueError
-        If a side is not positive, the image is too large for 32-bit indices, the cutoff is not in
-        (0, 12], the lists are for another size, cutoff or number of Gaussians, or `drjit.freeze`
-        is recording and no lists are given.
+        If a side is not positive, the image is too large for 32-bit indices, the region is not
+        inside the image, the cutoff is not in (0, 12], the lists are for another size, cutoff,
+        region, filter or number of Gaussians, or `drjit.freeze` is recording and no lists are
+        given.
 
     Notes
     -----
@@ -82,19 +96,24 @@ def render(
     construction of tile lists, which copies sizes to the host: build them with `tile_lists`, and
     pass them to the frozen function as an argument.
 
+    A smaller picture averages the sums of Gaussians, in the colour space of the set: codes for
+    "ycbcr" and "rgb", logarithms for "log". The box of a pixel is taken for a Gaussian of its
+    variance.
+
     Examples
     --------
     >>> import eigengs_dr as eg
     >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
-    >>> eg.render(g).shape, eg.render(g, width=16).shape
-    ((8, 8, 1), (16, 16, 1))
+    >>> eg.render(g).shape, eg.render(g, width=16, region=(0, 2, 8, 4)).shape
+    ((8, 8, 1), (8, 16, 1))
     """
     gaussians = set_of(gaussians)
     _check_rows(gaussians)
-    scaled = _at_size(gaussians, width, height, cutoff)
+    frame = _frame(gaussians, width, height, region, filter)
+    scaled = _seen(gaussians, frame, cutoff)
     parameters = decode_parameters(scaled)
     if lists is not None:
-        _check_lists(lists, scaled)
+        _check_lists(lists, scaled, frame)
         lists = update_exact_exp(lists, dr.detach(parameters.shape), kernel_radius(scaled.cutoff))
     elif dr.flag(dr.JitFlag.FreezingScope):
         raise ValueError(
@@ -115,6 +134,9 @@ def tile_lists(
     height: int | None = None,
     cutoff: float | None = None,
     margin: float = 0.0,
+    *,
+    region: Sequence[int] | None = None,
+    filter: bool = True,
 ) -> TileLists:
     """List the Gaussians that each tile of a rendering needs, for `render` inside `drjit.freeze`.
 
@@ -131,6 +153,8 @@ def tile_lists(
         As for `render`, which must get the same values.
     margin : float, optional
         Pixels of the rendering by which Gaussians may move or grow before lists miss a tile.
+    region, filter : optional
+        As for `render`.
 
     Returns
     -------
@@ -155,8 +179,9 @@ def tile_lists(
     _check_rows(gaussians)
     if not 0 <= margin < np.inf:
         raise ValueError(f"margin is {margin}; it must be finite and at least 0 pixels")
-    scaled = _at_size(dr.detach(gaussians), width, height, cutoff)
-    return bin_gaussians(scaled, float(margin))
+    frame = _frame(gaussians, width, height, region, filter)
+    lists = bin_gaussians(_seen(dr.detach(gaussians), frame, cutoff), float(margin))
+    return replace(lists, frame=frame)
 
 
 @door
@@ -165,16 +190,17 @@ def picture_of(
     width: int | None = None,
     height: int | None = None,
     cutoff: float | None = None,
+    *,
+    region: Sequence[int] | None = None,
+    filter: bool = True,
 ) -> Any:
     """Render a set for display and comparison: as `render`, but with linear light encoded as sRGB.
 
     Parameters
     ----------
     gaussians : Gaussians or Fit
-    width, height : int, optional
-        Size of the image in pixels, as for `render`.
-    cutoff : float, optional
-        Standard deviations after which a Gaussian ends; by default that of the set.
+    width, height, cutoff, region, filter : optional
+        As for `render`.
 
     Returns
     -------
@@ -183,7 +209,8 @@ def picture_of(
         maps, a picture of each map by name.
     """
     gaussians = set_of(gaussians)
-    image = render(dr.detach(gaussians), width, height, cutoff).numpy()
+    shown = render(dr.detach(gaussians), width, height, cutoff, region=region, filter=filter)
+    image = shown.numpy()
     if gaussians.maps:
         pairs = zip(gaussians.maps, slices(gaussians.maps), strict=True)
         return {m.name: display_values(m.space, image[..., part]) for m, part in pairs}
@@ -202,8 +229,8 @@ def _check_rows(gaussians: Gaussians) -> None:
             )
 
 
-def _check_lists(lists: TileLists, gaussians: Gaussians) -> None:
-    """Raise ValueError if lists are for another size, number of Gaussians or cutoff."""
+def _check_lists(lists: TileLists, gaussians: Gaussians, frame: Frame) -> None:
+    """Raise ValueError if lists are for another frame, number of Gaussians or cutoff."""
     assert lists.pieces is not None
     listed = lists.grid.width, lists.grid.height, dr.width(lists.pieces.number)
     expected = gaussians.width, gaussians.height, len(gaussians)
@@ -217,31 +244,83 @@ def _check_lists(lists: TileLists, gaussians: Gaussians) -> None:
             f"render: the lists are for the cutoff {lists.radius / EXP2_SCALE:g}, the rendering "
             f"has {gaussians.cutoff:g}; rebuild them with tile_lists"
         )
+    if lists.frame != frame:
+        raise ValueError(
+            "render: the lists are for another region or filter; rebuild them with tile_lists"
+        )
 
 
-def _at_size(
-    gaussians: Gaussians, width: int | None, height: int | None, cutoff: float | None
-) -> Gaussians:
-    """Return a set with the size and the cutoff of a rendering."""
-    width, height = _size(gaussians, width, height)
+class Frame(NamedTuple):
+    """What a rendering shows: a region in native pixels, at a size, averaged if it is smaller."""
+
+    region: Region
+    size: tuple[int, int]
+    filter: bool
+
+
+def _frame(
+    gaussians: Gaussians,
+    width: int | None,
+    height: int | None,
+    region: Sequence[int] | None,
+    filter: bool,
+) -> Frame:
+    native = gaussians.width, gaussians.height
+    part = check_region("region", (0, 0, *native) if region is None else region, native)
+    size = _size(part[2:], width, height)
+    return Frame(part, size, bool(filter) and (size[0] < part[2] or size[1] < part[3]))
+
+
+def _size(native: tuple[int, int], width: int | None, height: int | None) -> tuple[int, int]:
+    for name, side in (("width", width), ("height", height)):
+        if side is not None and index(side) < 1:
+            raise ValueError(f"{name} is {side}; it must be at least 1 pixel")
+    if width is None and height is None:
+        return native
+    if width is None:
+        assert height is not None
+        width = max(1, round(height * native[0] / native[1]))
+    if height is None:
+        height = max(1, round(width * native[1] / native[0]))
+    return index(width), index(height)
+
+
+def _seen(gaussians: Gaussians, frame: Frame, cutoff: float | None) -> Gaussians:
+    """Return the set whose native picture, sampled at centres of pixels, is a rendering."""
+    (left, top, columns, rows), (width, height), filter = frame
     check_index_range(width, height, gaussians.channels, TILE)
+    if filter:
+        gaussians = filter_by_box(gaussians, (columns / width, rows / height))
+    if frame.region != (0, 0, gaussians.width, gaussians.height):
+        types = types_of(gaussians.mean)
+        x, y = (dr.opaque(types.Float, v) for v in (left, top))
+        mean = types.Float2(gaussians.mean[0] - x, gaussians.mean[1] - y)
+        gaussians = replace(gaussians, mean=mean, width=columns, height=rows)
     scaled = gaussians.scaled(width, height)
     # A NumPy scalar would promote Dr.Jit arrays to float64.
     return scaled if cutoff is None else replace(scaled, cutoff=float(cutoff))
 
 
-def _size(gaussians: Gaussians, width: int | None, height: int | None) -> tuple[int, int]:
-    for name, side in (("width", width), ("height", height)):
-        if side is not None and index(side) < 1:
-            raise ValueError(f"{name} is {side}; it must be at least 1 pixel")
-    if width is None and height is None:
-        return gaussians.width, gaussians.height
-    if width is None:
-        assert height is not None
-        width = max(1, round(height * gaussians.width / gaussians.height))
-    if height is None:
-        height = max(1, round(width * gaussians.height / gaussians.width))
-    return index(width), index(height)
+def filter_by_box(gaussians: Gaussians, times: tuple[float, float]) -> Gaussians:
+    """Return a set whose values at points are averages over boxes; differentiable.
+
+    The mean of k pixels in a row has a variance of ``(k^2 - 1) / 12`` pixels squared. It is added
+    to each Gaussian, whose colour is scaled to keep its integral.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    times : (float, float)
+        Native pixels of a box along x and along y; at 1 and below, nothing is averaged.
+    """
+    if max(times) <= 1:
+        return gaussians
+    types = types_of(gaussians.mean)
+    # In arrays: as literals, every size would compile a program of its own.
+    variances = (dr.opaque(types.Float, max(k * k - 1, 0) / 12) for k in times)
+    factor, amplitude = add_variances(*gaussians.factor, *variances)
+    color = type(gaussians.color)([c * amplitude for c in gaussians.color])
+    return replace(gaussians, factor=types.Float3(*factor), color=color)
 
 
 def decode_parameters(gaussians: Gaussians) -> KernelParameters:

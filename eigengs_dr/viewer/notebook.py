@@ -13,6 +13,7 @@ from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.pca.basis import Eigenbasis
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
+from ..image.resize import resample
 from ..raster.render import picture_of
 from .pictures import first_components, photo_uri, within
 from .view import MAX_GAUSSIANS
@@ -34,18 +35,21 @@ def to_html(value: object) -> str:
 def _show_set(gaussians: Gaussians) -> str:
     if len(gaussians) > MAX_GAUSSIANS:  # rendering would take seconds
         return _block(repr(gaussians))
-    size = gaussians.width, gaussians.height
-    picture = picture_of(gaussians, *within(min(MAX_PICTURE_SIDE, max(size)), *size))
-    return _block(repr(gaussians), *_images(picture))
+    return _block(repr(gaussians), *_images(picture_of(gaussians, *_shown_size(gaussians))))
 
 
 @to_html.register
 def _show_fit(fit: Fit) -> str:
-    step = -(-max(fit.gaussians.width, fit.gaussians.height) // MAX_PICTURE_SIDE)
+    size = _shown_size(fit.gaussians)
     if isinstance(fit.image, Mapping):
-        small = {name: image[::step, ::step] for name, image in fit.image.items()}
+        small = {name: resample(image, *size) for name, image in fit.image.items()}
         return _block(repr(fit), *_images(small))
-    return _block(repr(fit), *_images(fit.image[::step, ::step]))
+    return _block(repr(fit), *_images(resample(fit.image, *size)))
+
+
+def _shown_size(gaussians: Gaussians) -> tuple[int, int]:
+    size = gaussians.width, gaussians.height
+    return within(min(MAX_PICTURE_SIDE, max(size)), *size)
 
 
 @to_html.register(Eigenbasis)

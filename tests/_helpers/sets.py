@@ -64,6 +64,27 @@ class Scene(NamedTuple):
         """Sum over all pairs of splats and pixels in float64, shape (H, W, C)."""
         return render_exact(*self[:4], *(size or self.size), cutoff)
 
+    def at(self, size, filter=True):
+        """The scene of a picture of another size.
+
+        Along axes that shrink by k it is averaged: each covariance grows by that of k pixels in a
+        row, and the colour keeps its integral.
+        """
+        scale = np.divide(size, self.size)
+        lower = np.zeros((len(self.mean), 2, 2))
+        lower[:, 0, 0], lower[:, 1, 0], lower[:, 1, 1] = self.factor.T
+        covariance = np.linalg.inv(lower @ np.swapaxes(lower, 1, 2))
+        spread = np.diag(np.maximum(scale**-2.0 - 1, 0) / 12) * filter
+        wide = covariance + spread
+        amplitude = np.sqrt(np.linalg.det(covariance) / np.linalg.det(wide))
+        return Scene(
+            self.mean * scale,
+            factors_of(wide) / scale[[0, 1, 1]],
+            self.color * amplitude[:, None],
+            self.background,
+            tuple(size),
+        )
+
     def distances(self):
         """``|F (x - mean)|`` of all splats at all pixels, shape (N, H, W)."""
         return distances(self.mean, self.factor, self.size)

@@ -12,11 +12,12 @@ import eigengs_dr as eg
 from _helpers.clusters import Here
 from _helpers.mosaics import FEW, Sliced, assert_same_bits, mosaic
 from _helpers.process import python_path, run_python
-from _helpers.sets import check_equal
+from _helpers.sets import check_equal, random_scene
 from eigengs_dr.backend.executor import Done
 from eigengs_dr.blocks.draw import BAND_PIXELS, draw_region, save_region
 from eigengs_dr.cli.memory import estimate_memory
 from eigengs_dr.gaussian.file import read
+from eigengs_dr.image.color import to_coded
 from eigengs_dr.storage.checkpoint import read_arrays, write_arrays
 
 
@@ -213,6 +214,24 @@ def test_written_set_draws_by_strips(tmp_path):
         save_region(tmp_path / name, data, (0, 0, 128, 128), size, "llvm")
         found = np.rint(255 * eg.load_image(tmp_path / name))
         np.testing.assert_array_equal(found, np.concatenate(bands))
+
+
+def test_bands_of_a_smaller_picture_are_averaged(monkeypatch):
+    """Also by Gaussians outside of a band or a region that become wider."""
+    monkeypatch.setattr("eigengs_dr.blocks.draw.BAND_PIXELS", 4096)
+    size, small = (16, 2048), (16, 512)
+    scene = random_scene(0, 200, size)
+    scene.mean[:, 1] = np.linspace(1008, 1040, 200)  # around the border of two bands
+    gaussians = scene.on("llvm", space="rgb")
+    data = gaussians.data()
+    whole = np.concatenate(list(draw_region(data, (0, 0, *size), small, "llvm", np.float32)))
+    np.testing.assert_allclose(to_coded(whole), eg.render(gaussians, *small).numpy(), atol=1e-4)
+
+    needles = random_scene(1, 200, (64, 64)).on("llvm", space="rgb")
+    [part] = draw_region(needles.data(), (16, 32, 24, 16), (3, 2), "llvm", np.float32)
+    expected = eg.render(needles, 3, region=(16, 32, 24, 16)).numpy()
+    np.testing.assert_allclose(to_coded(part), expected, atol=1e-4)
+    np.testing.assert_allclose(expected, eg.render(needles, 8).numpy()[4:6, 2:5], atol=1e-4)
 
 
 # --- Runs that were stopped ---

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import eigengs_dr as eg
 from _helpers.command import assert_refused, previewed, run, said, smooth_pixels, succeeded
 from eigengs_dr.gaussian.file import read
 from eigengs_dr.image.color import to_coded
@@ -60,6 +61,16 @@ def test_region_is_the_crop_of_the_whole(fitted, tmp_path, scale, region, suffix
     found = np.asarray(Image.open(part)).astype(int)
     box = left, top, left + width, top + height
     assert np.abs(found - np.asarray(Image.open(whole).crop(box)).astype(int)).max() <= 1
+
+
+@pytest.mark.parametrize("options", [["--size", "8"], ["--scale", "0.25"], ["--size", "32x6"]])
+def test_smaller_pictures_are_averages(fitted, tmp_path, options):
+    succeeded(run("render", fitted[0] / "fit.npz", "-o", tmp_path / "y.png", *options))
+    found = load_image(tmp_path / "y.png")
+    gaussians = eg.Gaussians.load(fitted[0] / "fit.npz")
+    for filter in (True, False):
+        expected = eg.render(gaussians, *found.shape[1::-1], filter=filter).numpy().clip(0, 1)
+        assert (np.abs(found - expected).max() < 0.6 / 255) == filter
 
 
 @pytest.mark.parametrize(

@@ -169,6 +169,7 @@ def test_sets_are_trees_of_arrays(backend):
     dr.backward(dr.sum(dr.square(gaussians.color)) + dr.sum(gaussians.mean))
     gradient = dr.grad(gaussians)
     assert isinstance(gradient, Gaussians)
+    assert repr(gradient) == f"Gaussians({len(gaussians)}, derivatives)"
     np.testing.assert_allclose(gradient.color, 2 * gaussians.to_arrays()["color"].T, rtol=1e-6)
     assert not dr.grad_enabled(dr.detach(gaussians).mean)
 

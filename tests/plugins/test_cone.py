@@ -6,10 +6,20 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.footprints import brute_force
 from _helpers.poster import camera
 from _helpers.sets import SIZE, random_scene
-from _helpers.texture import at, backend, gaussians, in_front, mi, texture
+from _helpers.texture import (
+    at,
+    backend,
+    gaussians,
+    in_front,
+    mi,
+    picture,
+    texel_centres,
+    texture,
+)
 from eigengs_dr.plugins import pixel_angle, texture_of
 from eigengs_dr.plugins.cone import PIXEL, metric
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance
@@ -120,6 +130,20 @@ class TestPlane:
         exact = brute_force(scene, "clamp", (uv * SIZE)[::40], covariance)
         np.testing.assert_allclose(found[::40], exact, atol=0.02)
         assert np.abs(np.diff(found, axis=0)).max() < 0.02 + 0.02 / angle / 12
+
+    @pytest.mark.parametrize("times", [2, 4])
+    def test_a_footprint_of_several_texels_shows_what_a_smaller_picture_does(self, times):
+        """Away from the borders, where a picture has no copies of itself."""
+        side, small = 32, 32 // times
+        g = random_scene(2, 60, (side, side)).on(backend())
+        box = np.sqrt((times**2 - 1) / 12) / side  # of the pixels of a picture that is averaged
+        tex = texture(g, raw=True, prefilter=box / PIXEL)
+        seen = picture(tex.eval(in_front(texel_centres((small, small)))), (small, small))
+        expected = eg.render(g, small).numpy()
+        inside = (slice(small // 4, -(small // 4)),) * 2
+        np.testing.assert_allclose(seen[inside], expected[inside], atol=0.005)
+        plain = eg.render(g, small, filter=False).numpy()
+        assert np.abs(seen - plain)[inside].max() > 0.05
 
     @pytest.mark.parametrize("scale", [1e3, 1e6])
     def test_clamped_from_afar_it_does_not_jump_to_the_mean(self, scale):

@@ -24,7 +24,9 @@ WIDE = 9.0
 SHOWN = {"data": lambda image: image, "ycbcr": ycbcr_to_rgb, "log": from_log}
 """What is shown of a sum, by the space."""
 
-asked_sizes = pytest.mark.parametrize("asked", [{}, {"width": 33}, {"width": 11, "height": 40}])
+asked_sizes = pytest.mark.parametrize(
+    "asked", [{}, {"width": 33}, {"width": 11, "height": 40}, {"width": 9, "height": 5}]
+)
 precisions = pytest.mark.parametrize(("bits", "rtol"), [(32, 1e-3), (64, 1e-6)])
 rounding = pytest.mark.parametrize(("bits", "share"), [(32, 1e-5), (64, 1e-13)])
 
@@ -38,10 +40,7 @@ def image_of(scene, cutoff, asked, space="data"):
     """The picture in float64, rendered as `asked`."""
     width = asked.get("width", scene.size[0])
     height = asked.get("height", round(width * scene.size[1] / scene.size[0]))
-    sx, sy = width / scene.size[0], height / scene.size[1]
-    scaled = scene._replace(mean=scene.mean * [sx, sy], factor=scene.factor / [sx, sy, sy])
-    image = scaled.exact(cutoff, (width, height))
-    return SHOWN[space](image)
+    return SHOWN[space](scene.at((width, height), asked.get("filter", True)).exact(cutoff))
 
 
 def numeric_gradient(loss, scene, step=1e-6):

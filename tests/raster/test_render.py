@@ -235,6 +235,7 @@ def test_reference_is_the_formula():
     assert found.shape == (SIZE[1], SIZE[0], 3)
 
 
+@pytest.mark.parametrize("filter", [True, False])
 @pytest.mark.parametrize(
     ("asked", "size"),
     [
@@ -247,17 +248,69 @@ def test_reference_is_the_formula():
         ({"height": 1}, (1, 1)),
     ],
 )
-def test_size_arguments(backend, asked, size):
+def test_size_arguments(backend, asked, size, filter):
     """Positions and lengths scale with each side: means by s, factors by 1 / s."""
     scene = random_scene(4)
-    image = render(scene.on(backend), **asked).numpy()
+    image = render(scene.on(backend), **asked, filter=filter).numpy()
     assert image.shape == (size[1], size[0], 3)
-    sx, sy = size[0] / SIZE[0], size[1] / SIZE[1]
-    larger = scene._replace(
-        mean=scene.mean * [sx, sy], factor=scene.factor / [sx, sy, sy], size=size
+    scaled = scene.at(size, filter)
+    clear = scaled.off_edge(CUTOFF, 1e-3)
+    np.testing.assert_allclose(image[clear], scaled.exact(CUTOFF)[clear], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("times", [(2, 2), (4, 4), (8, 8), (1, 4), (6, 1)])
+def test_a_smaller_picture_is_the_average_of_the_native_one(backend, times):
+    """Samples at the centres of pixels are far from it."""
+    size = (96, 48)
+    gaussians = random_scene(5, 3000, size, channels=1).on(backend, space="data")
+    small = [side // k for side, k in zip(size, times, strict=True)]
+    native = render(gaussians).numpy()[..., 0]
+    average = native.reshape(small[1], times[1], small[0], times[0]).mean((1, 3))
+    errors = [
+        np.std(render(gaussians, *small, filter=kept).numpy()[..., 0] - average)
+        for kept in (True, False)
+    ]
+    assert errors[0] < 0.25 * errors[1]
+    assert errors[0] < 0.1 * average.std()
+
+
+@pytest.mark.parametrize("asked", [{}, {"width": SIZE[0], "height": 40}, {"width": 100}])
+def test_nothing_is_averaged_where_pixels_are_not_larger(backend, asked):
+    gaussians = random_scene(6).on(backend)
+    np.testing.assert_array_equal(
+        render(gaussians, **asked), render(gaussians, **asked, filter=False)
     )
-    clear = larger.off_edge(CUTOFF, 1e-3)
-    np.testing.assert_allclose(image[clear], larger.exact(CUTOFF)[clear], rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("diagonal", [1e-15, 1e15, 1e-25, 1e25])
+def test_extreme_widths_in_a_smaller_picture(backend, diagonal):
+    """A constant stays one, and what no pixel sees does not become visible."""
+    scene = random_scene(11, count=1)._replace(factor=np.array([[diagonal, 0, diagonal]]))
+    image = render(scene.on(backend), width=5).numpy()
+    exact = np.broadcast_to(scene.background + (diagonal < 1) * scene.color, image.shape)
+    np.testing.assert_allclose(image, exact, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [(1, 1), (2, 2), (0.5, 0.5), (0.25, 3)])
+def test_a_region_is_the_crop_of_the_whole(backend, scale):
+    gaussians = random_scene(7, size=(24, 16)).on(backend)
+    region = (8, 4, 12, 8)
+    size = [int(side * s) for side, s in zip((24, 16), scale, strict=True)]
+    left, top, width, height = (int(v * s) for v, s in zip(region, scale * 2, strict=True))
+    whole = render(gaussians, *size, cutoff=SMOOTH).numpy()
+    part = render(gaussians, width, height, SMOOTH, region=region).numpy()
+    np.testing.assert_allclose(part, whole[top : top + height, left : left + width], atol=1e-5)
+    picture = picture_of(gaussians, width, cutoff=SMOOTH, region=region)
+    assert picture.shape == (round(width * 8 / 12), width, 3)
+    assert render(gaussians, region=region).shape == (8, 12, 3)
+
+
+@pytest.mark.parametrize(
+    "region", [(0, 0, 23, 5), (-1, 0, 5, 5), (20, 0, 3, 3), (3, 3, 0, 2), (1, 2, 3), (0.5, 0, 2, 2)]
+)
+def test_regions_that_are_refused(backend, region):
+    with pytest.raises((ValueError, TypeError), match=r"region|integer"):
+        render(random_scene().on(backend), region=region)
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ def step(gaussians, lists, size):
     return dr.detach(picture), dr.grad(gaussians)
 
 
-@pytest.mark.parametrize("size", [(), (50, 37)])
+@pytest.mark.parametrize("size", [(), (50, 37), (9, 11)])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_frozen_rendering_and_its_gradient(backend, size, dtype):
     """The bits of plain ones, in the recording, in replays, and with other values."""
@@ -128,3 +128,16 @@ def test_lists_of_another_cutoff_are_refused(backend):
     eg.render(g, cutoff=2, lists=lists)
     with pytest.raises(ValueError, match=r"the lists are for the cutoff 2, the rendering has 3; "):
         eg.render(g, cutoff=3, lists=lists)
+
+
+def test_lists_of_another_region_or_filter_are_refused(backend):
+    g = on(backend)
+    for asked, other in (
+        ({"region": (0, 0, 8, 8)}, {"region": (8, 8, 8, 8)}),
+        ({"width": 10}, {"width": 10, "filter": False}),
+    ):
+        lists = eg.tile_lists(g, **asked)
+        np.testing.assert_array_equal(eg.render(g, lists=lists, **asked), eg.render(g, **asked))
+        with pytest.raises(ValueError, match="another region or filter"):
+            eg.render(g, lists=lists, **other)
+    eg.render(g, lists=eg.tile_lists(g), filter=False)  # at the native size it makes no difference

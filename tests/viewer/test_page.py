@@ -143,6 +143,22 @@ def test_zoom_has_no_end(show, scale):
     assert differ(found, codes(moved)) < 0.5
 
 
+@pytest.mark.parametrize("times", [2, 3, 6])
+def test_zoomed_out_it_averages(show, times):
+    """As the renderer does, not samples at the centres of pixels."""
+    gaussians = make_set()
+    tab = show(eg.view(gaussians))
+    width, height = (round(side / times) for side in SIZE)
+    canvas = tab.pixels().shape[1::-1]
+    left, top = ((a - b) // 2 for a, b in zip(canvas, (width, height), strict=True))
+    x, y = (times * (c / 2 - first) for c, first in zip(canvas, (left, top), strict=True))
+    tab.run(f"Object.assign(viewer.camera, {{x: {x}, y: {y}, scale: {1 / times}}}) && 0")
+    tab.run("viewer.redraw()")
+    found = tab.pixels()[top : top + height, left : left + width]
+    assert differ(found, codes(gaussians, width=width, height=height)) < 0.05
+    assert differ(found, codes(gaussians, width=width, height=height, filter=False)) > 0.5
+
+
 def test_mouse_and_keyboard_move_the_picture(show):
     tab = show(eg.view(make_set()))
     canvas, page = tab.page.locator("#view"), tab.page

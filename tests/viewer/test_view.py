@@ -3,6 +3,7 @@
 import json
 import re
 from base64 import b64decode
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -136,6 +137,18 @@ def test_large_sets_are_scaled_down_and_one_of_many_channels_is_shown(channels, 
 def test_a_fit_is_its_picture():
     html = eg.fit(eg.sample("coffee")[:32, :48], 60, iterations=20)._repr_html_()
     assert len(pictures(html)) == 1 and "psnr_rgb=" in html
+
+
+def test_a_large_fit_is_scaled_down():
+    """Stripes of a pixel become grey."""
+    fit = eg.fit(eg.sample("coffee")[:32, :48], 60, iterations=2)
+    striped = np.zeros((640, 960, 3), np.float32)
+    striped[:, ::2] = 1
+    [shown] = pictures(
+        replace(fit, gaussians=fit.gaussians.scaled(960, 640), image=striped)._repr_html_()
+    )
+    assert shown.shape == (320, 480, 3)
+    assert np.abs(shown[:, 2:-2] - 127.5).max() < 4
 
 
 def test_bases_and_models_show_components():

@@ -103,6 +103,8 @@ class TileLists:
         decides.
     radius : float
         Cutoff for which the lists were built, in the units of the factor.
+    frame : tuple
+        What the rendering shows, if `eigengs_dr.tile_lists` built the lists.
     """
 
     grid: Grid
@@ -116,6 +118,7 @@ class TileLists:
     capacity: int
     exact_exp: bool | Bool
     radius: float
+    frame: tuple = ()
 
     def runs(self, begin: UInt, end: UInt) -> list[tuple[bool, UInt, UInt]]:
         """Return loops over ``[begin, end)``: (exact_exp, begin, end) of each.

@@ -96,11 +96,13 @@ class Renderer {
   /** Return what all programs need to know of the camera, for a canvas of some size. */
   placement(camera, look, width, height) {
     const high = [Math.fround(camera.x), Math.fround(camera.y)];
+    const scale = (camera.scale * width) / camera.width;
     return {
       center: [...high, camera.x - high[0], camera.y - high[1]],
       canvas: [width, height],
-      scale: (camera.scale * width) / camera.width,
+      scale,
       cutoff: look.cutoff,
+      box: Math.max(0, 1 - scale * scale) / 12, // the variance of a pixel's box less that of one of the image
     };
   }
 
@@ -150,7 +152,8 @@ class Renderer {
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.sums);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    for (const ring of look.rings) this.drawRings({ ...placement, wipe: look.wipe }, ring);
+    // Outlines are those of the Gaussians themselves.
+    for (const ring of look.rings) this.drawRings({ ...placement, box: 0, wipe: look.wipe }, ring);
   }
 
   /** Wait until everything is drawn. */

@@ -8,7 +8,7 @@ precision highp float;
 const int TEXELS = ${TEXELS};
 uniform vec4 center;
 uniform vec2 canvas;
-uniform float scale, cutoff;
+uniform float scale, cutoff, box;
 uniform highp sampler2D gaussians;  // two texels for each: x, y, a, b and c, R, G, B
 flat out vec2 place;
 flat out vec3 sharpness, color;
@@ -19,6 +19,12 @@ void load(int n) {
   place = ((first.xy - center.xy) - center.zw) * scale + 0.5 * canvas;
   sharpness = vec3(first.zw, second.x) / scale;
   color = second.yzw;
+  // A pixel that covers several of the image shows their average, as in gaussian/covariance.py.
+  vec3 squares = box * sharpness * sharpness;
+  float rows = 1.0 + squares.z;
+  float amplitude = inversesqrt(rows * (1.0 + squares.x) + squares.y), narrower = inversesqrt(rows);
+  sharpness *= vec3(sqrt(rows) * amplitude, narrower * amplitude, narrower);
+  color *= amplitude;
 }
 
 // Draw a square in the units of standard deviations as two triangles. An instance for each Gaussian
