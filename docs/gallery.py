@@ -8,6 +8,7 @@ from sphinx_gallery.scrapers import figure_rst
 
 ORDER = (
     "fit_an_image.py",
+    "film.py",
     "texture.py",
     "photos_of_a_ball.py",
     "numpy_and_torch.py",

@@ -62,6 +62,13 @@ def test_fit_an_image(run, tmp_path):
     assert len(eg.Gaussians.load(folder / "cat.npz")) == 3000
 
 
+def test_film(run, tmp_path):
+    out = run("film.py", tmp_path)
+    film, alone = numbers(out, "still                  NUM (NUM)")
+    assert film > alone + 0.2
+    check_pictures(tmp_path, "still", "an_object_moves", "pan", "cuts")
+
+
 def test_render_and_differentiate(run, tmp_path):
     out = run("render_and_differentiate.py")
     reverse, forward = numbers(out, "by NUM a pixel (reverse), NUM (forward)")
