@@ -61,7 +61,11 @@ def name_outputs(
         advice = "give an image once, or rename one of them"
         raise ValueError(f"{output / twice[0]}: two images have this name; {advice}")
     output.mkdir(parents=True, exist_ok=True)
-    return [output / name for name in names]
+    files = [output / name for name in names]
+    for file in files:  # sets of Gaussians alone are looked at before they are replaced
+        if file.is_symlink() and not (file.suffix == ".npz" and file.exists()):
+            raise ValueError(f"{file}: is a link, which is not followed; move it away")
+    return files
 
 
 def name_pictures(

@@ -116,7 +116,7 @@ def plan_output(source: RunImage, manifest: Manifest, overwrite: bool) -> RunIma
     """
     output = manifest.path.with_name(f"{source.name}.npz")
     source = source._replace(output=output)
-    if not output.exists():
+    if not os.path.lexists(output):  # a link that leads nowhere is not followed
         return source
     row = manifest.rows.get(source.name, {})
     if row.get("status") == "done" and not overwrite:

@@ -156,6 +156,20 @@ def test_a_run_that_was_killed_holds_no_lock(photos, output):
     assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == ["done"] * 3
 
 
+@pytest.mark.parametrize("name", [NAME, "01.npz"])
+def test_links_in_a_folder_from_elsewhere(photos, output, name):
+    """Neither the manifest nor a result is written where a link leads."""
+    output.mkdir()
+    (output / name).symlink_to(output.parent / "new")
+    if name == NAME:
+        with pytest.raises(OSError, match=r"manifest\.jsonl: is a link"):
+            eg.fit_many(photos, output, **QUICK)
+    else:
+        rows = eg.fit_many(photos, output, **QUICK)
+        assert [row.status for row in rows].count("failed") == 1
+    assert not (output.parent / "new").exists()
+
+
 # --- Images by folder, glob and URL ---
 
 
