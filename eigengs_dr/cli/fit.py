@@ -290,7 +290,7 @@ def _fit_at_once(
         record = {"input": {name: m.path for name, m in maps.items()} or source, "output": output}
         record |= _figures(result) | _similarity(image, result)
         if picture:
-            eg.save_image(picture, _comparison(image, result))
+            eg.save_image(picture, _comparison(image, result.gaussians, result.image))
     times = {"seconds_load": loaded - started, "seconds_total": time.perf_counter() - started}
     title = str(output if maps else source)
     run.tell(*_summary(title, record | times, settings, picture))
@@ -340,19 +340,18 @@ def _similarity(image: Any, result: eg.Fit) -> Record:
     return {"ssim": eg.ssim(*pair), "ms_ssim": ms_ssim}
 
 
-def _comparison(image: Any, result: eg.Fit) -> Any:
+def _comparison(image: Any, gaussians: eg.Gaussians, drawn: Any) -> Any:
     """Return a picture of image, fit and outlines side by side, with a row for each map."""
     import numpy as np
 
     from ..viewer.pictures import comparison, displayed
 
-    gaussians = result.gaussians
     if not gaussians.maps:
-        return comparison(displayed(image, gaussians.space), result.image, gaussians)
+        return comparison(displayed(image, gaussians.space), drawn, gaussians)
     rows = []
     for m in gaussians.maps:
         original = displayed(image[m.name], m.space)[..., : m.channels]
-        rows.append(comparison(original, result.image[m.name], gaussians[m.name]))
+        rows.append(comparison(original, drawn[m.name], gaussians[m.name]))
     return np.concatenate(rows)
 
 
@@ -442,9 +441,15 @@ def _fit_several(
         if row.error:
             print_message(f"error: {row.error}")
         picture = picture_of[row.name]
-        if picture and row.result and row.input:
-            image = load_images(row.input, settings.space or "ycbcr", settings.encoding)
-            eg.save_image(picture, _comparison(image, row.result))
+        if picture and row.result:
+            eg.save_image(picture, _compared(row, settings))
+        elif picture and row.status == "skipped" and not picture.exists():
+            try:
+                compared = _compared(row, settings)
+            except (ValueError, OSError) as error:
+                print_message(f"note: {picture} is not drawn: {error}; --overwrite fits it again")
+            else:
+                eg.save_image(picture, compared)
         show(folder.name, done, total, row)
 
     with bar(run.quiet) as show:
@@ -460,6 +465,20 @@ def _fit_several(
     run.tell(*_summary_of_all(rows, folder, seconds, space))
     known = [{k: v for k, v in vars(row).items() if v not in (None, "")} for row in rows]
     return [{"stopped": record["status"]} | record for record in known]
+
+
+def _compared(row: eg.ImageRow, settings: FitOptions) -> Any:
+    """Return the picture of a row; for a skipped image it shows the set in the file."""
+    assert row.input and row.output
+    image = load_images(row.input, settings.space or "ycbcr", settings.encoding)
+    if row.result:
+        return _comparison(image, row.result.gaussians, row.result.image)
+    if settings.method.needs_model:
+        raise ValueError(f"{row.output} lacks the mean image")
+    gaussians = eg.Gaussians.load(row.output, settings.backend)
+    if image.pixels.shape[:2] != (gaussians.height, gaussians.width):
+        raise ValueError(f"{row.output} is of an image of {gaussians.width}x{gaussians.height}")
+    return _comparison(image, gaussians, eg.picture_of(gaussians))
 
 
 def _given_options(context: click.Context, settings: FitOptions) -> dict[str, Any]:
