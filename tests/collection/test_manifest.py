@@ -43,6 +43,17 @@ def test_skipped_images_keep_their_figures(photos, output):
     assert (output / NAME).read_bytes() == before
 
 
+def test_a_result_that_is_cut_is_not_skipped(photos, output):
+    eg.fit_many(photos, output, **QUICK)
+    content = (output / "01.npz").read_bytes()
+    (output / "01.npz").write_bytes(content[: len(content) // 2])
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in rows] == ["skipped", "failed", "skipped"]
+    assert "01.npz: exists and is not a set of Gaussians; move it" in rows[1].error
+    (output / "01.npz").unlink()
+    assert [row.status for row in eg.fit_many(photos, output, **QUICK)].count("done") == 1
+
+
 def test_a_result_stays_until_it_is_replaced(photos, output):
     """A run that should replace all results and ends early leaves whole files of both runs."""
     eg.fit_many(photos, output, **QUICK)
