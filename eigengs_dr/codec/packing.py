@@ -23,6 +23,7 @@ from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
 from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
 from ..raster.render import picture_of
+from ..storage.atomic import require_writable
 from .egs import MAX_SECTIONS, SUFFIX, write
 from .quantization import Steps
 from .rounding import MIN_MSE, Comparison, planes_of, round_within
@@ -116,6 +117,7 @@ def pack(
     """
     if Path(output).suffix.lower() != SUFFIX:
         raise ValueError(f"{output}: pack writes {SUFFIX} files; use this suffix, or save()")
+    require_writable(output)  # before the work
     if not 0 < max_psnr_drop <= MAX_PSNR:
         raise ValueError(
             f"pack: max_psnr_drop is {max_psnr_drop}; it must be above 0 and at most "
