@@ -51,9 +51,7 @@ EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "clust
 @options.value("--target-psnr", "DB", float, "Use the fewest Gaussians that reach this PSNR.")
 @options.choice("--target-space", ["rgb", "ycbcr"], "Colour space of --target-psnr.", True)
 @options.number("--max-gaussians", "Largest number of Gaussians for --target-psnr.")
-@options.value(
-    "--blocks", "SIZE", int, "Fit blocks of this side.  [default: 1024 if memory is short]"
-)
+@options.value("--blocks", "SIZE", int, "Fit blocks of this side, such as 1024, in less memory.")
 @options.level_counts(
     "Number of levels of detail, each 4 times as large, or the number of Gaussians up to each."
 )
@@ -103,9 +101,9 @@ def fit(
     several images, with exit code 130. If --target-psnr cannot be reached, the command reports it,
     writes the best fit and exits with code 1.
 
-    An image that is too large for the memory of this machine is fitted by blocks, by default with
-    one Gaussian per 20 pixels. Ctrl-C then keeps the finished blocks, and the same command
-    continues.
+    An image that is too large for the memory of this machine is refused, with the memory that it
+    takes. --blocks 1024 fits it block by block, by default with one Gaussian per 20 pixels. Ctrl-C
+    then keeps the finished blocks, and the same command continues.
 
     With --map, several maps of the same size, such as albedo, roughness and normal, share one set
     of shapes, and -o names the file. Maps with names such as albedo or color are fitted in linear
@@ -145,8 +143,8 @@ def fit(
         raise ValueError("--blocks fits one image; run the command for each image")
     if not several:
         check_replaceable(outputs[0], bool(maps))
-    if not (several or maps):
-        blocks = blocks or _plan_memory(run, files[0], settings, preview)
+    if not (several or maps or blocks):
+        _check_memory(run, files[0], settings, _has_blocks(settings, preview))
     if blocks and not _has_blocks(settings, preview):
         raise ValueError(
             "--blocks needs the default preset and init; leave out --target-psnr, --levels and "
@@ -527,9 +525,6 @@ def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space
 REPORTED_BYTES = 1_000_000_000
 """Estimated memory from which a fit reports it, in bytes."""
 
-MAX_MEMORY_SHARE = 0.5
-"""Share of the usable memory up to which an image is fitted without blocks."""
-
 
 def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
     """Return whether a fit by blocks supports these options."""
@@ -537,43 +532,34 @@ def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
     return default and settings.goal is None and not settings.levels and preview is None
 
 
-def _plan_memory(
-    run: options.Run, path: Path | str, settings: FitOptions, preview: Path | None
-) -> int | None:
-    """Return the side of blocks if a fit of the full image takes too much memory, else None.
+def _check_memory(
+    run: options.Run, path: Path | str, settings: FitOptions, has_blocks: bool
+) -> None:
+    """Report the memory of a large fit, estimated from the header of the file.
 
-    A large fit reports its memory, estimated from the header of the file. Errors in the file are
-    left to its reader.
+    Errors in the file are left to its reader.
 
     Raises
     ------
     ValueError
-        If this process may not use enough memory, and the options do not allow blocks.
+        If this process may not use enough memory.
     """
-    from ..blocks.fit_large import BLOCK_SIDE
     from ..blocks.windows import image_size
     from . import memory
 
     size = image_size(path)
     if size is None:
-        return None
+        return
     height, width, channels = size
     pixels, data = width * height, rendered_as(settings.space or "ycbcr") is None
     channels = channels if data else 3
     first = settings.goal is not None
     count = settings.first_try(pixels, channels) if first else settings.count_for(pixels)
     problem = width, height, channels, count
-    needed, usable = memory.estimate_memory(*problem), memory.usable_memory()
-    if usable and needed > MAX_MEMORY_SHARE * usable and _has_blocks(settings, preview):
-        print_message(
-            f"{path}: a fit of the full image takes too much memory; it is fitted by blocks"
-        )
-        return BLOCK_SIDE
     with prefix_errors(path):
-        line = memory.check_memory(*problem)
-    if needed >= REPORTED_BYTES and not run.quiet:
+        line = memory.check_memory(*problem, has_blocks)
+    if memory.estimate_memory(*problem) >= REPORTED_BYTES and not run.quiet:
         print_message(line)
-    return None
 
 
 def _fit_by_blocks(

@@ -8,6 +8,7 @@ import zipfile
 from contextlib import nullcontext
 from functools import partial
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ QUICK = {"gaussians": 60, "iterations": 10}
 class Server(http.server.SimpleHTTPRequestHandler):
     """Files, what leads elsewhere, and nothing at all; it notes what is asked for."""
 
-    asked = []
+    asked: ClassVar[list] = []
 
     def log_message(self, *_):
         pass
@@ -124,7 +125,7 @@ def test_a_silent_server_is_given_up(served, monkeypatch):
 
 def test_where_a_server_may_lead(served):
     assert eg.load_image(f"{served}/to//2.png").shape == (32, 32, 3)
-    with pytest.raises(OSError, match="cannot be read .*ftp://, which is not followed"):
+    with pytest.raises(OSError, match=r"cannot be read .*ftp://, which is not followed"):
         eg.load_image(f"{served}/to/ftp://127.0.0.1/a.png")
 
 
