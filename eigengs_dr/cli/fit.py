@@ -39,7 +39,7 @@ PRESETS = ("default", "gaussianimage", "eigengs")
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
 
-EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster")
+EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster", "recursive")
 """Options that cannot be combined with maps."""
 
 
@@ -70,6 +70,7 @@ EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "clust
 @options.value(
     "--preview", "FILE", options.path, "Picture, or folder, that shows photo, fit and outlines."
 )
+@click.option("--recursive", is_flag=True, help="Also take images in subfolders of a folder.")
 @click.option(
     "--overwrite", is_flag=True, help="Also fit images again whose results exist, if several."
 )
@@ -82,6 +83,7 @@ def fit(
     basis: str | None,
     blocks: int | None,
     preview: Path | None,
+    recursive: bool,
     overwrite: bool,
     **choices: Any,
 ) -> None:
@@ -119,6 +121,7 @@ def fit(
       eigengs-dr fit photo.jpg -o levels.npz --levels 5000,7000,9000
       eigengs-dr fit photos/ -o fits/ --iterations 300 --report fits.json
       eigengs-dr fit photos/ extra.png -o fits/ --overwrite --preview previews/
+      eigengs-dr fit photos/ -o fits/ --recursive
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
       eigengs-dr fit s3://bucket/photos/ -o /shared/fits/ --cluster tcp://node1:8786
       eigengs-dr fit roughness.png -o roughness.npz --space data
@@ -130,9 +133,13 @@ def fit(
         _check_maps(run.context, images, output)
     elif not images:
         raise click.UsageError("no image is given; give image files, or maps with --map")
-    files = [m.path for m in maps.values()] or [f for given in images for f in _expand(given)]
+    files = [m.path for m in maps.values()] or [
+        file for given in images for file in _expand(given, recursive)
+    ]
     settings = _settings(choices, basis, run.backend, files[0], bool(maps))
     several = not maps and (len(files) > 1 or files != list(images))
+    if recursive and files == list(images):
+        raise ValueError("--recursive takes a folder of images")
     if run.cluster and (preview or not (several or blocks)):
         raise ValueError("--cluster takes several images, or --blocks, and no --preview")
     inputs = files if several else files[:1]
@@ -247,12 +254,12 @@ def _default_count(path: Path | str) -> int:
     return DEFAULT_COUNT if size is None else default_count(size[0] * size[1])
 
 
-def _expand(source: Path | str) -> Sequence[Path | str]:
+def _expand(source: Path | str, recursive: bool) -> Sequence[Path | str]:
     """Expand a folder, a pattern or a URL to its images."""
     from ..image.folder import list_images
 
     single = isinstance(source, Path) and source.exists() and not source.is_dir()
-    return [source] if single else list_images(source)
+    return [source] if single else list_images(source, recursive)
 
 
 # ---------------------------------------------------------------------------------------------

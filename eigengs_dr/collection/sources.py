@@ -54,7 +54,7 @@ class RunImage(NamedTuple):
         return ImageRow(self.name, status, self.path, self.output, **figures)
 
 
-def list_sources(images: Images) -> Iterable[RunImage]:
+def list_sources(images: Images, recursive: bool = False) -> Iterable[RunImage]:
     """Name the images of a run.
 
     Parameters
@@ -62,6 +62,8 @@ def list_sources(images: Images) -> Iterable[RunImage]:
     images : path-like or iterable
         A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of a folder, a glob or a file; or
         an iterable of files, URLs and arrays, see `eigengs_dr.image.io.check_image`.
+    recursive : bool, optional
+        Whether to take images in the subfolders of a folder too.
 
     Returns
     -------
@@ -72,10 +74,13 @@ def list_sources(images: Images) -> Iterable[RunImage]:
     Raises
     ------
     ValueError
-        If two images have the same name, there is no image, or `images` is the array of one image.
+        If two images have the same name, there is no image, or `images` is the array of one image;
+        if they should be recursive and are no folder.
     """
     if isinstance(images, (str, os.PathLike)):
-        images = list_images(images)
+        images = list_images(images, recursive)
+    elif recursive:
+        raise ValueError("recursive is for a folder; the images are given one by one")
     if isinstance(images, np.ndarray) and (images.ndim < 3 or images.shape[2:] in ((1,), (3,))):
         raise ValueError(f"images: got one array of shape {images.shape}; pass a list of images")
     if not isinstance(images, (Sequence, np.ndarray)):

@@ -33,16 +33,23 @@ shared exponent."""
 SUFFIXES = tuple(BITS)
 """Suffixes of files that can be written."""
 
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+"""Suffixes of files that Pillow reads with the package pillow-heif."""
+
+HAS_HEIF = find_spec("pillow_heif") is not None
+
 READ_SUFFIXES = (
     *SUFFIXES,
+    *(HEIF_SUFFIXES if HAS_HEIF else ()),
     *(".jfif", ".jpe", ".apng", ".avif", ".gif", ".tga", ".dib"),
     *(".jp2", ".j2k", ".jpf", ".jpx", ".pgm", ".pbm", ".pnm"),
 )
 """Suffixes of files that are read from a folder. A single file is read by its content."""
 
 UNREAD_SUFFIXES = (
-    *(".heic", ".heif", ".jxl", ".jpc", ".svg", ".psd", ".psb", ".xcf", ".kra", ".eps", ".ico"),
-    *(".dds", ".ktx", ".ktx2", ".hif", ".rgbe", ".sgi", ".pcx", ".dng", ".cr2", ".cr3", ".nef"),
+    *(() if HAS_HEIF else HEIF_SUFFIXES),
+    *(".jxl", ".jpc", ".svg", ".psd", ".psb", ".xcf", ".kra", ".eps", ".ico"),
+    *(".dds", ".ktx", ".ktx2", ".rgbe", ".sgi", ".pcx", ".dng", ".cr2", ".cr3", ".nef"),
     *(".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".fits", ".fit", ".dcm", ".npy", ".pam"),
 )
 """Suffixes of images that cannot be read; a warning names those in a folder."""

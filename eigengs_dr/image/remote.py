@@ -37,13 +37,15 @@ def stem_of(file: Path | str) -> str:
     return PurePosixPath(file.partition("::")[0]).stem if isinstance(file, str) else file.stem
 
 
-def list_urls(url: str) -> list[str]:
+def list_urls(url: str, recursive: bool = False) -> list[str]:
     """List the images in a folder or matching a pattern at a URL.
 
     Parameters
     ----------
     url : str
         A folder, a pattern, or one file, which need not exist.
+    recursive : bool, optional
+        Whether to list those in the subfolders of a folder too.
 
     Returns
     -------
@@ -62,7 +64,9 @@ def list_urls(url: str) -> list[str]:
         if glob.has_magic(path.replace("?", "") if is_web else path):  # "?" begins a query
             names = [name for name in system.glob(path) if not system.isdir(name)]
         elif not _is_image(path) and system.isdir(path):
-            names = [name for name in system.ls(path, detail=False) if _is_image(name)]
+            listed = system.find(path) if recursive else system.ls(path, detail=False)
+            seen = (name for name in listed if "/." not in name.removeprefix(path))
+            names = [name for name in seen if _is_image(name)]
         else:
             return [url]
     except ImageError:

@@ -32,6 +32,17 @@ def test_images_of_any_size_into_folders(photo, photos, tmp_path):
     assert [row["width"] for row in report["images"]] == [32, 32, 32, 20] and report["versions"]
 
 
+def test_images_in_subfolders(photos, tmp_path):
+    (photos / "1999").mkdir()
+    (photos / "02.png").rename(photos / "1999" / "02.png")
+    command = ["fit", photos, "-o", tmp_path / "fits", *QUICK]
+    assert "left out, such as 1999" in succeeded(run(*command)).stderr
+    told = succeeded(run(*command, "--recursive"))
+    assert told.stderr == "" and (tmp_path / "fits" / "02.npz").exists()
+    single = run("fit", photos / "00.png", "--recursive", *QUICK)
+    assert_refused(single, "--recursive takes a folder of images")
+
+
 def test_a_folder_of_one_image(photo, tmp_path):
     folder, report = tmp_path / "photos", tmp_path / "r.json"
     folder.mkdir()

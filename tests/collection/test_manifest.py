@@ -198,6 +198,10 @@ def bucket(photos):
 def test_globs(photos, tmp_path):
     (tmp_path / "photos" / "deep").mkdir()
     (photos / "02.png").rename(photos / "deep" / "03.png")
+    rows = eg.fit_many(photos, recursive=True, **QUICK)
+    assert [row.name for row in rows] == ["00", "01", "03"]
+    with pytest.raises(ValueError, match="recursive is for a folder; the images are given one"):
+        eg.fit_many([photos / "00.png"], recursive=True, **QUICK)
     names = [source.name for source in list_sources(str(tmp_path / "**" / "*.png"))]
     assert names == ["00", "01", "03"]
     with pytest.raises(ValueError, match=r"\*\.jpg: no file matches; check the pattern"):
