@@ -4,6 +4,7 @@ import io
 import sys
 import time
 from contextlib import redirect_stderr
+from types import SimpleNamespace
 
 import pytest
 
@@ -50,6 +51,19 @@ def test_no_bar_where_it_is_switched_off_or_nobody_looks(at_once, photo):
             slow(3, progress=progress)
             eg.fit(photo, progress=progress, **QUICK)
         assert stream.getvalue() == ""
+
+
+class Closed(io.StringIO):
+    def isatty(self):
+        raise ValueError("I/O operation on closed file")
+
+
+@pytest.mark.parametrize("stream", [None, Closed(), SimpleNamespace(write=print, flush=print)])
+@pytest.mark.parametrize("progress", [None, True])
+def test_no_bar_without_a_stream(photo, monkeypatch, stream, progress):
+    """As in a service, or where standard error was closed or replaced."""
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert len(eg.fit(photo, progress=progress, **QUICK).gaussians) == 30
 
 
 @pytest.mark.parametrize("progress", [None, True, "call"])

@@ -67,6 +67,7 @@ class PackResult(NamedTuple):
 
 
 @door
+@np.errstate(under="ignore")  # small weights become 0, whatever the caller does about that
 def pack(
     gaussians: Gaussians | Fit,
     output: str | os.PathLike[str],

@@ -5,6 +5,7 @@ OpenImageIO, from the extra ``hdr``, writes EXR, Radiance HDR and PNG files of 1
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -115,5 +116,18 @@ def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
     image.specmod().channelnames = ("R", "G", "B") if pixels.shape[2] == 3 else ("Y",)
     if suffix == ".exr":
         image.specmod().attribute("compression", "zip")
-    if not image.write(str(path)):
-        raise OSError(image.geterror().strip())
+    written = image.write(str(path))
+    reason = image.geterror().strip() or "the file is cut"
+    if written and suffix == ".png":  # OpenImageIO takes one that a full disk has cut for written
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - len(PNG_END)))
+            written = file.read() == PNG_END
+    if not written:
+        with path.open("ab") as file:  # nor does it tell why; the system does
+            file.write(bytes(1 << 16))
+            os.fsync(file.fileno())
+        raise OSError(reason)
+
+
+PNG_END = b"IEND\xaeB`\x82"
+"""Last bytes of a PNG file."""

@@ -311,6 +311,24 @@ def test_a_failed_write_leaves_everything_as_it_was(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such limit")
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".png", ".tif", ".pfm"])
+def test_a_full_disk_is_said(tmp_path, suffix):
+    """OpenImageIO does not tell why it fails, and takes a PNG file that is cut for written."""
+    import resource
+
+    pixels = np.random.default_rng(0).random((100, 100, 3), np.float32)
+    path, bits = tmp_path / f"a{suffix}", 16 if suffix in (".png", ".tif") else None
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (16384, before[1]))
+    try:
+        with pytest.raises(ImageError, match=r"cannot be written \(File too large\)"):
+            save_image(path, pixels, bits=bits)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+
+
 def test_bad_pixels_touch_no_file(tmp_path):
     for image, words in (
         (np.full((2, 2), np.nan), "not finite"),
