@@ -57,6 +57,8 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
     if callable(progress):
         yield progress
         return
+    if not (progress is None or isinstance(progress, bool)):
+        raise ValueError(f"progress is {progress!r}; pass True, False or a function")
     if progress is False or not _is_watched():
         yield None
         return

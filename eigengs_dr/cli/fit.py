@@ -87,7 +87,7 @@ def fit(
     overwrite: bool,
     **choices: Any,
 ) -> None:
-    """Fit sums of Gaussians to images.
+    """Fit sums of Gaussians to images. Grey ones become RGB; --space data keeps one channel.
 
     An IMAGE may be a folder of images, a pattern in quotes, or a URL. For several images, -o and
     --preview name folders. Files in these folders are named after the images, and manifest.jsonl
@@ -203,18 +203,20 @@ def _settings(
     if basis is not None or method.needs_model:
         start = eg.EigenGS.load(basis or DEFAULT_BASIS, backend)
     if start is not None and choices["init"]:
-        raise ValueError(f"init {choices['init']!r} and a start exclude each other; give one")
+        raise ValueError("--init and --basis, or a preset that has one, exclude each other")
     target, count, levels = (choices[name] for name in ("target_psnr", "gaussians", "levels"))
     goal = None
+    if target is not None and count is not None:
+        raise ValueError(
+            "--gaussians and --target-psnr exclude each other; --max-gaussians limits a search"
+        )
     if target is not None:
         goal = eg.Goal(target, choices["target_space"] or "rgb", choices["max_gaussians"])
     elif choices["max_gaussians"] is not None or choices["target_space"]:
-        raise ValueError(
-            "max_gaussians and target_space belong to target_psnr; give target_psnr too"
-        )
+        raise ValueError("--max-gaussians and --target-space need --target-psnr")
     if levels is not None:
         if goal:
-            raise ValueError("levels and target_psnr exclude each other; give one of them")
+            raise ValueError("--levels and --target-psnr exclude each other; give one of them")
         if isinstance(levels, int) and count is None:
             count = _default_count(first)
         try:

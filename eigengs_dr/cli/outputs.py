@@ -52,7 +52,8 @@ def name_outputs(
     output = Path() if output is None else output
     if len(inputs) == 1 and not folder and not output.is_dir():
         if output.suffix.lower() not in suffixes:
-            raise ValueError(f"{output}: the name must end in {' or '.join(suffixes)}")
+            packs = "; 'eigengs-dr pack' writes .egs files" * (output.suffix.lower() == ".egs")
+            raise ValueError(f"{output}: the name must end in {' or '.join(suffixes)}{packs}")
         return [output]
     if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
         raise ValueError(f"{output}: is a file; several images, or a folder of them, need a folder")

@@ -97,7 +97,7 @@ def fit_many(
         output folder has results of other options. In an iterator, the second image of the same
         name gets a row with an error instead.
     TypeError
-        If an option is unknown.
+        If an option is unknown, or only `eigengs_dr.fit` has it: weight and loss.
     OSError
         If the output folder cannot be written, or another run writes into it.
     BackendError
@@ -124,6 +124,8 @@ def fit_many(
     [('000000', 'done', 200), ('000001', 'done', 200)]
     """
     parameters = ("images", "output", "recursive", "overwrite", "progress", "client")
+    if single := {"weight", "loss"} & set(options):
+        raise TypeError(f"fit_many takes no {min(single)}; call eigengs_dr.fit for each image")
     known = [field.name for field in fields(FitOptions) if field.name != "loss"]
     refuse_unknown(options, [*known, *parameters])
     settings = FitOptions(**options)

@@ -145,6 +145,9 @@ class Method:
                 "the Surplus out"
             )
 
+    def __hash__(self) -> int:  # a dictionary has none
+        return hash(tuple(sorted(self.rates.items())))
+
     def __repr__(self) -> str:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])

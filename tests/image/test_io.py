@@ -2,6 +2,7 @@
 
 import io
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -205,7 +206,11 @@ def test_check_image_keeps_rows_columns_and_channels():
         (np.float32(1), r"shape \(\), expected"),
         (np.zeros((4, 4, 2)), r"shape \(4, 4, 2\), expected"),
         (np.zeros((4, 4, 4)), r"drop alpha"),
-        (np.zeros((1, 4, 4, 3)), r"shape \(1, 4, 4, 3\), expected"),
+        (np.zeros((1, 4, 4, 3)), r"shape \(1, 4, 4, 3\), expected .*; fit_many takes several"),
+        (["a.png", "b.png"], r"shape \(2,\), expected .*; fit_many takes several images"),
+        ([Path("a.png")], "fit_many takes several images"),
+        ([np.zeros((2, 3)), np.zeros((4, 5))], "fit_many takes several images"),
+        (np.ma.masked_less(np.eye(4), 1), r"12 values are masked; fill them, .*\.filled\(0\)"),
         (np.zeros((0, 4, 3)), "no pixels"),
         (np.zeros((4, 0)), "no pixels"),
         (np.zeros((4, 4), np.int64), "pixels are int64"),
