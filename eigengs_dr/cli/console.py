@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
@@ -18,6 +18,8 @@ from ..backend.interrupts import terminate_as_interrupt
 from ..backend.messages import printable
 from ..backend.progress import progress_bar
 from ..backend.selection import BackendError
+
+Result = TypeVar("Result")
 
 MISSED = 1
 """Exit code if the target PSNR cannot be reached."""
@@ -118,6 +120,34 @@ def prefix_errors(name: Path | str) -> Iterator[None]:
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(str(name)) else f"{name}: {text}") from None
+
+
+def for_each(
+    in_folder: bool, work: Callable[..., Result], *columns: Sequence[Any]
+) -> list[Result | None]:
+    """Call a function for files, and return its results.
+
+    In a folder, a file that fails does not end the others: its error is printed, and its result
+    is None.
+    """
+    results: list[Result | None] = []
+    for file, *others in zip(*columns, strict=True):
+        try:
+            with prefix_errors(file):
+                results.append(work(file, *others))
+        except ERRORS as error:
+            _end_if_interrupted(error)
+            if not in_folder:
+                raise
+            print_message(f"error: {_message(error)}")
+            results.append(None)
+    return results
+
+
+def exit_if_failed(results: Sequence[object]) -> None:
+    """End the command with the code of an error if a file of `for_each` failed."""
+    if None in results:
+        click.get_current_context().exit(FAILED)
 
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:

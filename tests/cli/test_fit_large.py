@@ -29,6 +29,9 @@ def test_fit_by_blocks(photo, tmp_path):
     expected = {"blocks": 4, "block": 64, "gaussians": 700, "stopped": "iterations", "width": 128}
     assert {key: figures[key] for key in expected} == expected
     assert figures["psnr_ycbcr"] > figures["psnr_rgb"] > 20
+    shown = json.loads(succeeded(run("info", output, "--json")).stdout)
+    assert shown["psnr_rgb"] == pytest.approx(figures["psnr_rgb"], abs=0.01)
+    assert (shown["iterations"], shown["source"]) == (5, "photo.tif")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photo.tif", "x.json", "x.npz"]
 
 
