@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -45,8 +46,9 @@ class Program(click.Group):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("always", UserWarning)
-                # One line per warning, without the line of code that issued it.
-                warnings.showwarning = lambda message, *_: print_message(f"note: {message}")
+                # One line per warning, said once, without the line of code that issued it.
+                note = cache(lambda text: print_message(f"note: {text}"))
+                warnings.showwarning = lambda message, *_: note(str(message))
                 sys.exit(super().main(arguments, *rest, **extra))
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()

@@ -134,11 +134,6 @@ def to_floats(
 
     The range of the pixels is checked if the encoding is given.
     """
-    if np.ma.is_masked(image):
-        raise ImageError(
-            f"{name}: {np.ma.count_masked(image)} values are masked; fill them, as in "
-            "image.filled(0), and give pixels that do not count the weight 0"
-        )
     try:
         array = np.asarray(image)
     except ValueError:  # rows of unequal length

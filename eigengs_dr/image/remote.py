@@ -186,8 +186,8 @@ async def _check_redirection(session: object, context: object, redirection: Any)
     """
     from yarl import URL
 
-    here, there = redirection.url, redirection.response.headers.get("Location", "")
-    there = here.join(URL(there))
+    here, headers = redirection.url, redirection.response.headers
+    there = here.join(URL(headers.get("Location") or headers.get("URI", "")))  # as aiohttp
     if there.scheme not in (here.scheme, "https"):
         raise OSError(f"it leads to {there.scheme}://, which is not followed")
     if await _is_private(there) and not await _is_private(here):

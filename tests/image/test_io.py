@@ -229,6 +229,14 @@ def test_check_image_refuses(image, complaint):
         check_image(image)
 
 
+def test_masked_pixels_are_not_dropped_in_silence():
+    masked = np.ma.masked_less(np.eye(64, dtype=np.float32), 1)
+    for call in (eg.fit, lambda a: eg.psnr(a, a), lambda a: eg.ssim(a, a), eg.fit_large):
+        with refused(ImageError, r"4032 values are masked; fill them"):
+            call(masked)
+    np.testing.assert_array_equal(check_image(np.ma.array(np.eye(4))), check_image(np.eye(4)))
+
+
 def test_non_finite_pixels_are_counted_and_placed():
     image = np.zeros((3, 4, 3))
     image[1, 2] = np.nan
