@@ -83,7 +83,6 @@ def fit(
     basis: str | None,
     blocks: int | None,
     preview: Path | None,
-    recursive: bool,
     overwrite: bool,
     **choices: Any,
 ) -> None:
@@ -129,6 +128,7 @@ def fit(
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024
       eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
+    recursive = choices["recursive"]
     if maps:
         _check_maps(run.context, images, output)
     elif not images:

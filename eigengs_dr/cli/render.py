@@ -85,17 +85,16 @@ def _render(
     *,
     run: options.Run,
     depth: int,
-    name: str | None,
-    region: tuple[int, int, int, int] | None,
     scale: float | None,
     size: tuple[int, int | None] | None,
-    first: int | None,
+    **choices: Any,
 ) -> Path:
     """Render one set to a file, and return its name."""
     from ..blocks.draw import save_region
     from ..gaussian.file import read_map
     from ..image.formats import TIFF_SUFFIXES
 
+    name, region, first = (choices[key] for key in ("name", "region", "first"))
     data = read_map(file, name, "--map")
     count = len(data.arrays["mean"])
     if first is not None:
