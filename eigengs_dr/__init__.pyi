@@ -1,5 +1,7 @@
 """The public names of eigengs_dr; `lazy_loader` and type checkers read this file."""
 
+from . import paper as paper
+from . import plugins as plugins
 from .backend.executor import ClusterError
 from .backend.recording import exclusive
 from .backend.selection import BackendError
@@ -24,9 +26,8 @@ from .plugins import register_plugins
 from .raster.render import picture_of, render, tile_lists
 from .scene.convert import convert_scene
 from .scene.fit_scene import fit_for_scene
+from .version import __version__ as __version__
 from .viewer.view import view
-
-__version__: str
 
 __all__ = [
     "COARSE_TO_FINE",

@@ -4,6 +4,7 @@ import io
 import sys
 import time
 from contextlib import redirect_stderr
+from types import SimpleNamespace
 
 import pytest
 
@@ -50,6 +51,25 @@ def test_no_bar_where_it_is_switched_off_or_nobody_looks(at_once, photo):
             slow(3, progress=progress)
             eg.fit(photo, progress=progress, **QUICK)
         assert stream.getvalue() == ""
+
+
+@pytest.mark.parametrize("progress", [5, "yes", 0])
+def test_what_is_no_progress(photo, progress):
+    with pytest.raises(ValueError, match=rf"progress is {progress!r}; pass True, False or a fun"):
+        eg.fit(photo, progress=progress, **QUICK)
+
+
+class Closed(io.StringIO):
+    def isatty(self):
+        raise ValueError("I/O operation on closed file")
+
+
+@pytest.mark.parametrize("stream", [None, Closed(), SimpleNamespace(write=print, flush=print)])
+@pytest.mark.parametrize("progress", [None, True])
+def test_no_bar_without_a_stream(photo, monkeypatch, stream, progress):
+    """As in a service, or where standard error was closed or replaced."""
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert len(eg.fit(photo, progress=progress, **QUICK).gaussians) == 30
 
 
 @pytest.mark.parametrize("progress", [None, True, "call"])

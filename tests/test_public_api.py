@@ -48,6 +48,14 @@ def test_public_names_are_documented(name):
     assert ("Returns" in sections) == (signature.return_annotation not in (None, "None"))
 
 
+def test_folders_that_the_manual_names_are_attributes():
+    code = """
+import eigengs_dr as eg
+print(eg.paper.__name__, eg.plugins.__name__, "__version__" in dir(eg))
+"""
+    assert run_python(code).stdout.split() == ["eigengs_dr.paper", "eigengs_dr.plugins", "True"]
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_examples_in_docstrings(module):
     if module.startswith("eigengs_dr.scene."):

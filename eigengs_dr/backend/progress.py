@@ -57,6 +57,8 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
     if callable(progress):
         yield progress
         return
+    if not (progress is None or isinstance(progress, bool)):
+        raise ValueError(f"progress is {progress!r}; pass True, False or a function")
     if progress is False or not _is_watched():
         yield None
         return
@@ -88,4 +90,7 @@ def _is_watched() -> bool:
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     if shell is not None and hasattr(shell, "kernel"):
         return True
-    return sys.stderr is not None and sys.stderr.isatty()
+    try:
+        return bool(sys.stderr.isatty())
+    except (AttributeError, ValueError):  # there is none, it has no such method, or it is closed
+        return False

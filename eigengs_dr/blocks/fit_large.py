@@ -6,6 +6,7 @@ import os
 import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from ..backend.arguments import takes_numbers
@@ -16,7 +17,7 @@ from ..cluster.client import executor_for
 from ..fitting.method import DEFAULT, Method
 from ..fitting.objective import restored
 from ..fitting.options import FitOptions, named_options
-from ..gaussian.file import check_suffix, write
+from ..gaussian.file import FitFigures, check_suffix, write
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
@@ -181,10 +182,11 @@ def fit_large(
         run = Run(source, blocks, settings, executor_for(client), checkpoint, progress, interrupted)
         data = run.fit()
         errors = run.measure(data)
+        ycbcr, rgb = (psnr_from_mse(e / (3 * source.width * source.height)) for e in errors)
         result = restored(Gaussians.from_data(data, backend), run.settings.affine)
         if output is not None:
-            write(output, result.data())
-    ycbcr, rgb = (psnr_from_mse(e / (3 * source.width * source.height)) for e in errors)
+            name = Path(image).name if isinstance(image, (str, os.PathLike)) else ""
+            write(output, result.data(), FitFigures(ycbcr, rgb, iterations, name))
     seconds = time.perf_counter() - started
     return LargeFit(result, ycbcr, rgb, len(blocks), run.resumed, iterations, seconds)
 

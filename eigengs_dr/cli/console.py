@@ -7,8 +7,9 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
@@ -18,6 +19,8 @@ from ..backend.interrupts import terminate_as_interrupt
 from ..backend.messages import printable
 from ..backend.progress import progress_bar
 from ..backend.selection import BackendError
+
+Result = TypeVar("Result")
 
 MISSED = 1
 """Exit code if the target PSNR cannot be reached."""
@@ -43,8 +46,9 @@ class Program(click.Group):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("always", UserWarning)
-                # One line per warning, without the line of code that issued it.
-                warnings.showwarning = lambda message, *_: print_message(f"note: {message}")
+                # One line per warning, said once, without the line of code that issued it.
+                note = cache(lambda text: print_message(f"note: {text}"))
+                warnings.showwarning = lambda message, *_: note(str(message))
                 sys.exit(super().main(arguments, *rest, **extra))
         except click.exceptions.NoArgsIsHelpError as error:
             error.show()
@@ -118,6 +122,34 @@ def prefix_errors(name: Path | str) -> Iterator[None]:
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(str(name)) else f"{name}: {text}") from None
+
+
+def for_each(
+    in_folder: bool, work: Callable[..., Result], *columns: Sequence[Any]
+) -> list[Result | None]:
+    """Call a function for files, and return its results.
+
+    In a folder, a file that fails does not end the others: its error is printed, and its result
+    is None.
+    """
+    results: list[Result | None] = []
+    for file, *others in zip(*columns, strict=True):
+        try:
+            with prefix_errors(file):
+                results.append(work(file, *others))
+        except ERRORS as error:
+            _end_if_interrupted(error)
+            if not in_folder:
+                raise
+            print_message(f"error: {_message(error)}")
+            results.append(None)
+    return results
+
+
+def exit_if_failed(results: Sequence[object]) -> None:
+    """End the command with the code of an error if a file of `for_each` failed."""
+    if None in results:
+        click.get_current_context().exit(FAILED)
 
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:

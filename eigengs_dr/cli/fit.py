@@ -39,7 +39,7 @@ PRESETS = ("default", "gaussianimage", "eigengs")
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
 
-EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster")
+EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster", "recursive")
 """Options that cannot be combined with maps."""
 
 
@@ -51,9 +51,7 @@ EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "clust
 @options.value("--target-psnr", "DB", float, "Use the fewest Gaussians that reach this PSNR.")
 @options.choice("--target-space", ["rgb", "ycbcr"], "Colour space of --target-psnr.", True)
 @options.number("--max-gaussians", "Largest number of Gaussians for --target-psnr.")
-@options.value(
-    "--blocks", "SIZE", int, "Fit blocks of this side.  [default: 1024 if memory is short]"
-)
+@options.value("--blocks", "SIZE", int, "Fit blocks of this side, such as 1024, in less memory.")
 @options.level_counts(
     "Number of levels of detail, each 4 times as large, or the number of Gaussians up to each."
 )
@@ -72,6 +70,7 @@ EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "clust
 @options.value(
     "--preview", "FILE", options.path, "Picture, or folder, that shows photo, fit and outlines."
 )
+@click.option("--recursive", is_flag=True, help="Also take images in subfolders of a folder.")
 @click.option(
     "--overwrite", is_flag=True, help="Also fit images again whose results exist, if several."
 )
@@ -87,7 +86,7 @@ def fit(
     overwrite: bool,
     **choices: Any,
 ) -> None:
-    """Fit sums of Gaussians to images.
+    """Fit sums of Gaussians to images. Grey ones become RGB; --space data keeps one channel.
 
     An IMAGE may be a folder of images, a pattern in quotes, or a URL. For several images, -o and
     --preview name folders. Files in these folders are named after the images, and manifest.jsonl
@@ -103,9 +102,9 @@ def fit(
     several images, with exit code 130. If --target-psnr cannot be reached, the command reports it,
     writes the best fit and exits with code 1.
 
-    An image that is too large for the memory of this machine is fitted by blocks, by default with
-    one Gaussian per 20 pixels. Ctrl-C then keeps the finished blocks, and the same command
-    continues.
+    An image that is too large for the memory of this machine is refused, with the memory that it
+    takes. --blocks 1024 fits it block by block, by default with one Gaussian per 20 pixels. Ctrl-C
+    then keeps the finished blocks, and the same command continues.
 
     With --map, several maps of the same size, such as albedo, roughness and normal, share one set
     of shapes, and -o names the file. Maps with names such as albedo or color are fitted in linear
@@ -121,6 +120,7 @@ def fit(
       eigengs-dr fit photo.jpg -o levels.npz --levels 5000,7000,9000
       eigengs-dr fit photos/ -o fits/ --iterations 300 --report fits.json
       eigengs-dr fit photos/ extra.png -o fits/ --overwrite --preview previews/
+      eigengs-dr fit photos/ -o fits/ --recursive
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
       eigengs-dr fit s3://bucket/photos/ -o /shared/fits/ --cluster tcp://node1:8786
       eigengs-dr fit roughness.png -o roughness.npz --space data
@@ -128,13 +128,18 @@ def fit(
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024
       eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
+    recursive = choices["recursive"]
     if maps:
         _check_maps(run.context, images, output)
     elif not images:
         raise click.UsageError("no image is given; give image files, or maps with --map")
-    files = [m.path for m in maps.values()] or [f for given in images for f in _expand(given)]
+    files = [m.path for m in maps.values()] or [
+        file for given in images for file in _expand(given, recursive)
+    ]
     settings = _settings(choices, basis, run.backend, files[0], bool(maps))
     several = not maps and (len(files) > 1 or files != list(images))
+    if recursive and files == list(images):
+        raise ValueError("--recursive takes a folder of images")
     if run.cluster and (preview or not (several or blocks)):
         raise ValueError("--cluster takes several images, or --blocks, and no --preview")
     inputs = files if several else files[:1]
@@ -145,8 +150,8 @@ def fit(
         raise ValueError("--blocks fits one image; run the command for each image")
     if not several:
         check_replaceable(outputs[0], bool(maps))
-    if not (several or maps):
-        blocks = blocks or _plan_memory(run, files[0], settings, preview)
+    if not (several or maps or blocks):
+        _check_memory(run, files[0], settings, _has_blocks(settings, preview))
     if blocks and not _has_blocks(settings, preview):
         raise ValueError(
             "--blocks needs the default preset and init; leave out --target-psnr, --levels and "
@@ -198,18 +203,20 @@ def _settings(
     if basis is not None or method.needs_model:
         start = eg.EigenGS.load(basis or DEFAULT_BASIS, backend)
     if start is not None and choices["init"]:
-        raise ValueError(f"init {choices['init']!r} and a start exclude each other; give one")
+        raise ValueError("--init and --basis, or a preset that has one, exclude each other")
     target, count, levels = (choices[name] for name in ("target_psnr", "gaussians", "levels"))
     goal = None
+    if target is not None and count is not None:
+        raise ValueError(
+            "--gaussians and --target-psnr exclude each other; --max-gaussians limits a search"
+        )
     if target is not None:
         goal = eg.Goal(target, choices["target_space"] or "rgb", choices["max_gaussians"])
     elif choices["max_gaussians"] is not None or choices["target_space"]:
-        raise ValueError(
-            "max_gaussians and target_space belong to target_psnr; give target_psnr too"
-        )
+        raise ValueError("--max-gaussians and --target-space need --target-psnr")
     if levels is not None:
         if goal:
-            raise ValueError("levels and target_psnr exclude each other; give one of them")
+            raise ValueError("--levels and --target-psnr exclude each other; give one of them")
         if isinstance(levels, int) and count is None:
             count = _default_count(first)
         try:
@@ -249,12 +256,12 @@ def _default_count(path: Path | str) -> int:
     return DEFAULT_COUNT if size is None else default_count(size[0] * size[1])
 
 
-def _expand(source: Path | str) -> Sequence[Path | str]:
+def _expand(source: Path | str, recursive: bool) -> Sequence[Path | str]:
     """Expand a folder, a pattern or a URL to its images."""
     from ..image.folder import list_images
 
     single = isinstance(source, Path) and source.exists() and not source.is_dir()
-    return [source] if single else list_images(source)
+    return [source] if single else list_images(source, recursive)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -290,7 +297,7 @@ def _fit_at_once(
         record = {"input": {name: m.path for name, m in maps.items()} or source, "output": output}
         record |= _figures(result) | _similarity(image, result)
         if picture:
-            eg.save_image(picture, _comparison(image, result))
+            eg.save_image(picture, _comparison(image, result.gaussians, result.image))
     times = {"seconds_load": loaded - started, "seconds_total": time.perf_counter() - started}
     title = str(output if maps else source)
     run.tell(*_summary(title, record | times, settings, picture))
@@ -340,19 +347,18 @@ def _similarity(image: Any, result: eg.Fit) -> Record:
     return {"ssim": eg.ssim(*pair), "ms_ssim": ms_ssim}
 
 
-def _comparison(image: Any, result: eg.Fit) -> Any:
+def _comparison(image: Any, gaussians: eg.Gaussians, drawn: Any) -> Any:
     """Return a picture of image, fit and outlines side by side, with a row for each map."""
     import numpy as np
 
     from ..viewer.pictures import comparison, displayed
 
-    gaussians = result.gaussians
     if not gaussians.maps:
-        return comparison(displayed(image, gaussians.space), result.image, gaussians)
+        return comparison(displayed(image, gaussians.space), drawn, gaussians)
     rows = []
     for m in gaussians.maps:
         original = displayed(image[m.name], m.space)[..., : m.channels]
-        rows.append(comparison(original, result.image[m.name], gaussians[m.name]))
+        rows.append(comparison(original, drawn[m.name], gaussians[m.name]))
     return np.concatenate(rows)
 
 
@@ -442,9 +448,15 @@ def _fit_several(
         if row.error:
             print_message(f"error: {row.error}")
         picture = picture_of[row.name]
-        if picture and row.result and row.input:
-            image = load_images(row.input, settings.space or "ycbcr", settings.encoding)
-            eg.save_image(picture, _comparison(image, row.result))
+        if picture and row.result:
+            eg.save_image(picture, _compared(row, settings))
+        elif picture and row.status == "skipped" and not picture.exists():
+            try:
+                compared = _compared(row, settings)
+            except (ValueError, OSError) as error:
+                print_message(f"note: {picture} is not drawn: {error}; --overwrite fits it again")
+            else:
+                eg.save_image(picture, compared)
         show(folder.name, done, total, row)
 
     with bar(run.quiet) as show:
@@ -460,6 +472,20 @@ def _fit_several(
     run.tell(*_summary_of_all(rows, folder, seconds, space))
     known = [{k: v for k, v in vars(row).items() if v not in (None, "")} for row in rows]
     return [{"stopped": record["status"]} | record for record in known]
+
+
+def _compared(row: eg.ImageRow, settings: FitOptions) -> Any:
+    """Return the picture of a row; for a skipped image it shows the set in the file."""
+    assert row.input and row.output
+    image = load_images(row.input, settings.space or "ycbcr", settings.encoding)
+    if row.result:
+        return _comparison(image, row.result.gaussians, row.result.image)
+    if settings.method.needs_model:
+        raise ValueError(f"{row.output} lacks the mean image")
+    gaussians = eg.Gaussians.load(row.output, settings.backend)
+    if image.pixels.shape[:2] != (gaussians.height, gaussians.width):
+        raise ValueError(f"{row.output} is of an image of {gaussians.width}x{gaussians.height}")
+    return _comparison(image, gaussians, eg.picture_of(gaussians))
 
 
 def _given_options(context: click.Context, settings: FitOptions) -> dict[str, Any]:
@@ -508,9 +534,6 @@ def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space
 REPORTED_BYTES = 1_000_000_000
 """Estimated memory from which a fit reports it, in bytes."""
 
-MAX_MEMORY_SHARE = 0.5
-"""Share of the usable memory up to which an image is fitted without blocks."""
-
 
 def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
     """Return whether a fit by blocks supports these options."""
@@ -518,43 +541,34 @@ def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
     return default and settings.goal is None and not settings.levels and preview is None
 
 
-def _plan_memory(
-    run: options.Run, path: Path | str, settings: FitOptions, preview: Path | None
-) -> int | None:
-    """Return the side of blocks if a fit of the full image takes too much memory, else None.
+def _check_memory(
+    run: options.Run, path: Path | str, settings: FitOptions, has_blocks: bool
+) -> None:
+    """Report the memory of a large fit, estimated from the header of the file.
 
-    A large fit reports its memory, estimated from the header of the file. Errors in the file are
-    left to its reader.
+    Errors in the file are left to its reader.
 
     Raises
     ------
     ValueError
-        If this process may not use enough memory, and the options do not allow blocks.
+        If this process may not use enough memory.
     """
-    from ..blocks.fit_large import BLOCK_SIDE
     from ..blocks.windows import image_size
     from . import memory
 
     size = image_size(path)
     if size is None:
-        return None
+        return
     height, width, channels = size
     pixels, data = width * height, rendered_as(settings.space or "ycbcr") is None
     channels = channels if data else 3
     first = settings.goal is not None
     count = settings.first_try(pixels, channels) if first else settings.count_for(pixels)
     problem = width, height, channels, count
-    needed, usable = memory.estimate_memory(*problem), memory.usable_memory()
-    if usable and needed > MAX_MEMORY_SHARE * usable and _has_blocks(settings, preview):
-        print_message(
-            f"{path}: a fit of the full image takes too much memory; it is fitted by blocks"
-        )
-        return BLOCK_SIDE
     with prefix_errors(path):
-        line = memory.check_memory(*problem)
-    if needed >= REPORTED_BYTES and not run.quiet:
+        line = memory.check_memory(*problem, has_blocks)
+    if memory.estimate_memory(*problem) >= REPORTED_BYTES and not run.quiet:
         print_message(line)
-    return None
 
 
 def _fit_by_blocks(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from ..gaussian.file import SetData
 from ..gaussian.packed import is_packed
 from ..storage import npz
 from . import options
-from .console import prefix_errors, table
+from .console import exit_if_failed, for_each, prefix_errors, table
 from .outputs import check_outputs, name_pictures
 from .scene import load_mitsuba, scene_errors
 
@@ -27,7 +28,7 @@ Facts = Record
 
 
 @click.command()
-@click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE")
+@click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE|FOLDER")
 @options.as_json
 @options.value("--preview", "FILE", options.path, "Picture of the contents.")
 @click.option(
@@ -55,6 +56,8 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     The preview shows the rendered image or, for a model, the mean image, some components and the
     outlines of the Gaussians.
 
+    Of a folder, the command shows all .npz and .egs files in it, and --preview names a folder.
+
     \b
     Examples:
       eigengs-dr info photo.npz
@@ -62,14 +65,28 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
       eigengs-dr info natural
       eigengs-dr info photo.npz --texture
       eigengs-dr info model.npz --preview components.png
+      eigengs-dr info fits/ --json
     """
-    [picture] = name_pictures([file], preview)
-    check_outputs([picture], [file])
     select()
-    from ..eigenbasis import model_file
     from ..eigenbasis.eigengs import SHIPPED
 
     file = SHIPPED.get(str(file), file)
+    files, in_folder = options.sets_in(file), file.is_dir()
+    pictures = name_pictures(files, preview, in_folder)
+    check_outputs(pictures, files)
+    facts = for_each(in_folder, partial(_facts_of, texture=texture), files, pictures)
+    found = [known for known in facts if known]
+    if as_json:
+        click.echo(json.dumps(found if in_folder else found[0], indent=2))
+    else:
+        click.echo("\n\n".join(_text(**known) for known in found))
+    exit_if_failed(facts)
+
+
+def _facts_of(file: Path, picture: Path | None, texture: bool) -> Facts:
+    """Return what a file holds, and draw it."""
+    from ..eigenbasis import model_file
+
     packed = is_packed(file)
     file_format = set_file.FORMAT if packed else npz.format_of(file)
     kinds = {set_file.FORMAT: "image", set_file.MATERIAL: "material", model_file.FORMAT: "model"}
@@ -93,7 +110,7 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     if picture:
         options.check_pixels(facts["width"], facts["height"])
         _draw(file, kind, picture)
-    click.echo(json.dumps(facts, indent=2) if as_json else _text(**facts))
+    return facts
 
 
 def _describe_set(data: SetData) -> Facts:

@@ -57,10 +57,10 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
     )
 
 
-def check_memory(width: int, height: int, channels: int, gaussians: int) -> str:
+def check_memory(width: int, height: int, channels: int, gaussians: int, has_blocks: bool) -> str:
     """Return a line with the estimated memory of a fit, and check that there is enough.
 
-    For the parameters see `estimate_memory`.
+    For the parameters see `estimate_memory`; `has_blocks` says whether blocks are an advice.
 
     Raises
     ------
@@ -73,8 +73,9 @@ def check_memory(width: int, height: int, channels: int, gaussians: int) -> str:
         "of memory"
     )
     if usable is not None and needed > usable:
+        blocks = "fit it with --blocks 1024, " if has_blocks else ""
         raise ValueError(
             f"{line}, but this process may use {usable / 1e9:.1f} GB; "
-            "scale the image down or use fewer Gaussians"
+            f"{blocks}scale the image down or use fewer Gaussians"
         )
     return line

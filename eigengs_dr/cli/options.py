@@ -20,6 +20,8 @@ from .outputs import describe_run, write_json
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 
+FILE_OR_FOLDER = click.Path(exists=True, path_type=Path)
+
 MAX_PIXELS = 1 << 29
 """Largest number of pixels of a rendered picture, except in TIFF files; it takes 3 bytes per
 pixel."""
@@ -61,6 +63,17 @@ def folder(text: str) -> Path | str:
     """Parse an existing folder, or its URL."""
     kind = click.Path(exists=True, file_okay=False, path_type=Path)
     return text if is_url(text) else kind.convert(text, None, None)
+
+
+def sets_in(path: Path, suffixes: tuple[str, ...] = (".npz", ".egs")) -> list[Path]:
+    """Return the sets in a folder, sorted by name; of a file, the file."""
+    if not path.is_dir():
+        return [path]
+    files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in suffixes]
+    files = [file for file in files if file.name[0] != "." and file.is_file()]
+    if not files:
+        raise ValueError(f"{path}: holds no files ending in {' or '.join(suffixes)}")
+    return files
 
 
 def size(text: str) -> tuple[int, int]:

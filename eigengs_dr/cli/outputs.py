@@ -52,7 +52,8 @@ def name_outputs(
     output = Path() if output is None else output
     if len(inputs) == 1 and not folder and not output.is_dir():
         if output.suffix.lower() not in suffixes:
-            raise ValueError(f"{output}: the name must end in {' or '.join(suffixes)}")
+            packs = "; 'eigengs-dr pack' writes .egs files" * (output.suffix.lower() == ".egs")
+            raise ValueError(f"{output}: the name must end in {' or '.join(suffixes)}{packs}")
         return [output]
     if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
         raise ValueError(f"{output}: is a file; several images, or a folder of them, need a folder")
@@ -61,7 +62,11 @@ def name_outputs(
         advice = "give an image once, or rename one of them"
         raise ValueError(f"{output / twice[0]}: two images have this name; {advice}")
     output.mkdir(parents=True, exist_ok=True)
-    return [output / name for name in names]
+    files = [output / name for name in names]
+    for file in files:  # sets of Gaussians alone are looked at before they are replaced
+        if file.is_symlink() and not (file.suffix == ".npz" and file.exists()):
+            raise ValueError(f"{file}: is a link, which is not followed; move it away")
+    return files
 
 
 def name_pictures(

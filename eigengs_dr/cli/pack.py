@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import click
 import eigengs_dr as eg
 
 from ..backend.selection import select
+from ..backend.types import Record
 from . import options
-from .console import prefix_errors
+from .console import exit_if_failed, for_each
 from .outputs import check_outputs, lock_outputs, name_outputs
 
 SUFFIX, BUDGET = ".egs", 0.5
@@ -23,8 +25,8 @@ COMPARED_IN = {"linear": "sRGB", "radiance": "PU21"}
 
 
 @click.command()
-@click.argument("file", type=options.EXISTING, metavar="X.npz")
-@options.output("File to write.", "Y.egs")
+@click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
+@options.output("File to write, or a folder.", "Y.egs|FOLDER")
 @options.value("--image", "IMAGE", options.image, "The original image, for measuring the loss.")
 @options.maps("The image of a map of a material; repeat the option for all maps.")
 @options.encoding
@@ -47,18 +49,46 @@ def pack(
     entropy-codes them. Every command that reads the .npz file of an image reads .egs files too.
     Without --image, the command assumes that the fit has 40 dB. A material takes --map instead.
 
+    Of a folder, all .npz files in it are packed. If one fails, the others still are, and the exit
+    code is 2.
+
     \b
     Examples:
       eigengs-dr pack photo.npz -o photo.egs --image photo.jpg
       eigengs-dr pack photo.npz -o photo.egs --max-psnr-drop 0.1
       eigengs-dr pack levels.npz -o levels.egs --levels 4
       eigengs-dr pack bark.npz -o bark.egs --map albedo=a.jpg --map normal=n.jpg
+      eigengs-dr pack fits/ -o packed/
     """
-    [target] = name_outputs([file], output, [SUFFIX])
-    inputs = [file, *([image] if image else []), *(m.path for m in maps.values())]
-    check_outputs([target, run.report], inputs)
-    lock_outputs(target)
+    files, in_folder = options.sets_in(file, (".npz",)), file.is_dir()
+    if in_folder and (image or maps):
+        raise ValueError("--image and --map belong to one set; leave them out for a folder")
+    targets = name_outputs(files, output, [SUFFIX], in_folder)
+    inputs = [*files, *([image] if image else []), *(m.path for m in maps.values())]
+    check_outputs([*targets, run.report], inputs)
+    lock_outputs(output if in_folder else targets[0])
     select(run.backend)
+    work = partial(
+        _pack, run=run, image=image, maps=maps, encoding=encoding, drop=max_psnr_drop, levels=levels
+    )
+    records = for_each(in_folder, work, files, targets)
+    figures = {"sets": [r for r in records if r]} if in_folder else records[0] or {}
+    run.write_report(figures | {"max_psnr_drop": max_psnr_drop})
+    exit_if_failed(records)
+
+
+def _pack(
+    file: Path,
+    target: Path,
+    *,
+    run: options.Run,
+    image: Path | str | None,
+    maps: dict[str, options.MapFile],
+    encoding: str | None,
+    drop: float,
+    levels: int | tuple[int, ...] | None,
+) -> Record:
+    """Pack one set into a file, and return its figures."""
     gaussians = eg.Gaussians.load(file, run.backend)
     if maps and not gaussians.maps:
         raise ValueError(f"{file}: holds one image and no maps; give --image instead of --map")
@@ -67,22 +97,21 @@ def pack(
     if levels is not None and gaussians.maps:
         raise ValueError(f"{file}: a material has no levels in .egs files; leave out --levels")
     images: Any = {name: m.path for name, m in maps.items()} or image
-    with prefix_errors(file):
-        counts = eg.level_counts(len(gaussians), 1 if levels is None else levels)
-        sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
-        packed = eg.pack(gaussians, target, images, max_psnr_drop, sections, encoding=encoding)
+    counts = eg.level_counts(len(gaussians), 1 if levels is None else levels)
+    sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
+    packed = eg.pack(gaussians, target, images, drop, sections, encoding=encoding)
     before = file.stat().st_size
-    figures = {"input": file, "output": target, "bytes_before": before, **packed._asdict()}
+    figures: Record = {"input": file, "output": target, "bytes_before": before, **packed._asdict()}
     figures |= {"gaussians": len(packed.gaussians), "steps": packed.steps._asdict()}
-    run.write_report(figures | {"max_psnr_drop": max_psnr_drop})
     against = "the original" if images else "the rendering of the input"
     psnr = packed.psnr if isinstance(packed.psnr, dict) else {"": packed.psnr}
-    values = ", ".join(f"{name} {value:.2f} dB".strip() for name, value in psnr.items())
-    figure = COMPARED_IN.get(gaussians.space, f"psnr in {gaussians.space}")
+    values = ", ".join(f"{key} {value:.2f} dB".strip() for key, value in psnr.items())
+    name = COMPARED_IN.get(gaussians.space, f"psnr in {gaussians.space}")
     if gaussians.maps:
-        figure = "psnr_rgb"
+        name = "psnr_rgb"
     run.tell(
         f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes",
         f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel",
-        f"  lost {packed.psnr_drop:.2f} dB; {figure} against {against}: {values}",
+        f"  lost {packed.psnr_drop:.2f} dB; {name} against {against}: {values}",
     )
+    return figures

@@ -2,18 +2,19 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
 from ..backend.selection import select
 from . import options
-from .console import bar
+from .console import bar, exit_if_failed, for_each
 from .outputs import check_outputs, lock_outputs, name_outputs
 
 
 @click.command()
-@click.argument("file", type=options.EXISTING, metavar="X.npz")
-@options.output("Picture to write.", "Y.png")
+@click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
+@options.output("Picture to write, or a folder of PNG files.", "Y.png|FOLDER")
 @click.option("--map", "name", metavar="NAME", help="The map of a material to render.")
 @options.value(
     "--region", "X,Y,W,H", options.region, "Region of the image: left, top, width, height."
@@ -37,12 +38,10 @@ def render(
     run: options.Run,
     file: Path,
     output: Path,
-    name: str | None,
-    region: tuple[int, int, int, int] | None,
     scale: float | None,
     size: tuple[int, int | None] | None,
-    first: int | None,
     bits: str | None,
+    **choices: Any,
 ) -> None:
     """Render a fitted image at any size, or a region of it.
 
@@ -51,6 +50,9 @@ def render(
     Files of 8 and 16 bits hold clamped sRGB; files of floats (.exr, .hdr, .pfm, and .tif with
     --bits 32) hold linear light. A fit of data is written unchanged; one channel gives a grey
     picture. Large pictures are rendered in bands; a .tif file takes no more memory than a band.
+
+    Of a folder, all sets in it are rendered. If one fails, the others still are, and the exit code
+    is 2.
 
     \b
     Examples:
@@ -62,21 +64,39 @@ def render(
       eigengs-dr render photo.npz -o icon.png --size 64x48 --first 500
       eigengs-dr render bark.npz -o roughness.png --map roughness
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2
+      eigengs-dr render fits/ -o pictures/ --size 512
     """
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
-    from ..image.formats import TIFF_SUFFIXES
     from ..image.io import SUFFIXES, bits_of
 
-    [output] = name_outputs([file], output, SUFFIXES)
-    depth = bits_of(output, int(bits) if bits else None)
-    check_outputs([output], [file])
-    lock_outputs(output)
+    files, in_folder = options.sets_in(file), file.is_dir()
+    outputs = name_outputs(files, output, SUFFIXES, in_folder)
+    depth = bits_of(outputs[0], int(bits) if bits else None)
+    check_outputs(outputs, files)
+    lock_outputs(output if in_folder else outputs[0])
     select(run.backend)
+    work = partial(_render, run=run, depth=depth, scale=scale, size=size, **choices)
+    exit_if_failed(for_each(in_folder, work, files, outputs))
+
+
+def _render(
+    file: Path,
+    output: Path,
+    *,
+    run: options.Run,
+    depth: int,
+    scale: float | None,
+    size: tuple[int, int | None] | None,
+    **choices: Any,
+) -> Path:
+    """Render one set to a file, and return its name."""
     from ..blocks.draw import save_region
     from ..gaussian.file import read_map
     from ..gaussian.region import check_region
+    from ..image.formats import TIFF_SUFFIXES
 
+    name, region, first = (choices[key] for key in ("name", "region", "first"))
     data = read_map(file, name, "--map")
     count = len(data.arrays["mean"])
     if first is not None:
@@ -95,3 +115,4 @@ def render(
         step = partial(show, output.name)
         save_region(output, data, region, (columns, rows), run.backend, step, depth)
     run.tell(f"{file}: {count:,} Gaussians", f"  wrote {output} ({columns}x{rows})")
+    return output

@@ -22,7 +22,9 @@ from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
 from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
+from ..image.pixels import check_encoding
 from ..raster.render import picture_of
+from ..storage.atomic import require_writable
 from .egs import MAX_SECTIONS, SUFFIX, write
 from .quantization import Steps
 from .rounding import MIN_MSE, Comparison, planes_of, round_within
@@ -66,6 +68,7 @@ class PackResult(NamedTuple):
 
 
 @door
+@np.errstate(under="ignore")  # small weights become 0, whatever the caller does about that
 def pack(
     gaussians: Gaussians | Fit,
     output: str | os.PathLike[str],
@@ -116,6 +119,8 @@ def pack(
     """
     if Path(output).suffix.lower() != SUFFIX:
         raise ValueError(f"{output}: pack writes {SUFFIX} files; use this suffix, or save()")
+    require_writable(output)  # before the work
+    check_encoding(encoding)
     if not 0 < max_psnr_drop <= MAX_PSNR:
         raise ValueError(
             f"pack: max_psnr_drop is {max_psnr_drop}; it must be above 0 and at most "

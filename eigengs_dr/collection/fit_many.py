@@ -42,6 +42,7 @@ def fit_many(
     images: Images,
     output: str | os.PathLike[str] | None = None,
     *,
+    recursive: bool = False,
     overwrite: bool = False,
     progress: Any = None,
     client: Any = None,
@@ -63,6 +64,9 @@ def fit_many(
         Folder of the results, ``NAME.npz`` for each image; it is created if it is missing. Each
         file is written atomically. ``manifest.jsonl`` has a row for each image. By default the
         results stay in memory.
+    recursive : bool, optional
+        Take images in the subfolders of a folder too; otherwise a warning names one. All images
+        need names of their own.
     overwrite : bool, optional
         Fit images again whose output exists. By default these are skipped, so that repeating an
         interrupted run continues it. Options that differ from those of existing results are an
@@ -93,7 +97,7 @@ def fit_many(
         output folder has results of other options. In an iterator, the second image of the same
         name gets a row with an error instead.
     TypeError
-        If an option is unknown.
+        If an option is unknown, or only `eigengs_dr.fit` has it: weight and loss.
     OSError
         If the output folder cannot be written, or another run writes into it.
     BackendError
@@ -119,7 +123,9 @@ def fit_many(
     >>> [(row.name, row.status, row.gaussians) for row in rows]
     [('000000', 'done', 200), ('000001', 'done', 200)]
     """
-    parameters = ("images", "output", "overwrite", "progress", "client")
+    parameters = ("images", "output", "recursive", "overwrite", "progress", "client")
+    if single := {"weight", "loss"} & set(options):
+        raise TypeError(f"fit_many takes no {min(single)}; call eigengs_dr.fit for each image")
     known = [field.name for field in fields(FitOptions) if field.name != "loss"]
     refuse_unknown(options, [*known, *parameters])
     settings = FitOptions(**options)
@@ -137,7 +143,7 @@ def fit_many(
         _settings_of(settings),
         list(options),
     )
-    return run_images(images, output, overwrite, job, progress, client)
+    return run_images(images, output, overwrite, job, progress, client, recursive)
 
 
 def _settings_of(settings: FitOptions) -> dict[str, Any]:

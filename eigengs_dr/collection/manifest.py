@@ -21,7 +21,7 @@ import numpy as np
 
 from ..backend.types import Record
 from ..gaussian.gaussians import Gaussians
-from ..storage.atomic import atomic_write, remove_stale
+from ..storage.atomic import atomic_write, refuse_link, remove_stale
 from ..storage.locks import lock_folder
 from ..storage.settings import Settings, difference, to_json
 
@@ -116,13 +116,14 @@ def open_manifest(folder: Path, options: Settings | None = None) -> Iterator[Man
     Raises
     ------
     OSError
-        If another run writes into the folder, or the file cannot be read or written.
+        If another run writes into the folder, or the file is a link or cannot be read or written.
     ValueError
         If the file is not a manifest.
     """
     path, settings = folder / NAME, to_json(options or {})
     with lock_folder(folder):
         remove_stale(folder)
+        refuse_link(path)
         rows, clean = read_manifest(path)
         if not clean:
             write_manifest(path, rows)  # otherwise the next row would extend a truncated line

@@ -107,12 +107,13 @@ def run_images(
     job: Job,
     progress: RowProgress | None = None,
     client: object = None,
+    recursive: bool = False,
 ) -> list[ImageRow]:
     """Run a job; for arguments, rows and errors see `eigengs_dr.fit_many`.
 
     In this process, images that are processed end in order.
     """
-    sources = list_sources(images)
+    sources = list_sources(images, recursive)
     total = len(sources) if isinstance(sources, list) else None
     executor = None if client is None else executor_for(client)
     rows: dict[int, ImageRow] = {}

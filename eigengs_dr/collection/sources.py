@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import is_zipfile
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,7 +54,7 @@ class RunImage(NamedTuple):
         return ImageRow(self.name, status, self.path, self.output, **figures)
 
 
-def list_sources(images: Images) -> Iterable[RunImage]:
+def list_sources(images: Images, recursive: bool = False) -> Iterable[RunImage]:
     """Name the images of a run.
 
     Parameters
@@ -61,6 +62,8 @@ def list_sources(images: Images) -> Iterable[RunImage]:
     images : path-like or iterable
         A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of a folder, a glob or a file; or
         an iterable of files, URLs and arrays, see `eigengs_dr.image.io.check_image`.
+    recursive : bool, optional
+        Whether to take images in the subfolders of a folder too.
 
     Returns
     -------
@@ -71,10 +74,13 @@ def list_sources(images: Images) -> Iterable[RunImage]:
     Raises
     ------
     ValueError
-        If two images have the same name, there is no image, or `images` is the array of one image.
+        If two images have the same name, there is no image, or `images` is the array of one image;
+        if they should be recursive and are no folder.
     """
     if isinstance(images, (str, os.PathLike)):
-        images = list_images(images)
+        images = list_images(images, recursive)
+    elif recursive:
+        raise ValueError("recursive is for a folder; the images are given one by one")
     if isinstance(images, np.ndarray) and (images.ndim < 3 or images.shape[2:] in ((1,), (3,))):
         raise ValueError(f"images: got one array of shape {images.shape}; pass a list of images")
     if not isinstance(images, (Sequence, np.ndarray)):
@@ -116,10 +122,11 @@ def plan_output(source: RunImage, manifest: Manifest, overwrite: bool) -> RunIma
     """
     output = manifest.path.with_name(f"{source.name}.npz")
     source = source._replace(output=output)
-    if not output.exists():
+    if not os.path.lexists(output):  # a link that leads nowhere is not followed
         return source
     row = manifest.rows.get(source.name, {})
-    if row.get("status") == "done" and not overwrite:
+    # Of 100,000 results, whether each is whole is seen at its end, and all are not read again.
+    if row.get("status") == "done" and not overwrite and is_zipfile(output):
         names = ("width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", "iterations")
         return source.row("skipped", **{name: row.get(name) for name in names})
     try:

@@ -207,7 +207,8 @@ class EigenGS:
         Raises
         ------
         ValueError
-            If there is not one array per channel, or one has more than k_c coefficients.
+            If there is not one array per channel, one has more than k_c coefficients, or a
+            coefficient is not finite.
         """
         return self.encoder.reconstruct(coefficients, size)
 

@@ -68,6 +68,8 @@ class Encoder:
             len(shape) == 1 and shape[0] <= k for shape, k in zip(shapes, limits, strict=True)
         ):
             raise ValueError(f"coefficients have shapes {shapes}; expected up to {limits}")
+        if not all(np.isfinite(np.asarray(values, np.float32)).all() for values in coefficients):
+            raise ValueError("coefficients are not all finite in single precision; replace them")
         return self._colored(self._mean_colors + self._sum(coefficients), size)
 
     def encode(self, image: Planes, colors: str, mean: str, target_psnr: float | None) -> Gaussians:

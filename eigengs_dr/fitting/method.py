@@ -163,6 +163,9 @@ class Method:
         if not rates or not all(isinstance(r, Real) and r > 0 for r in rates.values()):
             raise ValueError(f"Method: rates are {self.rates!r}; each must be above 0")
 
+    def __hash__(self) -> int:  # a dictionary has none
+        return hash(tuple(sorted(self.rates.items())))
+
     def __repr__(self) -> str:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])

@@ -129,7 +129,7 @@ class FitOptions:
     loss: Loss | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.gaussians, Sequence) and not isinstance(self.gaussians, str):
+        if isinstance(self.gaussians, Sequence) and not isinstance(self.gaussians, (str, bytes)):
             object.__setattr__(self, "gaussians", tuple(_check_counts(None, self.gaussians)))
         elif isinstance(self.gaussians, np.ndarray):
             counts = tuple(_check_counts(None, self.gaussians.tolist()))
@@ -282,7 +282,7 @@ def level_counts(count: int, levels: Levels) -> list[int]:
 def _check_counts(count: int | None, levels: Sequence[int]) -> list[int]:
     """Return numbers of Gaussians that rise up to `count`, if that is known."""
     counts, written = list(levels), ", ".join(map(str, levels))
-    if not all(isinstance(n, (int, np.integer)) for n in counts):
+    if not all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) for n in counts):
         raise ValueError(f"levels {written}: numbers of Gaussians must be whole")
     if not counts or not all(a < b for a, b in pairwise([0, *counts])):
         raise ValueError(f"levels {written}: numbers of Gaussians must rise, from 1 or more")

@@ -134,6 +134,8 @@ class Gaussians:
         kind = np.dtype(dtype)
         if kind not in (np.float32, np.float64):
             raise ValueError(f"Gaussians: dtype is {kind}; give numpy.float32 or numpy.float64")
+        if bad := [name for name, values in data.arrays.items() if np.iscomplexobj(values)]:
+            raise ValueError(f"Gaussians: {bad[0]} is complex; pass real numbers")
         arrays = {name: np.asarray(values, kind) for name, values in data.arrays.items()}
         arrays.setdefault("background", np.zeros(arrays["color"].shape[1:], kind))
         width, height = check_size(data.size)

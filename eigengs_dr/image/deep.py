@@ -9,7 +9,7 @@ OpenImageIO 3.2 returns PFM upside down.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -103,17 +103,23 @@ def exr_header(path: Path) -> Header:
 
 
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""Chromaticities of red, green, blue and white, in the format of an EXR file."""
+"""Chromaticities of red, green, blue and white, in the format of EXR and Radiance files."""
 
 
 def _exr_notes(spec: oiio.ImageSpec) -> tuple[str, ...]:
     notes: tuple[str, ...] = ()
     primaries = spec.getattribute("chromaticities")
-    if primaries is not None and np.abs(np.subtract(primaries, REC709)).max() > 0.01:
-        notes += ("its primaries are not those of sRGB, which is ignored",)
+    if primaries is not None:
+        notes += _primaries_note(primaries, 0.01)
     if _display(spec) != _data(spec):
         notes += ("its display window is shown, and what it lacks is black",)
     return notes
+
+
+def _primaries_note(primaries: Sequence[float], tolerance: float) -> tuple[str, ...]:
+    if np.abs(np.subtract(primaries, REC709)).max() <= tolerance:
+        return ()
+    return ("its primaries are not those of sRGB, which is ignored",)
 
 
 def _display(spec: oiio.ImageSpec) -> tuple[int, int, int, int]:
@@ -142,6 +148,8 @@ def read_exr(path: Path) -> Pixels:
 
 _RESOLUTION = re.compile(rb"\n([-+][XY]) +\d+ +([-+][XY]) +\d+\n")
 
+_PRIMARIES = re.compile(rb"\nPRIMARIES=((?:[ \t]*[-+]?\d*\.?\d+(?:[eE][-+]?\d+)?\b){8})[ \t]*\n")
+
 _RADIANCE = {
     b"-Y+X": 1, b"-Y-X": 2, b"+Y-X": 3, b"+Y+X": 4, b"+X-Y": 5, b"-X-Y": 6, b"-X+Y": 7, b"+X+Y": 8,
 }  # fmt: skip
@@ -161,7 +169,11 @@ def hdr_header(path: Path) -> Header:
     width, height = spec.width, spec.height
     if orientation in TRANSPOSED:
         width, height = height, width
-    return Header(width, height, 3, 12, "linear", orientation)
+    notes: tuple[str, ...] = ()
+    if found := _PRIMARIES.search(text):  # the white of Radiance itself is off by 0.02
+        primaries = [float(number) for number in found[1].split()]
+        notes = _primaries_note(primaries, 0.05)
+    return Header(width, height, 3, 12, "linear", orientation, notes=notes)
 
 
 # ---------------------------------------------------------------------------------------------

@@ -62,22 +62,24 @@ class PreparedImage(NamedTuple):
     problem: str = ""
 
 
-def image_files(folder: str | Path) -> list[Path]:
-    """List the images of a folder, without hidden files and subfolders.
+def image_files(folder: str | Path, recursive: bool = False) -> list[Path]:
+    """List the images of a folder, without hidden files and folders.
 
     Parameters
     ----------
     folder : str or Path
+    recursive : bool, optional
+        Whether to list those in its subfolders too; links to folders are not followed.
 
     Returns
     -------
     list of Path
-        Files with a suffix of `READ_SUFFIXES` in upper or lower case, sorted by name.
+        Files with a suffix of `READ_SUFFIXES` in upper or lower case, sorted by path.
 
     Warns
     -----
     UserWarning
-        If files with a suffix of `UNREAD_SUFFIXES` are left out.
+        If files with a suffix of `UNREAD_SUFFIXES` are left out, or images in subfolders.
 
     Raises
     ------
@@ -91,8 +93,17 @@ def image_files(folder: str | Path) -> list[Path]:
         raise ImageError(f"{folder}: is a file; give the folder that holds it") from None
     except OSError as error:
         raise ImageError(f"{folder}: not a readable folder ({error.strerror}); check it") from None
+    deeper = (path for entry in entries if entry.is_dir() for path in _walk(entry))
+    if recursive:
+        entries = sorted([*entries, *deeper])
     entries = [entry for entry in entries if entry.name[0] != "." and entry.is_file()]
     files = [entry for entry in entries if entry.suffix.lower() in READ_SUFFIXES]
+    left_out = next((path for path in deeper if path.suffix.lower() in READ_SUFFIXES), None)
+    if left_out:
+        warn(
+            f"{folder}: images in its subfolders are left out, such as "
+            f"{left_out.relative_to(folder)}; fit takes them with --recursive (recursive=True)"
+        )
     skipped = [entry.name for entry in entries if entry.suffix.lower() in UNREAD_SUFFIXES]
     if skipped:
         warn(f"{folder}: {len(skipped)} files of unsupported kinds are left out: {_names(skipped)}")
@@ -102,17 +113,28 @@ def image_files(folder: str | Path) -> list[Path]:
     return files
 
 
+def _walk(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and below, except hidden ones."""
+    if folder.name[0] == "." or folder.is_symlink():
+        return
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if name[0] != ".")
+        yield from (Path(place, name) for name in sorted(names) if name[0] != ".")
+
+
 def _names(names: list[str]) -> str:
     """Return the first names of a list as text."""
     return ", ".join(names[:MAX_NAMED]) + (", ..." if len(names) > MAX_NAMED else "")
 
 
-def list_images(images: str | os.PathLike[str]) -> Sequence[str | Path]:
+def list_images(images: str | os.PathLike[str], recursive: bool = False) -> Sequence[str | Path]:
     """List the images of a folder, a glob, or a URL of one of them or of a file.
 
     Parameters
     ----------
     images : path-like
+    recursive : bool, optional
+        Whether to list those in the subfolders of a folder too.
 
     Returns
     -------
@@ -122,16 +144,18 @@ def list_images(images: str | os.PathLike[str]) -> Sequence[str | Path]:
     Raises
     ------
     ImageError
-        If there are no images.
+        If there are no images, or a pattern is given that should be recursive.
     """
     if is_url(images):
-        return list_urls(str(images))
+        return list_urls(str(images), recursive)
     if glob.has_magic(os.fspath(images)) and not os.path.exists(images):
+        if recursive:
+            raise ImageError(f"{images}: recursive is for a folder; write ** into the pattern")
         files = sorted(Path(name) for name in glob.glob(os.fspath(images), recursive=True))
         if not files:
             raise ImageError(f"{images}: no file matches; check the pattern")
         return files
-    return image_files(Path(images))
+    return image_files(Path(images), recursive)
 
 
 def read_blocks(

@@ -5,6 +5,7 @@ OpenImageIO, from the extra ``hdr``, writes EXR, Radiance HDR and PNG files of 1
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -33,16 +34,23 @@ shared exponent."""
 SUFFIXES = tuple(BITS)
 """Suffixes of files that can be written."""
 
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+"""Suffixes of files that Pillow reads with the package pillow-heif."""
+
+HAS_HEIF = find_spec("pillow_heif") is not None
+
 READ_SUFFIXES = (
     *SUFFIXES,
+    *(HEIF_SUFFIXES if HAS_HEIF else ()),
     *(".jfif", ".jpe", ".apng", ".avif", ".gif", ".tga", ".dib"),
     *(".jp2", ".j2k", ".jpf", ".jpx", ".pgm", ".pbm", ".pnm"),
 )
 """Suffixes of files that are read from a folder. A single file is read by its content."""
 
 UNREAD_SUFFIXES = (
-    *(".heic", ".heif", ".jxl", ".jpc", ".svg", ".psd", ".psb", ".xcf", ".kra", ".eps", ".ico"),
-    *(".dds", ".ktx", ".ktx2", ".hif", ".rgbe", ".sgi", ".pcx", ".dng", ".cr2", ".cr3", ".nef"),
+    *(() if HAS_HEIF else HEIF_SUFFIXES),
+    *(".jxl", ".jpc", ".svg", ".psd", ".psb", ".xcf", ".kra", ".eps", ".ico"),
+    *(".dds", ".ktx", ".ktx2", ".rgbe", ".sgi", ".pcx", ".dng", ".cr2", ".cr3", ".nef"),
     *(".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".fits", ".fit", ".dcm", ".npy", ".pam"),
 )
 """Suffixes of images that cannot be read; a warning names those in a folder."""
@@ -108,5 +116,18 @@ def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
     image.specmod().channelnames = ("R", "G", "B") if pixels.shape[2] == 3 else ("Y",)
     if suffix == ".exr":
         image.specmod().attribute("compression", "zip")
-    if not image.write(str(path)):
-        raise OSError(image.geterror().strip())
+    written = image.write(str(path))
+    reason = image.geterror().strip() or "the file is cut"
+    if written and suffix == ".png":  # OpenImageIO takes one that a full disk has cut for written
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - len(PNG_END)))
+            written = file.read() == PNG_END
+    if not written:
+        with path.open("ab") as file:  # nor does it tell why; the system does
+            file.write(bytes(1 << 16))
+            os.fsync(file.fileno())
+        raise OSError(reason)
+
+
+PNG_END = b"IEND\xaeB`\x82"
+"""Last bytes of a PNG file."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..storage.memory import check_content
 from .color import to_coded
-from .formats import ADVICE
+from .formats import ADVICE, HAS_HEIF, HEIF_SUFFIXES
 from .pixels import ImageError, peak_of, reason_of, scale
 from .strips import Pixels, by_strips
 
@@ -89,11 +89,14 @@ def image_errors(path: Path) -> Iterator[None]:
         raise ImageError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
     except Exception as error:  # on damaged files decoders raise many types
         reason = reason_of(error)
+        unknown = "not an image that Pillow knows; save it as PNG or JPEG"
+        if path.suffix.lower() in HEIF_SUFFIXES and not HAS_HEIF:
+            unknown = "needs pillow-heif; type: pip install pillow-heif"
         messages = {
             FileNotFoundError: "no such file; check the path",
             IsADirectoryError: "is a folder; give an image file in it",
             PermissionError: "permission denied; check its permissions",
-            UnidentifiedImageError: "not an image that Pillow knows; save it as PNG or JPEG",
+            UnidentifiedImageError: unknown,
             ImportError: ADVICE,
         }
         damaged = f"damaged or unsupported ({reason}); export it again"

@@ -123,7 +123,15 @@ def read_image(image: object, keep_grey: bool = False, encoding: str | None = No
 
 
 def pixels_of(image: object) -> Any:
-    """Return a `PIL.Image.Image` as grey or RGB pixels over white; anything else unchanged."""
+    """Return a `PIL.Image.Image` as grey or RGB pixels over white; anything else unchanged.
+
+    Masked values are refused, because NumPy would take what is below the mask.
+    """
+    if np.ma.is_masked(image):
+        raise ImageError(
+            f"image: {np.ma.count_masked(image)} values are masked; fill them, as in "
+            "image.filled(0), and give pixels that do not count the weight 0"
+        )
     if not is_picture(image):
         return image
     try:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 
+from .formats import HAS_HEIF
 from .header import ORIENTATION, TRANSPOSED, Header, frames_note, profile_note
 from .pixels import ImageError
 from .strips import Pixels
@@ -54,6 +55,10 @@ def open_picture(path: Path) -> Iterator[Image]:
     Image.init()
     with path.open("rb") as file:
         prefix = file.read(16)
+        if HAS_HEIF and prefix[4:8] == b"ftyp":
+            from pillow_heif import register_heif_opener
+
+            register_heif_opener()
         for name in Image.ID:
             factory, accepts = Image.OPEN[name]
             try:
@@ -81,7 +86,7 @@ def picture_header(path: Path) -> Header:
             notes += _png_notes(chunks)
         else:
             orientation = image.getexif().get(ORIENTATION, 1)
-            notes += _depth_notes(path, image.format)
+            notes += _depth_notes(path, image)
         notes += frames_note(getattr(image, "n_frames", 1))
         width, height = image.size[::-1] if orientation in TRANSPOSED else image.size
     needed = TRANSPARENT_BYTES[channels] if transparent else OPAQUE_BYTES[channels]
@@ -199,14 +204,18 @@ _NCLX = re.compile(rb"colrnclx(..)(..)", re.S)
 _SIZ = re.compile(rb"\xff\x4f\xff\x51.{38}(.)", re.S)
 
 
-def _depth_notes(path: Path, kind: str | None) -> tuple[str, ...]:
-    """Return warnings about properties of AVIF and JPEG 2000 files that Pillow ignores."""
-    if kind not in ("AVIF", "JPEG2000"):
+def _depth_notes(path: Path, image: Image) -> tuple[str, ...]:
+    """Return warnings about properties of AVIF, HEIF and JPEG 2000 files that Pillow ignores."""
+    kind, notes = image.format, tuple[str, ...]()
+    if kind not in ("AVIF", "HEIF", "JPEG2000"):
         return ()
     with path.open("rb") as file:
         start = file.read(1 << 14)
-    notes: tuple[str, ...] = ()
-    if kind == "AVIF":
+    if kind == "HEIF":
+        bits, color = image.info.get("bit_depth", 8), image.info.get("nclx_profile") or {}
+        names = ("color_primaries", "transfer_characteristics")
+        notes = video_note(*(color.get(name, 1) for name in names))
+    elif kind == "AVIF":
         bits = max((match[1][0] for match in _PIXI.finditer(start)), default=8)
         if match := _NCLX.search(start):
             notes = video_note(*(int.from_bytes(code, "big") for code in match.groups()))

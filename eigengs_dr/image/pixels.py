@@ -94,7 +94,7 @@ def encoding_of(image: object, encoding: str | None = None) -> str | None:
     if is_tensor and tuple(getattr(image, "shape", ()))[2:] == (3,):
         warn(
             "the encoding of a Dr.Jit tensor is not known; pass encoding='linear' for light, e.g. "
-            "from mitsuba.render, or encoding='srgb'"
+            "from mitsuba.render, or encoding='srgb'; eigengs_dr.picture_of needs none"
         )
     return None
 
@@ -137,12 +137,16 @@ def to_floats(
     try:
         array = np.asarray(image)
     except ValueError:  # rows of unequal length
-        raise ImageError(f"{name}: not an array; expected shape (H, W, 3)") from None
+        raise ImageError(
+            f"{name}: not an array; expected shape (H, W, 3); fit_many takes several images"
+        ) from None
     if array.ndim == 2:
         array = array[..., None]
     if array.ndim != 3 or array.shape[2] not in known:
         hints = {2: "fit two channels as space='data'", 4: "drop alpha, as in image[..., :3]"}
         hint = hints.get(array.shape[-1] if array.ndim == 3 else 0, "pass one grey or RGB image")
+        if array.ndim == 4 or array.dtype.kind in "UO":  # arrays or files
+            hint = "fit_many takes several images"
         raise ImageError(f"{name}: shape {array.shape}, expected (H, W) or (H, W, 3); {hint}")
     if array.size == 0:
         raise ImageError(f"{name}: shape {array.shape} has no pixels; check how it was cropped")
@@ -193,6 +197,8 @@ def check_weight(weight: ArrayLike | None) -> Singles | None:
     """
     if weight is None:
         return None
+    if np.iscomplexobj(weight) or np.ma.is_masked(weight):
+        raise ValueError("weight: factors of the errors are complex or masked; pass real numbers")
     factors = np.asarray(weight, np.float32)
     if factors.ndim not in (2, 3) or not factors.size:
         raise ValueError(f"weight has shape {factors.shape}; expected (H, W) or (H, W, C)")

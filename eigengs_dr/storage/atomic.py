@@ -131,6 +131,15 @@ def refuse_url(path: str | os.PathLike[str]) -> None:
         raise OSError(f"{path}: results cannot be written to URLs; write to a folder and copy it")
 
 
+def refuse_link(path: Path) -> None:
+    """Raise OSError if a path that no user names is there, and neither a plain file nor a folder.
+
+    A folder from elsewhere may hold a link of the name of a file that a run writes.
+    """
+    if os.path.lexists(path) and (path.is_symlink() or not (path.is_file() or path.is_dir())):
+        raise OSError(f"{path}: is a link or a device, which is not followed; move it away")
+
+
 def _target(path: str | os.PathLike[str]) -> Path:
     """Follow links to a target; reject one that must not be replaced, such as /dev/null."""
     refuse_url(path)
@@ -156,8 +165,8 @@ def _temporary(target: Path, output: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _delete(path: Path) -> None:
-    """Delete a file or a folder, if it exists and can be deleted."""
-    if path.is_dir():
+    """Delete a file, a link or a folder, if it exists and can be deleted."""
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         with suppress(OSError):

@@ -14,7 +14,7 @@ import numpy as np
 from ..backend.ending import undone_at_end
 from ..backend.types import Arrays
 from . import npz
-from .atomic import atomic_folder, remove_folder, remove_stale
+from .atomic import atomic_folder, refuse_link, remove_folder, remove_stale
 from .locks import lock_output
 from .settings import Settings, difference, to_json
 
@@ -52,7 +52,7 @@ def open_checkpoint(
     ValueError
         If the folder belongs to a run with other settings, or holds other files.
     OSError
-        If another run writes the output, or the folder cannot be created.
+        If another run writes the output, the folder cannot be created, or it is or holds a link.
     """
     folder = Path(f"{os.fspath(output)}.checkpoint")
     with lock_output(output):
@@ -75,9 +75,13 @@ def open_checkpoint(
 
 def _resumed(folder: Path, settings: Settings) -> Checkpoint | None:
     """Return the checkpoint in a folder; delete a folder that holds none."""
+    refuse_link(folder)
     if not folder.exists():
         return None
     remove_stale(folder)
+    if folder.is_dir():
+        for path in folder.iterdir():
+            refuse_link(path)
     try:
         head = json.loads((folder / HEAD).read_text(encoding="utf-8"))
         stored, files = dict(head["settings"]), [str(name) for name in head["files"]]

@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 import platform
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -18,6 +19,12 @@ PREFIX = ".eigengs_dr-"
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 """Errors of file systems without locks."""
+
+HOLDER, LENGTH = b"process ", 200
+"""Start and number of bytes of what a lock file says of its run, after one byte."""
+
+NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+"""Flags of opening, where there are such: no link is followed, and no pipe waited for."""
 
 WAIT, POLL = 0.3, 0.02
 """Seconds to wait for a lock, because another run may be about to end, and between attempts."""
@@ -70,21 +77,17 @@ def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tup
 
     deadline = time.monotonic() + wait
     while True:
-        try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        except OSError as error:
-            reason = f"cannot create a file in {path.parent} ({error.strerror})"
-            raise OSError(f"{os.fspath(output)}: {reason}; choose another path") from error
+        descriptor, holder = _open(path, output)
         try:
             locked = lock_descriptor(descriptor, blocking=False)
             # The previous run may have deleted the file between the two calls.
             if locked and _is_file(path, descriptor):
-                os.ftruncate(descriptor, 0)
-                # Windows locks the first byte against readers.
-                os.write(descriptor, f"\0process {os.getpid()} on {platform.node()}".encode())
+                text = HOLDER + f"{os.getpid()} on {platform.node()}".encode()
+                os.lseek(descriptor, 0, os.SEEK_SET)
+                # Windows locks the first byte against readers. The length is that of what a killed
+                # run left, so that nobody reads a part.
+                os.write(descriptor, b"\0" + text[:LENGTH].ljust(LENGTH))
                 return descriptor, True
-            os.lseek(descriptor, 1, os.SEEK_SET)
-            holder = "" if locked else os.read(descriptor, 200).decode(errors="replace")
         except OSError as error:
             if error.errno in NO_LOCKS:
                 return descriptor, False
@@ -99,6 +102,35 @@ def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tup
                     f"wait for its end, or use another {kind}"
                 )
             time.sleep(POLL)
+
+
+def _open(path: Path, output: str | os.PathLike[str]) -> tuple[int, str]:
+    """Open a lock file, which need not exist, and return what it says of its run.
+
+    Anything else of this name, such as a link in an archive from elsewhere, is left as it is.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | NO_FOLLOW, 0o666)
+    except OSError as error:
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            raise _not_a_lock(path, output) from error
+        reason = f"cannot create a file in {path.parent} ({error.strerror})"
+        raise OSError(f"{os.fspath(output)}: {reason}; choose another path") from error
+    status, text = os.fstat(descriptor), b""
+    is_plain = stat.S_ISREG(status.st_mode) and status.st_nlink <= 1 and not path.is_symlink()
+    if is_plain and status.st_size:
+        os.lseek(descriptor, 1, os.SEEK_SET)
+        text = os.read(descriptor, LENGTH)
+    if not is_plain or (status.st_size and not text.startswith(HOLDER)):
+        os.close(descriptor)
+        raise _not_a_lock(path, output)
+    return descriptor, text.decode(errors="replace").strip()
+
+
+def _not_a_lock(path: Path, output: str | os.PathLike[str]) -> OSError:
+    return OSError(
+        f"{os.fspath(output)}: {path} is a link, or not a lock of eigengs-dr; move it away"
+    )
 
 
 def _is_file(path: Path, descriptor: int) -> bool:

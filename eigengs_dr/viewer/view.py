@@ -23,6 +23,7 @@ from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
 from ..image.color import UNBOUNDED, YCBCR_TO_RGB, decode, rendered_as
+from ..image.pixels import check_encoding
 from ..storage.atomic import atomic_write
 from .pictures import check_aspect, displayed, photo_uri
 
@@ -129,6 +130,7 @@ def view(
         raise TypeError(
             f"{type(source).__name__} cannot be shown; expected Gaussians, Fit or EigenGS"
         )
+    check_encoding(encoding)
     model = source if isinstance(source, EigenGS) else None
     gaussians = one_image(set_of(source)) if model is None else model.gaussians
     pixels = None if image is None else displayed(image, gaussians.space, encoding)

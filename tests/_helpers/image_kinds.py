@@ -179,6 +179,13 @@ def write_hdr(path, order=None):
     return shown
 
 
+def write_primaries(path, primaries):
+    shown = write_hdr(path)
+    head, gap, rows = path.read_bytes().partition(b"\n\n")
+    path.write_bytes(head + b"\nPRIMARIES= " + primaries + gap + rows)
+    return shown
+
+
 def write_xyze(path):
     write_hdr(path)
     path.write_bytes(path.read_bytes().replace(b"rle_rgbe", b"rle_xyze"))
@@ -371,6 +378,10 @@ def other_kinds():
             partial(write_hdr, order=(f"{order[:2]} {H} {order[2:]} {W}".encode(), turn)),
         )
     yield "Radiance HDR", "XYZ", ".hdr", write_xyze
+    own = b"0.640 0.330 0.290 0.600 0.150 0.060 0.3333 0.3333"
+    wide = b".68 .32 .265 .69 1.5e-1 .06 .3127 .329"  # P3
+    for what, primaries in (("primaries of Radiance", own), ("other primaries", wide)):
+        yield "Radiance HDR", what, ".hdr", partial(write_primaries, primaries=primaries)
     yield "EXR", "RGB", ".exr", write_exr
     yield "EXR", "RGBA", ".exr", partial(write_exr, names=("R", "G", "B", "A"))
     yield "EXR", "other channels", ".exr", refused(write_exr, names=("X", "Y", "Z"))

@@ -69,9 +69,12 @@ MISTAKES = {
     "few": (["--gaussians", 0], ["gaussians"]),
     "many": (["--gaussians", 1025], ["photo.png: gaussians is 1025"]),
     "init": (["--init", "nowhere"], ["init"]),
-    "both": (["--target-psnr", 30, "--gaussians", 9], ["exclude each other"]),
-    "space alone": (["--target-space", "ycbcr"], ["belong to target_psnr"]),
-    "most alone": (["--max-gaussians", 50], ["belong to target_psnr"]),
+    "both": (
+        ["--target-psnr", 30, "--gaussians", 9],
+        ["--gaussians and --target-psnr exclude each other"],
+    ),
+    "space alone": (["--target-space", "ycbcr"], ["need --target-psnr"]),
+    "most alone": (["--max-gaussians", 50], ["need --target-psnr"]),
     "levels": (["--gaussians", 64, "--levels", 9], ["photo.png: levels is 9"]),
     "levels, init": (["--levels", 2, "--init", "grid"], ["levels"]),
     "levels, target": (["--levels", 2, "--target-psnr", 30], ["levels"]),
@@ -89,6 +92,7 @@ MISTAKES = {
     "no folder, preview": (["--preview", "gone/p.png"], ["gone"]),
     "a folder": (["--report", "."], ["is a folder"]),
     "suffix": (["-o", "x.png"], ["x.png", ".npz"]),
+    "packed": (["-o", "x.egs"], ["must end in .npz; 'eigengs-dr pack' writes .egs files"]),
     "suffix of a picture": (["--preview", "p.txt"], [".png"]),
     "twice": (["--report", "existing.npz"], ["existing.npz", "is written"]),
     "the image": (["--preview", "photo.png"], ["photo.png", "is read"]),
@@ -222,7 +226,7 @@ def test_fit_from_an_eigenbasis(trained, photo, tmp_path):
     for options, words in (
         (["--gaussians", 50], ["50", "60"]),
         (["--space", "rgb"], ["'rgb'", "'ycbcr'"]),
-        (["--init", "grid"], ["start"]),
+        (["--init", "grid"], ["--init and --basis"]),
         (["--basis", tmp_path / "x.npz"], ["eigengs_dr.gaussians"]),
     ):
         assert_refused(run(*command, "--overwrite", *options), *words)

@@ -29,17 +29,23 @@ def test_fit_by_blocks(photo, tmp_path):
     expected = {"blocks": 4, "block": 64, "gaussians": 700, "stopped": "iterations", "width": 128}
     assert {key: figures[key] for key in expected} == expected
     assert figures["psnr_ycbcr"] > figures["psnr_rgb"] > 20
+    shown = json.loads(succeeded(run("info", output, "--json")).stdout)
+    assert shown["psnr_rgb"] == pytest.approx(figures["psnr_rgb"], abs=0.01)
+    assert (shown["iterations"], shown["source"]) == (5, "photo.tif")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photo.tif", "x.json", "x.npz"]
 
 
-def test_blocks_are_chosen_where_memory_says_so(photo, tmp_path, monkeypatch):
+def test_the_number_of_gaussians_does_not_depend_on_memory(photo, tmp_path, monkeypatch):
+    """Too little memory is an error that names blocks, where there are such."""
+    command = ["fit", photo, "-o", tmp_path / "x.npz", "--iterations", 2]
+    assert "5,000 Gaussians" in succeeded(run(*command)).stdout
     monkeypatch.setattr(memory, "usable_memory", lambda: 200_000_000)
-    result = succeeded(run("fit", photo, "-o", tmp_path / "x.npz", "--iterations", 2))
-    assert "takes too much memory; it is fitted by blocks" in result.stderr
-    assert f"{128 * 128 // 20} Gaussians" in result.stdout
-    # Levels of detail have no blocks: such a fit is tried as a whole.
-    levels = run("fit", photo, "-o", tmp_path / "y.npz", "--levels", 2, *FEW)
-    assert "blocks" not in succeeded(levels).stderr
+    assert "5,000 Gaussians" in succeeded(run(*command)).stdout
+    monkeypatch.setattr(memory, "usable_memory", lambda: 100_000_000)
+    assert_refused(run(*command), "may use 0.1 GB; fit it with --blocks 1024, scale the image down")
+    levels = run(*command, "--levels", 2, *FEW)
+    assert_refused(levels, "may use 0.1 GB; scale the image down")
+    assert "819 Gaussians" in succeeded(run(*command, "--blocks", 64)).stdout
 
 
 # --- Memory, before the image is read ---

@@ -32,6 +32,17 @@ def test_images_of_any_size_into_folders(photo, photos, tmp_path):
     assert [row["width"] for row in report["images"]] == [32, 32, 32, 20] and report["versions"]
 
 
+def test_images_in_subfolders(photos, tmp_path):
+    (photos / "1999").mkdir()
+    (photos / "02.png").rename(photos / "1999" / "02.png")
+    command = ["fit", photos, "-o", tmp_path / "fits", *QUICK]
+    assert "left out, such as 1999" in succeeded(run(*command)).stderr
+    told = succeeded(run(*command, "--recursive"))
+    assert told.stderr == "" and (tmp_path / "fits" / "02.npz").exists()
+    single = run("fit", photos / "00.png", "--recursive", *QUICK)
+    assert_refused(single, "--recursive takes a folder of images")
+
+
 def test_a_folder_of_one_image(photo, tmp_path):
     folder, report = tmp_path / "photos", tmp_path / "r.json"
     folder.mkdir()
@@ -55,6 +66,24 @@ def test_the_same_command_continues(photos, tmp_path):
     result = succeeded(run(*command, "--overwrite", "--gaussians", 9))
     assert "3 images fitted in" in result.stdout
     assert len(eg.Gaussians.load(fits / "00.npz")) == 9
+
+
+def test_pictures_of_results_that_exist(photos, tmp_path):
+    """A killed run may have written results without their pictures."""
+    command = ["fit", photos, "-o", tmp_path / "fits", *QUICK]
+    pictures = ["--preview", tmp_path / "new"]
+    succeeded(run(*command, "--preview", tmp_path / "old"))
+    eg.save_image(photos / "02.png", smooth_pixels(20, 30))  # another image of the same name
+    told = succeeded(run(*command, *pictures))
+    assert "02.png is not drawn: " in told.stderr and "is of an image of 32x24" in told.stderr
+    for name in ("00.png", "01.png"):
+        a, b = (eg.load_image(tmp_path / folder / name) for folder in ("old", "new"))
+        assert abs(a - b).max() <= 1.01 / 255
+    (tmp_path / "new" / "00.png").write_bytes(b"kept")
+    (tmp_path / "new" / "01.png").unlink()
+    succeeded(run(*command, *pictures))
+    assert (tmp_path / "new" / "00.png").read_bytes() == b"kept"
+    assert len(list((tmp_path / "new").iterdir())) == 2
 
 
 def test_a_bad_image_does_not_end_a_folder(photos, trained, tmp_path):

@@ -39,6 +39,33 @@ def test_info_of_a_fit(set_file):
     assert "gaussians   40" in text and "photo.png" in text and "bpp" in text
 
 
+def test_sets_in_a_folder(set_file, trained, tmp_path):
+    """All are shown, rendered and packed; one that cannot be is an error, with exit code 2."""
+    fits = tmp_path / "fits"
+    fits.mkdir()
+    empty = run("info", fits)
+    assert_refused(empty, "fits: holds no files ending in .npz or .egs")
+    for name in ("a", "b"):
+        (fits / f"{name}.npz").write_bytes(set_file[1].read_bytes())
+    (fits / "manifest.jsonl").write_text("")
+    assert [facts["gaussians"] for facts in facts_of(fits)] == [40, 40]
+    assert said("info", fits, "--preview", tmp_path / "seen").count("kind ") == 2
+    said("render", fits, "-o", tmp_path / "drawn", "--size", 16)
+    assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.png", "b.png"]
+    assert len(list((tmp_path / "seen").iterdir())) == 2
+    (fits / "b.npz").write_bytes(b"no set")
+    report = tmp_path / "r.json"
+    packed = run("pack", fits, "-o", tmp_path / "packed", "--report", report)
+    assert packed.exit_code == 2 and "error: " in packed.stderr and "b.npz: not a" in packed.stderr
+    [figures] = json.loads(report.read_text())["sets"]
+    assert figures["bytes"] == (tmp_path / "packed" / "a.egs").stat().st_size
+    shown = run("info", fits)
+    assert shown.exit_code == 2 and shown.stdout.count("kind ") == 1
+    image = run("pack", fits, "-o", tmp_path / "x", "--image", tmp_path / "photo.png")
+    assert_refused(image, "--image and --map belong to one set")
+    assert_refused(run("render", fits, "-o", tmp_path / "x.png"), "need a folder")
+
+
 def test_info_of_textures(set_file, trained, tmp_path):
     """At least the arrays of the file; with a prefilter more."""
     pytest.importorskip("mitsuba", reason="textures need mitsuba")
@@ -126,7 +153,7 @@ def test_info_of_the_basis_that_ships(tmp_path):
     assert found["file"] == str(SHIPPED["natural"])
     assert found["components"] == found["truncation"][-1]["components"] == [230, 60, 60]
     assert_refused(run("info", tmp_path / "natural"), tmp_path / "natural", "No such file")
-    assert_refused(run("info", tmp_path), tmp_path, "Is a directory")
+    assert_refused(run("info", tmp_path), tmp_path, "holds no files ending in .npz or .egs")
 
 
 def test_info_of_something_else(trained, tmp_path):

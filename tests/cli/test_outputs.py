@@ -32,6 +32,22 @@ def test_what_killed_runs_left_beside_a_single_output_goes(photo, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photo.png", "x.npz"]
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".png"])
+def test_names_that_the_command_chooses_are_no_links(photo, tmp_path, suffix):
+    """Names that the user gives may be; so may sets, which are looked at before."""
+    link, precious = tmp_path / f"a{suffix}", tmp_path / "thesis"
+    link.symlink_to(precious)
+    with pytest.raises(ValueError, match=rf"a\{suffix}: is a link, which is not followed"):
+        name_outputs(["a.jpg"], tmp_path, [suffix])
+    assert name_outputs(["a.jpg"], link, [suffix]) == [link]
+    precious.write_text("thesis")
+    if suffix == ".npz":
+        assert name_outputs(["a.jpg"], tmp_path, [suffix]) == [link]
+        told = run("fit", photo.rename(tmp_path / "a.png"), "-o", tmp_path, *QUICK)
+        assert told.exit_code == 2 and "is not a set of Gaussians" in told.stderr
+        assert precious.read_text() == "thesis"
+
+
 @pytest.mark.parametrize(
     ("text", "shown"),
     [

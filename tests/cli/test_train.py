@@ -35,6 +35,14 @@ def test_train_report(trained):
     assert report["psnr_init"] == pytest.approx(report["psnr_pca"], abs=1.5)
 
 
+def test_a_note_is_said_once(tmp_path):
+    """Although the folder is listed twice."""
+    random_fields(tmp_path / "photos", 3)
+    random_fields(tmp_path / "photos" / "more", 1)
+    told = succeeded(run("train", tmp_path / "photos", "-o", tmp_path / "m.npz", *SMALL))
+    assert told.stderr.count("images in its subfolders are left out") == 1
+
+
 def test_target_psnr(tmp_path):
     photos = random_fields(tmp_path / "photos", 30)
     report, model = tmp_path / "r.json", tmp_path / "m.npz"

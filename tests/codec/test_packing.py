@@ -53,6 +53,15 @@ def test_files_are_small_and_equal_for_equal_arguments(receipts, path):
     assert file.stat().st_size < saved.stat().st_size / 4
 
 
+def test_a_caller_whose_numpy_raises(path):
+    flat = eg.fit(np.full((32, 32, 3), 0.5, np.float32), 10, iterations=0)
+    eg.pack(flat, path)
+    before = path.read_bytes()
+    with np.errstate(all="raise"):
+        eg.pack(flat, path)
+    assert path.read_bytes() == before
+
+
 def test_without_an_image_the_rendering_is_kept(path):
     gaussians, _ = small_fit()
     receipt = eg.pack(gaussians, path)

@@ -43,6 +43,17 @@ def test_skipped_images_keep_their_figures(photos, output):
     assert (output / NAME).read_bytes() == before
 
 
+def test_a_result_that_is_cut_is_not_skipped(photos, output):
+    eg.fit_many(photos, output, **QUICK)
+    content = (output / "01.npz").read_bytes()
+    (output / "01.npz").write_bytes(content[: len(content) // 2])
+    rows = eg.fit_many(photos, output, **QUICK)
+    assert [row.status for row in rows] == ["skipped", "failed", "skipped"]
+    assert "01.npz: exists and is not a set of Gaussians; move it" in rows[1].error
+    (output / "01.npz").unlink()
+    assert [row.status for row in eg.fit_many(photos, output, **QUICK)].count("done") == 1
+
+
 def test_a_result_stays_until_it_is_replaced(photos, output):
     """A run that should replace all results and ends early leaves whole files of both runs."""
     eg.fit_many(photos, output, **QUICK)
@@ -156,6 +167,20 @@ def test_a_run_that_was_killed_holds_no_lock(photos, output):
     assert [row.status for row in eg.fit_many(photos, output, **QUICK)] == ["done"] * 3
 
 
+@pytest.mark.parametrize("name", [NAME, "01.npz"])
+def test_links_in_a_folder_from_elsewhere(photos, output, name):
+    """Neither the manifest nor a result is written where a link leads."""
+    output.mkdir()
+    (output / name).symlink_to(output.parent / "new")
+    if name == NAME:
+        with pytest.raises(OSError, match=r"manifest\.jsonl: is a link"):
+            eg.fit_many(photos, output, **QUICK)
+    else:
+        rows = eg.fit_many(photos, output, **QUICK)
+        assert [row.status for row in rows].count("failed") == 1
+    assert not (output.parent / "new").exists()
+
+
 # --- Images by folder, glob and URL ---
 
 
@@ -173,6 +198,10 @@ def bucket(photos):
 def test_globs(photos, tmp_path):
     (tmp_path / "photos" / "deep").mkdir()
     (photos / "02.png").rename(photos / "deep" / "03.png")
+    rows = eg.fit_many(photos, recursive=True, **QUICK)
+    assert [row.name for row in rows] == ["00", "01", "03"]
+    with pytest.raises(ValueError, match="recursive is for a folder; the images are given one"):
+        eg.fit_many([photos / "00.png"], recursive=True, **QUICK)
     names = [source.name for source in list_sources(str(tmp_path / "**" / "*.png"))]
     assert names == ["00", "01", "03"]
     with pytest.raises(ValueError, match=r"\*\.jpg: no file matches; check the pattern"):

@@ -175,6 +175,12 @@ def test_few_or_equal_images(backend, kind, split):
     assert fidelity(rendered(model, images[:1], "projected"), images[:1]) > 28
 
 
+def test_coefficients_are_finite():
+    model = small_model("llvm")
+    with pytest.raises(ValueError, match="coefficients are not all finite"):
+        model.reconstruct([[np.nan]] * 3)
+
+
 def test_fit_refuses():
     with pytest.raises(ValueError, match="gaussians is 1025; a basis of 32x32 takes 1 to 1024"):
         eg.EigenGS.fit(small_basis(), 1025)

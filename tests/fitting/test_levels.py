@@ -57,6 +57,8 @@ def test_bad_levels_are_refused(count, levels, message):
         ({"gaussians": [5, 5, 9]}, "levels 5, 5, 9: numbers of Gaussians must rise"),
         ({"gaussians": [0, 9]}, "must rise, from 1 or more"),
         ({"gaussians": []}, "must rise, from 1 or more"),
+        ({"gaussians": [True, 9]}, "levels True, 9: numbers of Gaussians must be whole"),
+        ({"gaussians": b"5"}, "gaussians is b'5'; it must be a whole number"),
         ({"gaussians": np.array([4.5, 9])}, "levels 4.5, 9.0: numbers of Gaussians must be whole"),
         ({"gaussians": [9, 48 * 48 + 1]}, "gaussians is 2305; an image of 48x48 takes 1 to 2304"),
         ({"target_psnr": 30}, "gaussians and target_psnr exclude each other"),

@@ -96,6 +96,10 @@ def test_parts_are_checked(changed, words):
         replace(eg.DEFAULT, **changed)
 
 
+def test_methods_are_keys():
+    assert {eg.DEFAULT: 1}[replace(eg.DEFAULT, rates=dict(eg.DEFAULT.rates))] == 1
+
+
 @pytest.mark.parametrize("share", [-0.1, 1.1, np.nan])
 def test_shares_are_checked(share):
     with pytest.raises(ValueError, match=r"Relocate: share is .*; it must be from 0 to 1"):

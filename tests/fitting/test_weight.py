@@ -131,6 +131,8 @@ def test_data_without_weight_do_not_set_the_range():
         (-np.eye(SIDE), "finite and at least 0"),
         (np.full((SIDE, SIDE), np.nan), "finite and at least 0"),
         (np.full((SIDE, SIDE), np.inf), "finite and at least 0"),
+        (np.eye(SIDE) * 1j, "are complex or masked; pass real numbers"),
+        (np.ma.masked_less(np.eye(SIDE), 1), "are complex or masked; pass real numbers"),
         (np.ones(SIDE), r"weight has shape \(48,\); expected \(H, W\)"),
         (1.0, r"weight has shape \(\); expected"),
         (np.ones((0, 4)), "weight has shape"),

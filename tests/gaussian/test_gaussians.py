@@ -196,6 +196,11 @@ def test_other_precisions_are_refused(dtype):
         Gaussians.from_arrays([[4, 5]], [[1, 0, 1]], [[1]], size=(8, 8), dtype=dtype)
 
 
+def test_complex_numbers_are_refused():
+    with pytest.raises(ValueError, match="Gaussians: color is complex; pass real numbers"):
+        Gaussians.from_arrays([[4, 5]], [[1, 0, 1]], [[1j]], size=(8, 8), space="data")
+
+
 # --- Several sets as one --------------------------------------------------------------------------
 
 

@@ -18,9 +18,10 @@ import eigengs_dr as eg
 from _helpers.command import run, succeeded
 from _helpers.errors import one_line
 from _helpers.files import png, tiff
+from _helpers.process import python_path, run_python
 from eigengs_dr.blocks.windows import image_size, open_source
 from eigengs_dr.image.folder import image_files
-from eigengs_dr.image.formats import READ_SUFFIXES
+from eigengs_dr.image.formats import HAS_HEIF, HEIF_SUFFIXES, READ_SUFFIXES
 from eigengs_dr.image.io import ImageError, check_image, load_image, save_image
 from eigengs_dr.storage.memory import SETTING
 
@@ -118,10 +119,49 @@ def test_a_folder_takes_what_a_file_may_be(suffix, tmp_path):
 
 
 def test_a_folder_names_images_that_it_leaves_out(tmp_path):
-    for name in ("a.png", "b.heic", "c.JXL", ".d.psd", "notes.txt"):
+    for name in ("a.png", "b.dng", "c.JXL", ".d.psd", "notes.txt"):
         (tmp_path / name).write_bytes(b"")
-    with pytest.warns(UserWarning, match=r"2 files of .* left out: b\.heic, c\.JXL"):
+    with pytest.warns(UserWarning, match=r"2 files of .* left out: b\.dng, c\.JXL"):
         assert len(image_files(tmp_path)) == 1
+
+
+HEIF = """
+from PIL import Image, PngImagePlugin
+
+class Heif(PngImagePlugin.PngImageFile):
+    format = "HEIF"
+
+    def _open(self):
+        self.fp.read(16)  # "....ftypheic", then a PNG
+        super()._open()
+        self.info["bit_depth"] = 10
+
+def register_heif_opener():
+    Image.register_open("HEIF", Heif, lambda prefix: prefix[4:12] == b"ftypheic")
+"""
+
+
+def test_heic_is_read_where_pillow_heif_is_installed(tmp_path):
+    (tmp_path / "pillow_heif.py").write_text(HEIF)
+    Image.fromarray(PIXELS).save(tmp_path / "a.png")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    content = b"\0\0\0\x1cftypheic\0\0\0\0" + (tmp_path / "a.png").read_bytes()
+    (photos / "a.HEIC").write_bytes(content)
+    words = ["fit", str(photos / "a.HEIC"), "-o", str(tmp_path / "x.npz"), "--gaussians", "4"]
+    code = f"""
+from eigengs_dr.image.folder import image_files
+print(image_files({str(photos)!r}))
+from eigengs_dr.cli.main import main
+main({[*words, "--iterations", "1"]!r})
+"""
+    path = os.pathsep.join([str(tmp_path), python_path()])
+    found = run_python(code, PYTHONPATH=path)
+    assert found.returncode == 0 and "a.HEIC" in found.stdout.splitlines()[0]
+    assert "a.HEIC: keeps 8 of its 10 bits" in found.stderr
+    if not HAS_HEIF:
+        with pytest.raises(ImageError, match=r"a.HEIC: needs pillow-heif; type: pip install"):
+            load_image(photos / "a.HEIC")
 
 
 def test_the_manual_names_the_suffixes_of_folders():
@@ -129,7 +169,7 @@ def test_the_manual_names_the_suffixes_of_folders():
     words = set(
         re.findall(r"[`\s](\.\w+)", page.read_text(encoding="utf-8").split("and name other")[0])
     )
-    assert words == set(READ_SUFFIXES)
+    assert words == set(READ_SUFFIXES) - set(HEIF_SUFFIXES)
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="shows no open files")

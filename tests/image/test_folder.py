@@ -15,6 +15,7 @@ from eigengs_dr.image.folder import (
     MAX_WAITING,
     MAX_WAITING_BYTES,
     image_files,
+    list_images,
     read_ahead,
     read_blocks,
 )
@@ -197,3 +198,18 @@ def test_image_files_are_sorted_and_only_images(tmp_path):
     (tmp_path / "folder.png").mkdir()
     assert image_files(tmp_path) == [tmp_path / name for name in ("a.png", "b.JPG", "c.tif")]
     assert image_files(str(tmp_path)) == image_files(tmp_path)
+
+
+def test_images_in_subfolders_are_taken_or_named(tmp_path):
+    for name in ("b.png", "a/1/c.jpg", "a/notes.txt", ".hidden/d.png", "z/.e/f.png", "z/g.PNG"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "loop").symlink_to(tmp_path)
+    with pytest.warns(UserWarning, match=r"left out, such as a.1.c\.jpg; .*recursive=True") as said:
+        assert image_files(tmp_path) == [tmp_path / "b.png"]
+    assert len(said) == 1
+    found = [tmp_path / name for name in ("a/1/c.jpg", "b.png", "z/g.PNG")]
+    assert image_files(tmp_path, recursive=True) == found
+    assert list_images(f"file://{tmp_path}", recursive=True)[0] == f"file://{found[0]}"
+    with pytest.raises(ImageError, match=r"recursive is for a folder; write \*\* into"):
+        list_images(f"{tmp_path}/*.png", recursive=True)

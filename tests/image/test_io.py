@@ -2,6 +2,7 @@
 
 import io
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -205,7 +206,11 @@ def test_check_image_keeps_rows_columns_and_channels():
         (np.float32(1), r"shape \(\), expected"),
         (np.zeros((4, 4, 2)), r"shape \(4, 4, 2\), expected"),
         (np.zeros((4, 4, 4)), r"drop alpha"),
-        (np.zeros((1, 4, 4, 3)), r"shape \(1, 4, 4, 3\), expected"),
+        (np.zeros((1, 4, 4, 3)), r"shape \(1, 4, 4, 3\), expected .*; fit_many takes several"),
+        (["a.png", "b.png"], r"shape \(2,\), expected .*; fit_many takes several images"),
+        ([Path("a.png")], "fit_many takes several images"),
+        ([np.zeros((2, 3)), np.zeros((4, 5))], "fit_many takes several images"),
+        (np.ma.masked_less(np.eye(4), 1), r"12 values are masked; fill them, .*\.filled\(0\)"),
         (np.zeros((0, 4, 3)), "no pixels"),
         (np.zeros((4, 0)), "no pixels"),
         (np.zeros((4, 4), np.int64), "pixels are int64"),
@@ -222,6 +227,14 @@ def test_check_image_keeps_rows_columns_and_channels():
 def test_check_image_refuses(image, complaint):
     with refused(ImageError, complaint):
         check_image(image)
+
+
+def test_masked_pixels_are_not_dropped_in_silence():
+    masked = np.ma.masked_less(np.eye(64, dtype=np.float32), 1)
+    for call in (eg.fit, lambda a: eg.psnr(a, a), lambda a: eg.ssim(a, a), eg.fit_large):
+        with refused(ImageError, r"4032 values are masked; fill them"):
+            call(masked)
+    np.testing.assert_array_equal(check_image(np.ma.array(np.eye(4))), check_image(np.eye(4)))
 
 
 def test_non_finite_pixels_are_counted_and_placed():
@@ -309,6 +322,24 @@ def test_a_failed_write_leaves_everything_as_it_was(tmp_path):
     one_line(error)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such limit")
+@pytest.mark.parametrize("suffix", [".exr", ".hdr", ".png", ".tif", ".pfm"])
+def test_a_full_disk_is_said(tmp_path, suffix):
+    """OpenImageIO does not tell why it fails, and takes a PNG file that is cut for written."""
+    import resource
+
+    pixels = np.random.default_rng(0).random((100, 100, 3), np.float32)
+    path, bits = tmp_path / f"a{suffix}", 16 if suffix in (".png", ".tif") else None
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (16384, before[1]))
+    try:
+        with pytest.raises(ImageError, match=r"cannot be written \(File too large\)"):
+            save_image(path, pixels, bits=bits)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
 
 
 def test_bad_pixels_touch_no_file(tmp_path):

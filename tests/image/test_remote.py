@@ -1,9 +1,14 @@
 """Files and URLs where images are taken, and fits where sets are."""
 
+import asyncio
 import http.server
 import threading
+import time
 import zipfile
+from contextlib import nullcontext
 from functools import partial
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -13,15 +18,32 @@ import eigengs_dr as eg
 from _helpers.command import assert_refused, run, succeeded
 from _helpers.errors import refused
 from _helpers.families import small_model
+from eigengs_dr.image import remote
 
 pytest.importorskip("fsspec")
 
 QUICK = {"gaussians": 60, "iterations": 10}
 
 
-class Quiet(http.server.SimpleHTTPRequestHandler):
+class Server(http.server.SimpleHTTPRequestHandler):
+    """Files, what leads elsewhere, and nothing at all; it notes what is asked for."""
+
+    asked: ClassVar[list] = []
+
     def log_message(self, *_):
         pass
+
+    def do_GET(self):
+        self.asked.append(self.path)
+        kind, _, rest = self.path[1:].partition("/")
+        if kind == "to":
+            self.send_response(302)
+            self.send_header("Location", rest)
+            self.end_headers()
+        elif kind == "silent":
+            time.sleep(2)
+        else:
+            super().do_GET()
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +63,7 @@ def served(photos):
     """The URL of the folder."""
     pytest.importorskip("aiohttp")
     with http.server.ThreadingHTTPServer(
-        ("127.0.0.1", 0), partial(Quiet, directory=photos)
+        ("127.0.0.1", 0), partial(Server, directory=photos)
     ) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
@@ -81,6 +103,53 @@ def test_a_url_of_http(served, tmp_path):
         eg.load_image(f"{served}/none.png")
     succeeded(run("fit", f"{served}/2.png", "-o", tmp_path / "a.npz", "--iterations", 5))
     assert eg.Gaussians.load(tmp_path / "a.npz").width == 32
+
+
+def test_a_url_is_asked_once(served, tmp_path):
+    Server.asked.clear()
+    eg.load_image(f"{served}/2.png")
+    succeeded(run("fit", f"{served}/1.png", "-o", tmp_path / "a.npz", "--iterations", 1))
+    eg.fit_many([f"{served}/3.png"], gaussians=20, iterations=1)
+    assert Server.asked == ["/2.png", "/1.png", "/3.png"]
+
+
+def test_a_silent_server_is_given_up(served, monkeypatch):
+    remote._web_options.cache_clear()
+    monkeypatch.setattr(remote, "SILENCE", 0.2)
+    started = time.monotonic()
+    with pytest.raises(OSError, match=r"silent/a.png: cannot be read \(.*[Tt]imeout"):
+        eg.load_image(f"{served}/silent/a.png")
+    assert time.monotonic() - started < 1.5
+    remote._web_options.cache_clear()
+
+
+def test_where_a_server_may_lead(served):
+    assert eg.load_image(f"{served}/to//2.png").shape == (32, 32, 3)
+    with pytest.raises(OSError, match=r"cannot be read .*ftp://, which is not followed"):
+        eg.load_image(f"{served}/to/ftp://127.0.0.1/a.png")
+
+
+@pytest.mark.parametrize(
+    ("here", "there", "kept"),
+    [
+        ("http://8.8.8.8/a", "/b", True),
+        ("http://8.8.8.8/a", "https://9.9.9.9/b", True),
+        ("http://10.0.0.1/a", "http://127.0.0.1/b", True),
+        ("https://8.8.8.8/a", "http://8.8.8.8/b", False),
+        ("http://8.8.8.8/a", "file:///etc/passwd", False),
+        ("http://8.8.8.8/a", "http://localhost:80/b", False),
+        ("http://8.8.8.8/a", "http://169.254.169.254/b", False),
+        ("http://8.8.8.8/a", "//[::1]/b", False),
+        ("http://8.8.8.8/a", "http://[::ffff:10.0.0.1]/b", False),
+    ],
+)
+def test_public_servers_lead_to_no_private_ones(here, there, kept):
+    """Nobody's program may be led to what only its own network may read."""
+    yarl = pytest.importorskip("yarl")
+    response = SimpleNamespace(headers={"Location": there})
+    redirection = SimpleNamespace(url=yarl.URL(here), response=response)
+    with nullcontext() if kept else pytest.raises(OSError, match="which is not followed"):
+        asyncio.run(remote._check_redirection(None, None, redirection))
 
 
 def test_a_url_is_read_up_to_a_limit(served, photos, monkeypatch):

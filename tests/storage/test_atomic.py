@@ -1,7 +1,9 @@
 """Files and folders that appear in one step, one writer for each, and what killed runs leave."""
 
 import errno
+import hashlib
 import os
+import secrets
 
 import pytest
 
@@ -154,3 +156,63 @@ def test_links_to_one_file_have_one_lock(target):
     link.symlink_to(target)
     with lock_output(link), pytest.raises(OSError, match=r"x\.txt: process"), lock_output(target):
         pass
+
+
+# --- Links, as in an archive from elsewhere ---
+
+
+def hashed(name):
+    return f".eigengs_dr-{hashlib.sha256(name.encode()).hexdigest()[:16]}.lock"
+
+
+def write_to(path):
+    with atomic_write(path) as temporary:
+        temporary.write_text("new")
+
+
+DOORS = {
+    ".lock": lambda folder: lock_folder(folder).__enter__(),
+    hashed("out.txt"): lambda folder: lock_output(folder / "out.txt").__enter__(),
+    ".eigengs_dr-0.txt.lock": lambda folder: write_to(folder / "out.txt"),
+    ".eigengs_dr-0.txt": lambda folder: write_to(folder / "out.txt"),
+    ".eigengs_dr-0": lambda folder: atomic_folder(folder / "out").__enter__(),
+}
+"""What is opened, by the name that somebody else has given to a link."""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows lets few users make links")
+@pytest.mark.parametrize("kind", ["link", "second name", "link to nothing", "own file", "pipe"])
+@pytest.mark.parametrize("name", DOORS)
+def test_no_link_is_followed(tmp_path, monkeypatch, name, kind):
+    """Nor is a file emptied that is not a lock; nobody waits for a pipe."""
+    monkeypatch.setattr(secrets, "token_hex", lambda _: "0")
+    precious, folder = tmp_path / "thesis.txt", tmp_path / "from elsewhere"
+    folder.mkdir()
+    precious.write_text("thesis")
+    if kind == "second name":
+        os.link(precious, folder / name)
+    elif kind == "own file":
+        (folder / name).write_text("thesis")
+    elif kind == "pipe":
+        os.mkfifo(folder / name)
+    else:
+        (folder / name).symlink_to(precious if kind == "link" else tmp_path / "new")
+    with pytest.raises(OSError, match=r"is not a lock|is a link|File exists"):
+        DOORS[name](folder)
+    remove_stale(folder)
+    assert precious.read_text() == "thesis" and sorted(os.listdir(tmp_path)) == [
+        folder.name,
+        precious.name,
+    ]
+    if kind == "own file" and name.endswith(".lock"):
+        assert (folder / name).read_text() == "thesis"
+
+
+def test_stale_links_go_and_what_they_name_stays(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.txt").write_text("a")
+    for name in ("photos", "photos/a.txt"):
+        (tmp_path / f".eigengs_dr-{len(name)}").symlink_to(tmp_path / name)
+    remove_stale(tmp_path)
+    assert os.listdir(tmp_path) == ["photos"]
+    assert (tmp_path / "photos" / "a.txt").read_text() == "a"

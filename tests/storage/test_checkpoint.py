@@ -80,3 +80,14 @@ def test_two_runs_at_once(output):
         ):
             pass
         assert checkpoint.holds("part")
+
+
+@pytest.mark.parametrize("name", ["", "part.npz", HEAD])
+def test_links_in_a_folder_from_elsewhere(tmp_path, output, stopped, name):
+    """A run would write to what they name, or delete it."""
+    path, other = stopped / name, tmp_path / "other"
+    path.rename(other)
+    path.symlink_to(other)
+    with pytest.raises(OSError, match="is a link"), open_checkpoint(output, SETTINGS, []):
+        pass
+    assert path.is_symlink() and other.exists()

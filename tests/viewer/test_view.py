@@ -57,6 +57,7 @@ def test_a_page_is_one_file(tmp_path):
         ({"image": np.zeros((32, 32, 3), np.float32)}, "the photo has 32x32 pixels, the set 32x24"),
         ({"image": np.full((24, 32, 3), np.nan, np.float32)}, "not finite"),
         ({"image": np.zeros((24, 32, 3), np.float32), "encoding": "hdr"}, "encoding 'hdr'"),
+        ({"encoding": "hdr"}, "encoding 'hdr'"),
     ],
 )
 def test_refuses_bad_arguments(change, message):
