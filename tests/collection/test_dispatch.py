@@ -1,10 +1,13 @@
 """Chunks of images by an executor that ends them in any order and may lose them."""
 
+import errno
+
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, Here, files_of, folder_of_photos
+from eigengs_dr.collection import run
 
 
 @pytest.fixture
@@ -56,21 +59,22 @@ def test_images_of_a_lost_chunk_are_done_one_by_one(photos, tmp_path):
     assert len(chunk) > 1 and all([name] in executor.names for name in chunk)
 
 
-def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path):
+def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path, monkeypatch):
     """As a full disk of one worker, and of all."""
-    output = tmp_path / "fits"
-    output.mkdir()
-    (output / "03.npz").symlink_to(tmp_path / "gone" / "03.npz")
-    (output / "04.npz").symlink_to(tmp_path / "late" / "04.npz")
+    output, full, write = tmp_path / "fits", ["03.npz", "03.npz", "02.npz"], run.write
 
-    def mend(done, total, row):
-        (tmp_path / "late").mkdir(exist_ok=True)
+    def write_if_there_is_room(path, *content):
+        if path.name in full:
+            full.remove(path.name)
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write(path, *content)
 
+    monkeypatch.setattr(run, "write", write_if_there_is_room)
     executor = Here()
-    rows = eg.fit_many(photos, output, client=executor, progress=mend, **QUICK)
+    rows = eg.fit_many(photos, output, client=executor, **QUICK)
     assert [row.name for row in rows if row.status == "failed"] == ["03"]
-    assert f"{tmp_path / 'gone'} (No such file or directory)" in rows[3].error
-    assert executor.names.count(["03"]) == executor.names.count(["04"]) == 1
+    assert rows[3].error == f"{output / '03.npz'}: No space left on device"
+    assert executor.names.count(["03"]) == executor.names.count(["02"]) == 1
     assert len(rows) == 12 and not list(output.glob(".*"))
 
 
