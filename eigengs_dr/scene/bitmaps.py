@@ -149,6 +149,13 @@ def file_keys(props: Properties) -> list[str]:
     return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 
 
+def references(props: Properties) -> dict[str, int]:
+    """Return the indices of the nodes that a parsed node has in its slots."""
+    kind = mi.Properties.Type.ResolvedReference
+    slots = (slot for slot in props.keys() if props.type(slot) == kind)  # noqa: SIM118
+    return {slot: props[slot].index() for slot in slots}
+
+
 def uses_of(
     parsed: Parsed, key_of: Callable[[int, str], str | None]
 ) -> tuple[list[Use], list[tuple[str, str]]]:
@@ -169,9 +176,8 @@ def uses_of(
     nodes = parsed.state.nodes
     parents: dict[int, list[tuple[int, str]]] = {}
     for index, node in enumerate(nodes):
-        for slot in node.props.keys():  # noqa: SIM118  it is no mapping
-            if node.props.type(slot) == mi.Properties.Type.ResolvedReference:
-                parents.setdefault(node.props[slot].index(), []).append((index, slot))
+        for slot, child in references(node.props).items():
+            parents.setdefault(child, []).append((index, slot))
     uses, left = [], list[tuple[str, str]]()
     for index, node in enumerate(nodes):
         props = node.props

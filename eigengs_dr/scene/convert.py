@@ -38,6 +38,7 @@ from .bitmaps import (
     label,
     parse,
     read_pixels,
+    references,
     uses_of,
 )
 from .costs import Cost, costs_of, of_environment, of_texture
@@ -440,11 +441,16 @@ def _save_set(props: Properties, folder: Path, file: str) -> None:
 
 
 def _to_xml(parsed: Parsed) -> str:
-    """Write a parsed scene as XML.
+    """Write a parsed scene as XML, with the ids of all objects.
 
-    Mitsuba writes what a dictionary calls "floor" as ``name="floor"``. Only of an ``id`` does
-    `mitsuba.traverse` make a name.
+    Cameras are chosen by ids and `mitsuba.traverse` makes names of them, but Mitsuba's writer drops
+    those that nothing refers to.
     """
+    nodes, owners = parsed.state.nodes, dict[str, int]()
+    for index in [*references(parsed.state.root.props).values(), *range(len(nodes))]:
+        props = nodes[index].props
+        if owners.setdefault(props.id(), index) != index:
+            props.set_id("")  # of a dictionary, where slots without an id are all called "bsdf"
     try:
         root = ElementTree.fromstring(mi.parser.write_string(parsed.state))
     except RuntimeError as error:
@@ -452,7 +458,17 @@ def _to_xml(parsed: Parsed) -> str:
         raise ValueError(
             f"the scene cannot be written as XML ({reason}); give meshes and volumes by files"
         ) from None
-    for child in root:
-        if "type" in child.attrib and "name" in child.attrib and "id" not in child.attrib:
-            child.set("id", child.attrib.pop("name"))
+    _write_ids(root, parsed.state.root.props, nodes)
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def _write_ids(
+    element: ElementTree.Element, props: Properties, nodes: list[mi.parser.SceneNode]
+) -> None:
+    """Give an element and those in it the ids of their nodes, which the writer visits in turn."""
+    if props.id():
+        element.set("id", props.id())
+    children = [child for child in element if child.tag == "ref" or "type" in child.attrib]
+    for child, index in zip(children, references(props).values(), strict=True):
+        if child.tag != "ref":  # what is written already
+            _write_ids(child, nodes[index].props, nodes)

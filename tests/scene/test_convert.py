@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from eigengs_dr.storage.locks import lock_output
 pytestmark = pytest.mark.mitsuba
 
 QUICK = {"target_psnr": 30, "iterations": 20, "replace_all": True}
+QUICKEST = {"target_psnr": 20, "iterations": 1, "replace_all": True}
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +145,42 @@ def test_a_dictionary_with_a_mesh_and_a_bump_map_that_stays(folder, tmp_path):
     assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
     assert "cube.ply" in found.scene.read_text()
     assert not (tmp_path / "new" / "rough.npz").exists()
+
+
+def test_ids_are_kept(folder, tmp_path):
+    """Also those that nothing refers to: of cameras, shapes, emitters, materials and textures."""
+    text = wall(folder).read_text().replace("<emitter", '<emitter id="sky"')
+    for number, kind in enumerate(["sensor", "sensor", "shape", "shape"]):
+        text = text.replace(f'<{kind} type="', f'<{kind} id="object-{number}" type="', 1)
+    text = text.replace('<bsdf type="principled"', '<bsdf type="principled" id="coat"')
+    text = text.replace('name="roughness" type', 'id="grain" name="roughness" type')
+    (folder / "named.xml").write_text(text)
+    found = eg.convert_scene(folder / "named.xml", tmp_path / "new", spp=0, **QUICKEST)
+    ids = [
+        {e.attrib["id"]: e.attrib["type"] for e in ElementTree.parse(file).iter("*")
+         if "id" in e.attrib and e.tag != "ref"}
+        for file in (folder / "named.xml", found.scene)
+    ]  # fmt: skip
+    bitmaps = {name for name, kind in ids[0].items() if kind == "bitmap"}
+    assert bitmaps == {"photo", "grain"}
+    assert ids[1] == ids[0] | dict.fromkeys(bitmaps, "gaussian_texture")
+    names = [
+        {k for k in mi.traverse(mi.load_file(str(file))).keys() if "to_world" in k}  # noqa: SIM118
+        for file in (folder / "named.xml", found.scene)
+    ]
+    assert names[1] == names[0] == {f"object-{k}.to_world" for k in range(4)}
+
+
+def test_ids_of_a_dictionary(folder, tmp_path):
+    """Slots are called alike in many objects, and one of them may be an object of the scene."""
+    photo = {"type": "bitmap", "filename": str(folder / "photo.png")}
+    coat = {"type": "diffuse", "id": "coat", "reflectance": {"type": "rgb", "value": 0.2}}
+    other = {"type": "sphere", "radius": 0.1, "bsdf": coat}
+    scene = plain(mi, folder, photo, other=other, bsdf={"type": "sphere", "bsdf": {"type": "null"}})
+    found = eg.convert_scene(scene, tmp_path / "new", spp=0, **QUICKEST)
+    ids = [e.attrib.get("id") for e in ElementTree.parse(found.scene).iter("*")]
+    assert {"cube", "other", "coat", "bsdf", "sensor"} <= {*ids}
+    assert "bsdf.to_world" in mi.traverse(mi.load_file(str(found.scene)))
 
 
 def bumpy(folder, name, **settings):
