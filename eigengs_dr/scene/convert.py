@@ -18,6 +18,7 @@ from ..backend.doors import door
 from ..backend.messages import warn
 from ..backend.progress import shows_progress
 from ..backend.types import PathLike, Record
+from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import FIELDS, Gaussians
 from ..image.io import ImageError
 from ..image.metrics import psnr
@@ -41,13 +42,21 @@ from .bitmaps import (
     references,
     uses_of,
 )
-from .costs import Cost, costs_of, of_environment, of_texture
 from .fit_environment import fit_environment
 from .fit_uses import Original, fit_heights, fit_picture, replace_bitmap
 from .rendering import Progress, compare, pictures
 
 SCENE = "scene.xml"
 """Name of the new scene in its folder."""
+
+NEGLIGIBLE = 1 << 14
+"""Bytes that are not worth saving: the smallest images take less."""
+
+MOST_OVERLAP = 32.0
+"""Mean number of Gaussians at a point from which on the bitmap is better: a lookup then takes eight
+times as long as in a bitmap (4 times with the 15 of a usual fit, 15 with 96; llvm, CPU time). Time
+itself would decide otherwise on a busy machine. Lookups are a small part of a rendering: the
+picture of a coated ball takes 1.1 times as long where they take two to three times as long."""
 
 NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directly"
 
@@ -65,14 +74,11 @@ class ConvertedTexture(NamedTuple):
     width, height, channels : int
     bytes : int
         Memory of its bitmaps in the scene, see `eigengs_dr.plugins.resident_bytes`.
-    lookup_ns : float
-        Time of a lookup in the bitmap, in nanoseconds, on all cores of this machine; of an
-        environment map, of a lookup and a direction that is sampled.
     gaussians : int
     gaussian_bytes : int
         Memory of the textures of Gaussians in the scene. Those of one wrap mode share it.
-    gaussian_lookup_ns : float
-        Time of a lookup in the Gaussians.
+    overlap : float
+        Mean number of Gaussians at a point of the image: what a lookup sums.
     psnr : float
         Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`; of a bump
         map, lowest PSNR between the renderings with and without this set alone; of an environment
@@ -85,10 +91,9 @@ class ConvertedTexture(NamedTuple):
     height: int
     channels: int
     bytes: int
-    lookup_ns: float
     gaussians: int
     gaussian_bytes: int
-    gaussian_lookup_ns: float
+    overlap: float
     psnr: float
 
 
@@ -103,7 +108,7 @@ class ConvertedScene(NamedTuple):
     textures : list of ConvertedTexture
         Bitmaps that became Gaussians.
     better : list of ConvertedTexture
-        Bitmaps that stayed, since they take less memory or time than Gaussians.
+        Bitmaps that stayed, since they take less memory than Gaussians, or many overlap.
     left : list of (str, str)
         What else stayed, and why.
     psnr : list of float
@@ -147,8 +152,8 @@ def convert_scene(
 ) -> ConvertedScene:
     """Replace the bitmaps of a scene by as many Gaussians as its cameras resolve.
 
-    Uses of one image share a set. A bitmap that takes less memory than its Gaussians, or an eighth
-    of their time, is better and stays. The function leaves alone what Gaussians would spoil or
+    Uses of one image share a set. A bitmap that takes less memory than its Gaussians, or where many
+    of them overlap, is better and stays. The function leaves alone what Gaussians would spoil or
     cannot replace: bump maps with which the renderings would miss the PSNR,
     images of two values such as masks, data beyond 0 and 1, and images of no shape or that no
     camera sees.
@@ -332,9 +337,8 @@ def _convert(
         return str(error)
     saved, wraps = {"type": GAUSSIANS, "filename": str(file)}, {use.wrap for use in group}
     sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted(wraps)]
-    look = of_texture(use.raw or use.is_height, g.channels)
-    costs = costs_of((original.textures(group), sets), look)
-    return _chosen(tuple(use.name for use in group), file, g, seen, costs, settings)
+    held = [sum(map(resident_bytes, kind)) for kind in (original.textures(group), sets)]
+    return _chosen(tuple(use.name for use in group), file, g, seen, held, settings)
 
 
 def _convert_sky(
@@ -352,8 +356,8 @@ def _convert_sky(
     except ValueError:
         return "an environment map that its to_world scales or shears"
     g.save(file)
-    costs = costs_of(([sky], [mi.load_dict({"type": SKY, "filename": str(file)})]), of_environment)
-    return _chosen((name,), file, g, seen, costs, settings)
+    held = list(map(resident_bytes, (sky, mi.load_dict({"type": SKY, "filename": str(file)}))))
+    return _chosen((name,), file, g, seen, held, settings)
 
 
 def _chosen(
@@ -361,12 +365,16 @@ def _chosen(
     file: Path,
     g: Gaussians,
     seen: float,
-    costs: list[Cost],
+    held: list[int],
     settings: Settings,
 ) -> ConvertedTexture:
-    """Report an image, and remove the file of its set if the bitmap is better."""
-    bitmap, gaussians = costs
-    stays = bitmap.is_better_than(gaussians) and not settings.replace_all
+    """Report an image, and remove the file of its set if the bitmap is better.
+
+    `held` are the bytes of the bitmaps, and of the Gaussians.
+    """
+    overlap = overlap_of(g)
+    is_better = held[1] - held[0] > NEGLIGIBLE or overlap > MOST_OVERLAP
+    stays = is_better and not settings.replace_all
     if stays:
         file.unlink()
     return ConvertedTexture(
@@ -375,13 +383,18 @@ def _chosen(
         width=g.width,
         height=g.height,
         channels=g.channels,
-        bytes=bitmap.bytes,
-        lookup_ns=bitmap.nanoseconds,
+        bytes=held[0],
         gaussians=len(g),
-        gaussian_bytes=gaussians.bytes,
-        gaussian_lookup_ns=gaussians.nanoseconds,
+        gaussian_bytes=held[1],
+        overlap=overlap,
         psnr=seen,
     )
+
+
+def overlap_of(g: Gaussians) -> float:
+    """Return the mean number of Gaussians at a point of the image: their areas by its own."""
+    a, _, c = g.to_arrays()["factor"].T
+    return float(np.minimum(math.pi * CUTOFF**2 / (a * c) / (g.width * g.height), 1).sum())
 
 
 def _file_name(image: str, raw: bool, used: set[str]) -> str:

@@ -14,7 +14,7 @@ from _helpers.texture import gaussians
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.io import load_image
 from eigengs_dr.plugins import texture_of
-from eigengs_dr.scene import costs
+from eigengs_dr.scene import convert
 from eigengs_dr.scene.rendering import pictures
 from eigengs_dr.storage.locks import lock_output
 
@@ -45,7 +45,7 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
         "rough.npz": ("rough.png (principled.roughness)",),
     }
     for texture in found.textures:
-        assert texture.psnr >= 30 and texture.lookup_ns > 0 and texture.gaussian_lookup_ns > 0
+        assert texture.psnr >= 30 and texture.overlap > 0
         saved = eg.Gaussians.load(tmp_path / "new" / texture.file)
         assert len(saved) == texture.gaussians
         assert saved.space == ("linear" if texture.file == "photo.npz" else "data")
@@ -60,8 +60,7 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
 
 def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     """A small photo takes less memory than its Gaussians, a large gradient takes more."""
-    monkeypatch.setattr(costs, "SLOWEST", np.inf)  # a busy machine times anything
-    monkeypatch.setattr(costs, "NEGLIGIBLE", 0)  # the photo is small
+    monkeypatch.setattr(convert, "NEGLIGIBLE", 0)  # the photo is small
     y, x = np.mgrid[:512, :512] / 512
     eg.save_image(folder / "soft.png", np.stack([0.2 + 0.5 * x, y * x, 0.5 + 0 * x], axis=2))
     text = wall(folder).read_text()
@@ -82,29 +81,27 @@ def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     assert bitmaps_in(found.scene) == len(found.better)
 
 
-def test_which_bitmap_is_better():
-    """One that takes less memory, or an eighth of the time."""
-    small, large = costs.Cost(100_000, 10.0), costs.Cost(200_000, 10.0)
-    assert small.is_better_than(large) and not small.is_better_than(small)
-    assert not small.is_better_than(small._replace(bytes=101_000))
-    assert not large.is_better_than(small._replace(nanoseconds=79.0))
-    assert large.is_better_than(small._replace(nanoseconds=81.0))
+def many_at_a_point(count):
+    """A set of wide Gaussians, of which so many overlap."""
+    side, deviation = 512, 20.0
+    number = round(count * side**2 / (np.pi * 9 * deviation**2))
+    mean = np.random.default_rng(0).uniform(0, side, (number, 2))
+    factor = np.tile([1 / deviation, 0, 1 / deviation], (number, 1))
+    return eg.Gaussians.from_arrays(mean, factor, np.full((number, 3), 0.01), size=(side, side))
 
 
-@pytest.mark.parametrize("kind", ["llvm_ad_mono", "llvm_ad_spectral"])
-def test_costs_of_data_and_colours_in_other_variants(folder, kind):
-    mi.set_variant(kind)
-    eg.register_plugins()
-    for file, raw, channels, space in (
-        ("photo.png", False, 3, "linear"),
-        ("rough.png", True, 1, "data"),
-        ("normals.png", True, 3, "data"),
-    ):
-        bitmap = mi.load_dict({"type": "bitmap", "filename": str(folder / file), "raw": raw})
-        set_of = mi.load_dict(texture_of(gaussians(space, channels)))
-        look = costs.of_texture(raw, channels)
-        for cost in costs.costs_of([[bitmap], [set_of, set_of]], look):
-            assert cost.bytes > 0 and 0 < cost.nanoseconds < 1e9
+def test_where_many_gaussians_overlap_the_bitmap_is_better(tmp_path):
+    """A count decides, not a clock, and so does memory."""
+    settings = convert.Settings(40.0, 10, 0, False)
+    for count, held, stays in ((20, [1 << 20, 1000], False), (50, [1 << 20, 1000], True),
+                               (20, [1000, 17_000], False), (20, [1000, 18_000], True)):  # fmt: skip
+        g, file = many_at_a_point(count), tmp_path / "set.npz"
+        assert convert.overlap_of(g) == pytest.approx(count, rel=0.02)
+        g.save(file)
+        for chosen in (settings, settings._replace(replace_all=True)):
+            found = convert._chosen(("name",), file, g, 40.0, held, chosen)
+            assert (found.file == "") == (not file.exists()) == (stays and chosen is settings)
+            g.save(file)
 
 
 def test_what_stays_and_why(folder, tmp_path):
