@@ -75,6 +75,14 @@ class Parsed(NamedTuple):
     config: mi.parser.ParserConfig
     state: mi.parser.ParserState
 
+    def copied(self) -> Parsed:
+        """Return a copy to instantiate: a scene that was instantiated cannot be written."""
+        state = mi.parser.ParserState(self.state)
+        for node in state.nodes:
+            if "data" in node.props and is_bitmap(node):  # an instance takes the tensor away
+                node.props["data"] = mi.TensorXf(np.array(node.props["data"], np.float32))
+        return Parsed(self.config, state)
+
 
 def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None) -> Parsed:
     """Parse a scene, and make the names of its files absolute.
@@ -109,8 +117,6 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
         for node in state.nodes:
             _make_absolute(node.props)
     for node in state.nodes:
-        if "data" in node.props and is_bitmap(node):  # an instance takes the tensor away
-            node.props["data"] = mi.TensorXf(np.array(node.props["data"], np.float32))
         kinds = {GAUSSIANS: texture_kind(), SKY: mi.ObjectType.Emitter}
         if kind := kinds.get(node.props.plugin_name()):  # Mitsuba does not know plugins in Python
             node.type = kind

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -219,8 +219,8 @@ def convert_scene(
     with lock_output(output):
         remove_stale(target.parent)
         with atomic_folder(output) as work:
-            make = partial(parse, scene, parameters)
-            result = _convert_into(work, target, make, settings, progress or _silent)
+            parsed = parse(scene, parameters)
+            result = _convert_into(work, target, parsed, settings, progress or _silent)
     for camera in result.missed(target_psnr):
         warn(
             f"{output}: camera {camera} sees psnr_rgb {result.psnr[camera - 1]:.1f} dB between the "
@@ -251,14 +251,13 @@ def _silent(label: str, done: int, total: int) -> None:
 def _convert_into(
     work: Path,
     target: Path,
-    make: Callable[[], Parsed],
+    parsed: Parsed,
     settings: Settings,
     progress: Progress,
 ) -> ConvertedScene:
-    """Write a scene and its files into a folder that becomes the target; `make` parses it."""
-    again = make()
-    original = Original(make, settings.spp)
-    uses, left = uses_of(again, original.key_of)
+    """Write a scene and its files into a folder that becomes the target."""
+    original = Original(parsed, settings.spp)
+    uses, left = uses_of(parsed, original.key_of)
     result = ConvertedScene(work / SCENE, [], [], left, [], [])
     replacements = dict[int, str]()
     groups: dict[tuple[str, bool, bool], list[Use]] = {}
@@ -268,7 +267,7 @@ def _convert_into(
             groups.setdefault((use.file, use.raw, use.is_height), []).append(use)
         else:
             left.append((use.name, NO_SHAPE))
-    sky = environment_of(again)
+    sky = environment_of(parsed)
     total = len(groups) + (sky is not None)
 
     def add(outcome: ConvertedTexture | str, nodes: dict[int, str]) -> None:
@@ -286,20 +285,20 @@ def _convert_into(
         file = work / _file_name(
             group[0].file, group[0].raw, {texture.file for texture in result.textures}
         )
-        pixels = read_pixels(again.state.nodes[group[0].node].props)
+        pixels = read_pixels(parsed.state.nodes[group[0].node].props)
         outcome = _convert(original, group, pixels, file, settings)
         add(outcome, {use.node: use.name for use in group})
     if sky is not None:
         progress("textures", len(groups), total)
-        props = again.state.nodes[sky].props
+        props = parsed.state.nodes[sky].props
         name = label(props, original.keys.get(original.scene.environment(), "environment"))
         path = str(props["filename"]) if "filename" in props else "sky"
         file = work / _file_name(path, False, {texture.file for texture in result.textures})
         add(_convert_sky(original, name, read_pixels(props), file, settings), {sky: name})
     progress("textures", total, total)
-    _mark_integrator(original, again)
-    _rewrite(again, replacements, work, target)
-    result.scene.write_text(_to_xml(again), encoding="utf-8")
+    _mark_integrator(original, parsed)
+    _rewrite(parsed, replacements, work, target)
+    result.scene.write_text(_to_xml(parsed), encoding="utf-8")
     if settings.spp != 0:
         progress("renderings", 0, 2)
         after = pictures(mi.load_file(str(result.scene)), settings.spp)
@@ -400,8 +399,9 @@ def overlap_of(g: Gaussians) -> float:
 def _file_name(image: str, raw: bool, used: set[str]) -> str:
     """Name the file of a set after its image."""
     stem = Path(image).stem
-    names = [f"{stem}.npz", f"{stem}-data.npz", *(f"{stem}-{k}.npz" for k in range(2, 1000))]
-    return next(name for name in names[raw and f"{stem}.npz" in used :] if name not in used)
+    data = [f"{stem}-data.npz"] if raw else []
+    names = chain([f"{stem}.npz"], data, (f"{stem}-{k}.npz" for k in count(2)))
+    return next(name for name in names if name not in used)
 
 
 # --- The scene -----------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ decide.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -45,22 +44,21 @@ class Original:
 
     Attributes
     ----------
-    make : callable
-        Parses it again: an instantiated scene cannot be written or changed.
+    source : Parsed
     spp : int or None
         Samples per pixel of renderings, by default those of the cameras.
     parsed : Parsed
-        The parsed scene, whose references to textures are their instances.
+        A copy of it, whose references to textures are their instances.
     scene : mitsuba.Scene
     """
 
-    make: Callable[[], Parsed]
+    source: Parsed
     spp: int | None
     parsed: Parsed = field(init=False)
     scene: mi.Scene = field(init=False)
 
     def __post_init__(self) -> None:
-        self.parsed = self.make()
+        self.parsed = self.source.copied()
         self.scene = mi.parser.instantiate(self.parsed.config, self.parsed.state)
 
     @cached_property
@@ -90,7 +88,7 @@ class Original:
 
     def psnr_with(self, file: Path, uses: list[Use]) -> float:
         """Return the lowest PSNR of a camera if only this set replaces its bitmap."""
-        other = self.make()
+        other = self.source.copied()
         for use in uses:
             replace_bitmap(other.state.nodes[use.node].props, str(file))
         seen = pictures(mi.parser.instantiate(other.config, other.state), self.spp)
