@@ -36,14 +36,18 @@ from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
 from ..raster.render import render
 from .bitmaps import Unsuitable
-from .target import MARGIN, error_weights, seen_by, smoothest_target
+from .target import error_weights, seen_by, smoothest_target
 from .visibility import Box, Visibility, visibility
 
 COLORS = ("linear", "radiance", "data")
 """Names of the spaces of textures: linear light to 1, or of any range, or data."""
 
 PIXELS = 4
-"""Pixels per Gaussian at the start of the search."""
+"""Fewest pixels per Gaussian at the start of the search."""
+
+FEWER, GAIN = (64, 16, 4, 1), 8.0
+"""Parts of that number that are placed in turn, and decibels that a search gains: the first part
+that is no further below the goal is the start. A fit of few Gaussians needs few texels."""
 
 ENOUGH = 2.0
 """Smallest number of texels per pixel without an enlargement. With fewer texels the image is
@@ -180,20 +184,24 @@ def fit_for_scene(
         pictures = (seen_by(candidate, rows, kind, peak) for rows in fine.pixel_to_texel)
         return tuple(psnr_of(a, b, compared) for a, b in zip(pictures, goal, strict=True))
 
-    target = smoothest_target(values, fine, lambda t: min(seen(t)) >= target_psnr + MARGIN)
+    target = smoothest_target(values, fine, lambda t: min(seen(t)), target_psnr)
     weight = error_weights(fine, target, kind)
 
     max_gaussians = min(max_gaussians or int(native.seen.sum()), fine.seen.size)
     looks = np.minimum(PIXEL / native.footprint[native.seen], 1) ** 2  # pixels per texel, at most 1
-    first = min(max(1, int(looks.sum()) // PIXELS), max_gaussians)
-    objective = _objective(target, weight, fine.seen, first, kind)
+    most = min(max(1, int(looks.sum()) // PIXELS), max_gaussians)
     size = fine.seen.shape[1], fine.seen.shape[0]
+    away = distance_transform_edt(~fine.seen)
 
     def score(gaussians: Gaussians) -> list[Row]:
-        psnr = seen(render(_without_unseen(gaussians.scaled(*size), fine.seen)).numpy())
+        psnr = seen(render(_without_unseen(gaussians.scaled(*size), away)).numpy())
         return [{"psnr_ycbcr": min(psnr), "psnr": psnr}]
 
-    start = DEFAULT.place_and_solve(objective, first)
+    for count in (-(-most // fewer) for fewer in FEWER):
+        objective = _objective(target, weight, fine.seen, count, kind)
+        start = DEFAULT.place_and_solve(objective, count)
+        if score(start)[0]["psnr_ycbcr"] >= target_psnr - GAIN:
+            break
     search = fewest(
         objective, DEFAULT, start, score, ("psnr_ycbcr", target_psnr), max_gaussians, iterations
     )
@@ -203,7 +211,7 @@ def fit_for_scene(
             f"{len(search.gaussians)} Gaussians reach {reached:.1f} dB, but the cameras shall see "
             f"{target_psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
         )
-    gaussians = _without_unseen(search.gaussians.scaled(*size), fine.seen)
+    gaussians = _without_unseen(search.gaussians.scaled(*size), away)
     left, top = box.left + corner.left, box.top + corner.top
     mean = gaussians.mean + type(gaussians.mean)(left, top)
     placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height, space=space)
@@ -256,12 +264,15 @@ def _crop_to_seen(values: Image, view: Visibility) -> tuple[Image, Visibility, B
     return np.ascontiguousarray(box.of(values)), cut, box
 
 
-def _without_unseen(gaussians: Gaussians, seen: NDArray[np.bool_]) -> Gaussians:
-    """Keep the Gaussians that may reach a seen texel, by their longer axes; at least one."""
+def _without_unseen(gaussians: Gaussians, away: NDArray[np.floating]) -> Gaussians:
+    """Keep the Gaussians that may reach a seen texel, by their longer axes; at least one.
+
+    `away` holds the distance of each texel from the nearest seen one.
+    """
     arrays = gaussians.to_arrays()
     mean, factor = arrays["mean"], arrays["factor"]
-    column = mean[:, 0].astype(int).clip(0, seen.shape[1] - 1)
-    row = mean[:, 1].astype(int).clip(0, seen.shape[0] - 1)
-    away = distance_transform_edt(~seen)[row, column]
-    reaches = away <= np.maximum(CUTOFF * max_deviation(*factor.T), away.min())
+    column = mean[:, 0].astype(int).clip(0, away.shape[1] - 1)
+    row = mean[:, 1].astype(int).clip(0, away.shape[0] - 1)
+    far = away[row, column]
+    reaches = far <= np.maximum(CUTOFF * max_deviation(*factor.T), far.min())
     return gaussians[np.flatnonzero(reaches)]

@@ -72,7 +72,7 @@ class TestTarget:
         image = photo()
         rows = blocks(48, 6)
         found = Visibility(np.full((48, 48), 2.4, np.float32), [rows])
-        target = back_project(image, found, 1.0)
+        *_, target = back_project(image, found, 1.0)
         blurred = gaussian_filter(image, (2.4, 2.4, 0), mode="nearest")
 
         def missed(t):
