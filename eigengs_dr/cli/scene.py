@@ -246,9 +246,7 @@ def scene_errors(path: Path) -> Iterator[None]:
 @options.number(
     "--spp", "Samples per pixel; 0 renders nothing.  [default: from the scene]", minimum=0
 )
-@click.option(
-    "--replace-all", is_flag=True, help="Also replace bitmaps that are better."
-)
+@click.option("--replace-all", is_flag=True, help="Also replace bitmaps that are better.")
 @variant_option
 @definitions_option
 @options.shared("report", "quiet")

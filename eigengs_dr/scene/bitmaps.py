@@ -32,6 +32,9 @@ SKY_KEPT = ("to_world", "scale", "sampling_weight")
 GAUSSIANS, SKY = "gaussian_texture", "gaussian_environment"
 """Names of the plugins in scenes."""
 
+RELIEF = {"bumpmap": "heights of a bump map", "normalmap": "vectors of a normal map"}
+"""What turns the light on a surface, by the material that uses it: renderings judge it."""
+
 UDIM = re.compile(r"<udim>|<uvtile>|%\(udim\)d", re.IGNORECASE)
 """Placeholders of Mari, Mudbox and Houdini for the number of a tile in file names."""
 
@@ -53,8 +56,8 @@ class Use(NamedTuple):
         Whether the values are data.
     wrap : str
         Wrap mode.
-    is_height : bool
-        Whether a bump map uses it.
+    relief : str
+        Whether it is the `RELIEF` of a surface, or "".
     name : str
         Its name in reports.
     """
@@ -65,7 +68,7 @@ class Use(NamedTuple):
     file: str
     raw: bool
     wrap: str
-    is_height: bool
+    relief: str
     name: str
 
 
@@ -201,7 +204,8 @@ def uses_of(
             continue
         file = os.path.realpath(props["filename"]) if "filename" in props else f"{slot}-{index}"
         raw, wrap = bool(props.get("raw", False)), str(props.get("wrap_mode", "repeat"))
-        uses.append(Use(index, parent, slot, file, raw, wrap, "bumpmap" in parents_of, name))
+        relief = RELIEF.get(parents_of[0], "")
+        uses.append(Use(index, parent, slot, file, raw, wrap, relief, name))
     return uses, left
 
 
@@ -226,8 +230,8 @@ def _reason(props: Properties, parents: list[str]) -> str:
     """Return why the properties or users of a bitmap require a bitmap, or nothing."""
     if not parents:
         return "nothing uses it"
-    if "bumpmap" in parents and len(set(parents)) > 1:
-        return "heights of a bump map that are something else too"
+    if len(set(parents)) > 1 and (relief := {*parents} & {*RELIEF}):
+        return f"{RELIEF[min(relief)]} that are something else too"
     if str(props.get("filter_type", "bilinear")) != "bilinear":
         return "its filter shows single texels"
     return ""

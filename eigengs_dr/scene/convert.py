@@ -18,6 +18,7 @@ from ..backend.doors import door
 from ..backend.messages import warn
 from ..backend.progress import shows_progress
 from ..backend.types import PathLike, Record
+from ..fitting.options import Goal
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import FIELDS, Gaussians
 from ..image.io import ImageError
@@ -42,9 +43,9 @@ from .bitmaps import (
     references,
     uses_of,
 )
-from .fit_environment import fit_environment
-from .fit_uses import Original, fit_heights, fit_picture, replace_bitmap
-from .rendering import Progress, compare, pictures
+from .fit_environment import BYTES, fit_environment
+from .fit_uses import Original, fit_picture, fit_relief, replace_bitmap
+from .rendering import Progress, compare, pictures, silent
 
 SCENE = "scene.xml"
 """Name of the new scene in its folder."""
@@ -81,8 +82,8 @@ class ConvertedTexture(NamedTuple):
         Mean number of Gaussians at a point of the image: what a lookup sums.
     psnr : float
         Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`; of a bump
-        map, lowest PSNR between the renderings with and without this set alone; of an environment
-        map, the lower PSNR of its picture and of the light that it gives to surfaces.
+        or normal map, lowest PSNR between the renderings with and without this set alone; of an
+        environment map, the lower PSNR of its picture and of the light that it gives to surfaces.
     """
 
     names: tuple[str, ...]
@@ -154,9 +155,8 @@ def convert_scene(
 
     Uses of one image share a set. A bitmap that takes less memory than its Gaussians, or where many
     of them overlap, is better and stays. The function leaves alone what Gaussians would spoil or
-    cannot replace: bump maps with which the renderings would miss the PSNR,
-    images of two values such as masks, data beyond 0 and 1, and images of no shape or that no
-    camera sees.
+    cannot replace: bump and normal maps with which the renderings would miss the PSNR, images of
+    two values such as masks, data beyond 0 and 1, and images of no shape or that no camera sees.
 
     Parameters
     ----------
@@ -165,7 +165,8 @@ def convert_scene(
     output : path-like
         Folder to write; it must not exist, or be empty. It is written as a whole, or not at all.
     target_psnr : float, optional
-        Lowest PSNR in dB with which a camera sees a texture, see `eigengs_dr.fit_for_scene`.
+        Lowest PSNR in dB with which a camera sees a texture, see `eigengs_dr.fit_for_scene`, and
+        the goal of the renderings: where they need more, a texture gets up to 6 dB more.
     iterations : int, optional
         Steps of refinement for each number of Gaussians.
     spp : int, optional
@@ -220,7 +221,7 @@ def convert_scene(
         remove_stale(target.parent)
         with atomic_folder(output) as work:
             parsed = parse(scene, parameters)
-            result = _convert_into(work, target, parsed, settings, progress or _silent)
+            result = _convert_into(work, target, parsed, settings, progress or silent)
     for camera in result.missed(target_psnr):
         warn(
             f"{output}: camera {camera} sees psnr_rgb {result.psnr[camera - 1]:.1f} dB between the "
@@ -244,10 +245,6 @@ def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
         raise ValueError(f"{output}: exists and is not empty; choose another folder")
 
 
-def _silent(label: str, done: int, total: int) -> None:
-    """Show no progress."""
-
-
 def _convert_into(
     work: Path,
     target: Path,
@@ -256,15 +253,16 @@ def _convert_into(
     progress: Progress,
 ) -> ConvertedScene:
     """Write a scene and its files into a folder that becomes the target."""
+    progress("scene", 0, 1)
     original = Original(parsed, settings.spp)
     uses, left = uses_of(parsed, original.key_of)
     result = ConvertedScene(work / SCENE, [], [], left, [], [])
     replacements = dict[int, str]()
-    groups: dict[tuple[str, bool, bool], list[Use]] = {}
+    groups: dict[tuple[str, bool, str], list[Use]] = {}
     on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
         if any(original.textures([use])[0] in hierarchy for hierarchy in on_shapes):
-            groups.setdefault((use.file, use.raw, use.is_height), []).append(use)
+            groups.setdefault((use.file, use.raw, use.relief), []).append(use)
         else:
             left.append((use.name, NO_SHAPE))
     sky = environment_of(parsed)
@@ -280,22 +278,24 @@ def _convert_into(
             result.textures.append(outcome)
             replacements.update(dict.fromkeys(nodes, outcome.file))
 
-    for number, group in enumerate(groups.values()):
-        progress("textures", number, total)
-        file = work / _file_name(
-            group[0].file, group[0].raw, {texture.file for texture in result.textures}
-        )
+    def shown(number: int, name: str) -> Progress:
+        """Return what shows the stages of one of the images."""
+        return lambda label, *done: progress(f"{number}/{total} {name}: {label}", *done)
+
+    for number, group in enumerate(groups.values(), 1):
+        used = {texture.file for texture in result.textures}
+        file = work / _file_name(group[0].file, group[0].raw, used)
         pixels = read_pixels(parsed.state.nodes[group[0].node].props)
-        outcome = _convert(original, group, pixels, file, settings)
+        show = shown(number, Path(group[0].file).name)
+        outcome = _convert(original, group, pixels, file, settings, show, len(groups))
         add(outcome, {use.node: use.name for use in group})
     if sky is not None:
-        progress("textures", len(groups), total)
         props = parsed.state.nodes[sky].props
         name = label(props, original.keys.get(original.scene.environment(), "environment"))
         path = str(props["filename"]) if "filename" in props else "sky"
         file = work / _file_name(path, False, {texture.file for texture in result.textures})
-        add(_convert_sky(original, name, read_pixels(props), file, settings), {sky: name})
-    progress("textures", total, total)
+        show = shown(total, Path(path).name)
+        add(_convert_sky(original, name, read_pixels(props), file, settings, show), {sky: name})
     _mark_integrator(original, parsed)
     _rewrite(parsed, replacements, work, target)
     result.scene.write_text(_to_xml(parsed), encoding="utf-8")
@@ -320,36 +320,48 @@ def _convert(
     pixels: NDArray[np.float32],
     file: Path,
     settings: Settings,
+    show: Progress,
+    share: int,
 ) -> ConvertedTexture | str:
     """Fit the image of some uses and save the set, or return why it must stay.
 
-    If the bitmap is better, there is no file.
+    Of the errors that renderings may have, it gets one of so many shares. If the bitmap is better,
+    there is no file.
     """
-    use, asked = group[0], (settings.target_psnr, settings.iterations)
+    use, bitmaps = group[0], original.textures(group)
+    held = sum(map(resident_bytes, bitmaps))
     try:
-        if use.is_height:
-            g, seen = fit_heights(original, group, pixels, *asked, file)
+        if use.relief:
+            most = None if settings.replace_all else (held + NEGLIGIBLE) // BYTES
+            needed = settings.target_psnr + 10 * math.log10(share)
+            goal = Goal(needed, max_gaussians=most)
+            g, seen = fit_relief(original, group, pixels, goal, settings.iterations, file, show)
         else:
-            g, seen = fit_picture(original, group, pixels, *asked)
-            g.save(file)
+            asked = settings.target_psnr, settings.iterations
+            g, seen = fit_picture(original, group, pixels, *asked, file, show, share)
     except (Unsuitable, ImageError) as error:
+        file.unlink(missing_ok=True)
         return str(error)
     saved, wraps = {"type": GAUSSIANS, "filename": str(file)}, {use.wrap for use in group}
     sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted(wraps)]
-    held = [sum(map(resident_bytes, kind)) for kind in (original.textures(group), sets)]
-    return _chosen(tuple(use.name for use in group), file, g, seen, held, settings)
+    both = [held, sum(map(resident_bytes, sets))]
+    return _chosen(tuple(use.name for use in group), file, g, seen, both, settings)
 
 
 def _convert_sky(
-    original: Original, name: str, pixels: NDArray[np.float32], file: Path, settings: Settings
+    original: Original,
+    name: str,
+    pixels: NDArray[np.float32],
+    file: Path,
+    settings: Settings,
+    show: Progress,
 ) -> ConvertedTexture | str:
     """Fit an environment map and save the set, or return why it must stay."""
     sky = original.scene.environment()
     try:
         check_rotation(sky.world_transform())
-        g, seen = fit_environment(
-            original.scene, pixels, settings.target_psnr, settings.iterations, resident_bytes(sky)
-        )
+        asked = settings.target_psnr, settings.iterations, resident_bytes(sky)
+        g, seen = fit_environment(original.scene, pixels, *asked, show)
     except (Unsuitable, ImageError) as error:
         return str(error)
     except ValueError:

@@ -8,7 +8,7 @@ which every camera sees the texture at a given PSNR.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -20,8 +20,11 @@ from skimage.transform import resize_local_mean
 
 from ..backend.arrays import types_in
 from ..backend.doors import door
+from ..backend.interrupts import defer_interrupts
+from ..backend.progress import shows_progress
 from ..backend.selection import backend_of, select
 from ..fitting.fewest import fewest
+from ..fitting.fit import FitInterrupted
 from ..fitting.measure import Row
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Affine, Data, Pixels, restored
@@ -36,6 +39,7 @@ from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
 from ..raster.render import render
 from .bitmaps import Unsuitable
+from .rendering import Progress, silent
 from .target import error_weights, seen_by, smoothest_target
 from .visibility import Box, Visibility, visibility
 
@@ -59,6 +63,9 @@ takes a quarter of the time. 1,024 x 1,024 texels at 6 and more texels per pixel
 DETAIL = 64
 """Fewest seen texels per Gaussian in a fit. A target with four times as many is halved, again and
 again: 200 Gaussians show no more of an enlarged image, and a step takes the time of its texels."""
+
+ROUNDING = 1e-3
+"""By how much data may exceed 0 and 1."""
 
 FINER = 3
 """Factor of the enlargement; odd, so that the centres of texels stay samples."""
@@ -87,7 +94,12 @@ class SceneFit(NamedTuple):
     visibility: Visibility
     tried: list[tuple[int, float]]
 
+    def __repr__(self) -> str:
+        g, seen = self.gaussians, ", ".join(f"{psnr:.2f}" for psnr in self.psnr)
+        return f"SceneFit({len(g)} Gaussians, {g.width}x{g.height} pixels, psnr=({seen}))"
 
+
+@shows_progress
 @door
 def fit_for_scene(
     scene: Any,
@@ -99,6 +111,7 @@ def fit_for_scene(
     iterations: int = 400,
     wrap_mode: str | Sequence[str] = "repeat",
     encoding: str | None = None,
+    progress: Any = None,
 ) -> SceneFit:
     """Find the fewest Gaussians with which all cameras of a scene see an image at a given PSNR.
 
@@ -127,6 +140,9 @@ def fit_for_scene(
         See `eigengs_dr.scene.visibility.visibility`.
     encoding : {"srgb", "linear"}, optional
         What the pixels are, see `eigengs_dr.fit`.
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
+        ``progress(label, done, total)``.
 
     Returns
     -------
@@ -137,6 +153,8 @@ def fit_for_scene(
     ValueError
         If the image or an argument is unusable, the scene has no such texture, no pixel sees it, or
         the largest number of Gaussians does not suffice.
+    FitInterrupted
+        After Ctrl-C in the search; its ``result`` is the SceneFit of the best set so far.
 
     Examples
     --------
@@ -157,7 +175,43 @@ def fit_for_scene(
             "least 0 and at least 1"
         )
     checked = check_data(image) if space == "data" else check_image(image, encoding=encoding)
+    low, high = float(checked.min()), float(checked.max())
+    if space == "data" and (low < -ROUNDING or high > 1 + ROUNDING):
+        raise ValueError(
+            f"image: data from {low:g} to {high:g}; cameras compare data from 0 to 1: scale it"
+        )
     pixels = checked.clip(0, None if space == "radiance" else 1)
+    return fit_seen(
+        scene,
+        texture,
+        pixels,
+        target_psnr,
+        space,
+        max_gaussians,
+        iterations,
+        wrap_mode,
+        progress or silent,
+    )
+
+
+def fit_seen(
+    scene: Any,
+    texture: str | Texture | Sequence[str | Texture],
+    pixels: Image,
+    target_psnr: float,
+    space: str,
+    max_gaussians: int | None,
+    iterations: int,
+    wrap_mode: str | Sequence[str],
+    show: Progress = silent,
+    aim: Callable[[Gaussians, float], float] | None = None,
+) -> SceneFit:
+    """Find the fewest Gaussians for checked pixels; see `fit_for_scene`.
+
+    ``aim(gaussians, psnr)`` returns the PSNR to look for, once the cameras have seen a first set at
+    a PSNR; at most `eigengs_dr.scene.target.MARGIN` above `target_psnr`.
+    """
+    show("rays", 0, 1)
     height, width = pixels.shape[:2]
     values = pixels if space == "data" else to_linear(pixels)
     peak = max(1.0, float(values.max())) if space == "radiance" else 1.0
@@ -184,7 +238,11 @@ def fit_for_scene(
         pictures = (seen_by(candidate, rows, kind, peak) for rows in fine.pixel_to_texel)
         return tuple(psnr_of(a, b, compared) for a, b in zip(pictures, goal, strict=True))
 
-    target = smoothest_target(values, fine, lambda t: min(seen(t)), target_psnr)
+    def closeness(candidate: Image) -> float:
+        show("target", 0, 1)
+        return min(seen(candidate))
+
+    target = smoothest_target(values, fine, closeness, target_psnr)
     weight = error_weights(fine, target, kind)
 
     max_gaussians = min(max_gaussians or int(native.seen.sum()), fine.seen.size)
@@ -197,27 +255,35 @@ def fit_for_scene(
         psnr = seen(render(_without_unseen(gaussians.scaled(*size), away)).numpy())
         return [{"psnr_ycbcr": min(psnr), "psnr": psnr}]
 
+    def whole(gaussians: Gaussians) -> Gaussians:
+        kept = _without_unseen(gaussians.scaled(*size), away)
+        mean = kept.mean + type(kept.mean)(box.left + corner.left, box.top + corner.top)
+        placed = replace(kept, mean=mean, width=fine_width, height=fine_height, space=space)
+        return restored(placed.scaled(width, height), Affine(peak))
+
     for count in (-(-most // fewer) for fewer in FEWER):
         objective = _objective(target, weight, fine.seen, count, kind)
         start = DEFAULT.place_and_solve(objective, count)
-        if score(start)[0]["psnr_ycbcr"] >= target_psnr - GAIN:
+        [row] = score(start)
+        if row["psnr_ycbcr"] >= target_psnr - GAIN:
             break
-    search = fewest(
-        objective, DEFAULT, start, score, ("psnr_ycbcr", target_psnr), max_gaussians, iterations
-    )
-    if search.stopped != "met":
-        reached = search.row["psnr_ycbcr"]
+    aimed = ("psnr_ycbcr", aim(whole(start), row["psnr_ycbcr"]) if aim else target_psnr)
+    with defer_interrupts() as interrupted:
+        search = fewest(
+            objective, DEFAULT, start, score, aimed, max_gaussians, iterations,
+            progress=lambda step, steps, row: show("search", step, steps), interrupted=interrupted,
+        )  # fmt: skip
+    reached = search.row["psnr_ycbcr"]
+    if search.stopped == "out of reach" and reached < target_psnr:
         raise Unsuitable(
             f"{len(search.gaussians)} Gaussians reach {reached:.1f} dB, but the cameras shall see "
             f"{target_psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
         )
-    gaussians = _without_unseen(search.gaussians.scaled(*size), away)
-    left, top = box.left + corner.left, box.top + corner.top
-    mean = gaussians.mean + type(gaussians.mean)(left, top)
-    placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height, space=space)
     tried = [(row["gaussians"], row["psnr_ycbcr"]) for row in search.trace]
-    whole = restored(placed.scaled(width, height), Affine(peak))
-    return SceneFit(whole, search.row["psnr"], native, tried)
+    found = SceneFit(whole(search.gaussians), search.row["psnr"], native, tried)
+    if search.stopped == "interrupted":
+        raise FitInterrupted(found)  # type: ignore[arg-type]
+    return found
 
 
 def _objective(
