@@ -266,7 +266,7 @@ def convert(
     FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
     after, and 8 times their difference. If a rendering misses the PSNR, the command reports it and
     exits with code 1. A bitmap is kept if it takes less memory than its Gaussians, or if many of
-    them overlap; the command shows both. Bump maps with which the renderings would miss the PSNR,
+    them overlap; the command shows both. Bump and normal maps with which renderings would miss it,
     environment maps whose light or picture would miss it, images of two values such as masks, data
     outside of 0 to 1, and images that no camera sees are kept too; the command shows the reason.
     Other files are not moved, and the new scene refers to them relative to FOLDER.

@@ -232,7 +232,7 @@ def fit_relief(
         file.unlink()
         reached.append(f"{kept:.1f} dB with {len(gaussians):,} Gaussians")
         if result.stopped == "out of reach":
-            reached[-1] += ", which take the memory of the bitmap"
+            reached[-1] += ", the most that are allowed"
             break
         least = more + goal.psnr - kept
     raise Unsuitable(f"{use.relief}: the renderings keep {', '.join(reached)}")

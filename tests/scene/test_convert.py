@@ -14,7 +14,7 @@ from _helpers.texture import gaussians
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.io import load_image
 from eigengs_dr.plugins import texture_of
-from eigengs_dr.scene import convert
+from eigengs_dr.scene import convert, fit_uses
 from eigengs_dr.scene.rendering import pictures
 from eigengs_dr.storage.locks import lock_output
 
@@ -93,8 +93,12 @@ def many_at_a_point(count):
 def test_where_many_gaussians_overlap_the_bitmap_is_better(tmp_path):
     """A count decides, not a clock, and so does memory."""
     settings = convert.Settings(40.0, 10, 0, False)
-    for count, held, stays in ((20, [1 << 20, 1000], False), (50, [1 << 20, 1000], True),
-                               (20, [1000, 17_000], False), (20, [1000, 18_000], True)):  # fmt: skip
+    for count, held, stays in (
+        (20, [1 << 20, 1000], False),
+        (50, [1 << 20, 1000], True),
+        (20, [1000, 17_000], False),
+        (20, [1000, 18_000], True),
+    ):
         g, file = many_at_a_point(count), tmp_path / "set.npz"
         assert convert.overlap_of(g) == pytest.approx(count, rel=0.02)
         g.save(file)
@@ -211,9 +215,51 @@ def test_a_bump_map_without_renderings_stays(folder, tmp_path):
     assert found.textures == [] and "renderings decide, and none was asked for" in reason
 
 
+def test_a_normal_map_whose_glints_would_go_stays(folder, tmp_path):
+    """Its vectors look alike in the mean of each pixel, and nothing of what they reflect does."""
+    noise = np.random.default_rng(0).normal(0, 0.3, (64, 64, 2))
+    n = np.concatenate([noise, np.ones((64, 64, 1))], axis=2)
+    eg.save_image(folder / "glints.png", 0.5 + 0.5 * n / np.linalg.norm(n, axis=2, keepdims=True))
+    glints = {"type": "bitmap", "filename": str(folder / "glints.png"), "raw": True}
+    metal = {"type": "roughconductor", "alpha": 0.05}
+    wall = {"type": "rectangle", "bsdf": {"type": "normalmap", "normalmap": glints, "bsdf": metal}}
+    lamp = {"type": "point", "position": [1, 1, 3], "intensity": 8.0}
+    scene = {**room(mi, folder), "cube": wall, "lamp": lamp}
+    found = eg.convert_scene(scene, tmp_path / "new", spp=16, **QUICK)
+    [(name, reason)] = found.left
+    assert found.textures == [] and name.startswith("glints.png")
+    assert reason.startswith("vectors of a normal map: the renderings keep ")
+    assert min(found.psnr) > 60
+
+
+def test_what_cannot_be_smooth_is_refused_without_a_fit(folder, tmp_path, monkeypatch):
+    """A chequered bump map: one rendering tells."""
+    monkeypatch.setattr(fit_uses, "fit", None)
+    scene = bumpy(folder, "tiles.png")
+    y, x = np.mgrid[:32, :32] // 2
+    eg.save_image(folder / "tiles.png", 0.3 + 0.4 * ((x + y) % 2))
+    found = eg.convert_scene(scene, tmp_path / "new", spp=16, **{**QUICK, "target_psnr": 40})
+    [(_, reason)] = found.left
+    assert reason.startswith("heights of a bump map: the renderings keep ")
+    assert reason.endswith(" dB if they are only made smooth")
+
+
+def test_progress_from_the_first_second(folder, tmp_path):
+    calls = []
+    scene = plain(mi, folder, {"type": "bitmap", "filename": str(folder / "photo.png")})
+    show = lambda *call: calls.append(call)  # noqa: E731
+    eg.convert_scene(scene, tmp_path / "new", progress=show, **QUICKEST)
+    labels = list(dict.fromkeys(label for label, _, _ in calls))
+    stages = ("rays", "target", "search")
+    assert labels == ["scene", *(f"1/1 photo.png: {s}" for s in stages), "renderings"]
+    assert all(0 <= done <= total for _, done, total in calls)
+
+
 def test_nothing_is_rendered_on_request(folder, tmp_path):
     found = eg.convert_scene(wall(folder), tmp_path / "new", spp=0, target_psnr=20, iterations=1)
     assert found.psnr == [] and not list((tmp_path / "new").glob("*.png"))
+    [(_, reason)] = found.left
+    assert reason.startswith("vectors of a normal map: renderings decide")
 
 
 def test_mistakes(folder, tmp_path):
