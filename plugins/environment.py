@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.backend.arrays import upload
+from eigengs_dr.backend.arrays import types_of, upload
 from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.gaussian.gaussians import Fitted, Gaussians
 from eigengs_dr.image.color import rendered_as, to_linear
@@ -90,12 +92,13 @@ def bake_environment(
     Returns
     -------
     dict
-        The emitter with a bitmap of linear light; negative light is 0.
+        The emitter with a bitmap of linear light; negative light is 0. Its first and last rows are
+        the poles, as an ``envmap`` reads them.
 
     Raises
     ------
     ValueError
-        If the set has other channels, or holds data.
+        If the set has other channels, or holds data, or the bitmap has one row.
 
     Examples
     --------
@@ -113,7 +116,31 @@ def bake_environment(
             f"bake_environment: the set has {gaussians.channels} channels in the space "
             f"{gaussians.space!r}; it needs three of light or colour"
         )
-    picture = render(gaussians, width, height).numpy()
+    if height is None:
+        ratio = 1.0 if width is None else width / gaussians.width
+        height = round(ratio * gaussians.height)
+    picture = render(_from_pole_to_pole(gaussians, height), width, height).numpy()
     light = to_linear(picture) if encoding == "srgb" else picture
     bitmap = mi.Bitmap(np.maximum(light, 0).astype(np.float32))
     return {"type": "envmap", "bitmap": bitmap, **properties}
+
+
+def _from_pole_to_pole(gaussians: Gaussians, rows: int) -> Gaussians:
+    """Move Gaussians, so that the centres of the outermost of so many rows show the poles.
+
+    They do in the native rows: `eigengs_dr.plugins.gaussian_environment`.
+    """
+    if min(rows, gaussians.height) < 2:
+        raise ValueError(
+            f"bake_environment: {min(rows, gaussians.height)} rows; the set and the bitmap must "
+            "have at least 2, one for each pole"
+        )
+    types, native = types_of(gaussians.mean), gaussians.height
+    stretch = (rows - 1) / (native - 1) * (native / rows)
+    ratio, border = (dr.opaque(types.Float, v) for v in (stretch, (native / rows - stretch) / 2))
+    (x, y), (a, b, c) = gaussians.mean, gaussians.factor
+    return replace(
+        gaussians,
+        mean=types.Float2(x, dr.fma(y, ratio, border)),
+        factor=types.Float3(a, b / ratio, c / ratio),
+    )

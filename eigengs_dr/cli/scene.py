@@ -246,9 +246,7 @@ def scene_errors(path: Path) -> Iterator[None]:
 @options.number(
     "--spp", "Samples per pixel; 0 renders nothing.  [default: from the scene]", minimum=0
 )
-@click.option(
-    "--replace-all", is_flag=True, help="Also replace bitmaps that are smaller or faster."
-)
+@click.option("--replace-all", is_flag=True, help="Also replace bitmaps that are better.")
 @variant_option
 @definitions_option
 @options.shared("report", "quiet")
@@ -267,8 +265,8 @@ def convert(
 
     FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
     after, and 8 times their difference. If a rendering misses the PSNR, the command reports it and
-    exits with code 1. A bitmap is kept if it takes less memory than its Gaussians, or an eighth of
-    their time; the command shows both. Bump maps with which the renderings would miss the PSNR,
+    exits with code 1. A bitmap is kept if it takes less memory than its Gaussians, or if many of
+    them overlap; the command shows both. Bump and normal maps with which renderings would miss it,
     environment maps whose light or picture would miss it, images of two values such as masks, data
     outside of 0 to 1, and images that no camera sees are kept too; the command shows the reason.
     Other files are not moved, and the new scene refers to them relative to FOLDER.
@@ -305,19 +303,19 @@ def convert(
 def _table(converted: ConvertedScene, before: int, after: int) -> list[str]:
     """Format the replaced textures, those that were kept, and the PSNRs of the renderings."""
     rows: list[Sequence[str]] = [
-        ("texture", "texels", "bytes", "ns", "Gaussians", "bytes", "ns", "PSNR seen")
+        ("texture", "texels", "bytes", "Gaussians", "bytes", "overlap", "PSNR seen")
     ]
     for t in [*converted.textures, *converted.better]:
-        bitmap = f"{t.width}x{t.height}", f"{t.bytes:,}", f"{t.lookup_ns:.1f}"
-        gaussians = f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.gaussian_lookup_ns:.1f}"
+        bitmap = f"{t.width}x{t.height}", f"{t.bytes:,}"
+        gaussians = f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.overlap:.1f}"
         rows.append((t.names[0], *bitmap, *gaussians, f"{t.psnr:.1f} dB"))
-        rows += [(name, "(the same set)", *[""] * 6) for name in t.names[1:]]
+        rows += [(name, "(the same set)", *[""] * 5) for name in t.names[1:]]
     lines = table(rows)
     if before:
         lines.append(f"memory: {after:,} of {before:,} bytes ({after / before:.3f})")
     lines += [f"kept, the bitmap is better: {name}" for t in converted.better for name in t.names]
     if converted.better:
-        lines.append("  (it takes less memory, or an eighth of the time; see --replace-all)")
+        lines.append("  (it takes less memory, or many Gaussians overlap; see --replace-all)")
     lines += [f"left alone: {name}: {reason}" for name, reason in converted.left]
     psnrs = enumerate(converted.psnr, 1)
     lines += [f"camera {k}: psnr_rgb {psnr:.1f} dB between the renderings" for k, psnr in psnrs]

@@ -4,7 +4,6 @@
 - ``target``: the smoothest texture that looks alike, and the weights of its errors
 - ``fit_scene``: the fewest Gaussians for a scene
 - ``bitmaps``: the bitmaps of a scene, and which of them must stay
-- ``costs``: the memory and the time of a lookup of textures
 - ``fit_uses``: Gaussians for the uses of an image in a scene
 - ``convert``: a scene with Gaussians in the place of its bitmaps
 - ``rendering``: pictures by each camera, with the names of their channels; before and after

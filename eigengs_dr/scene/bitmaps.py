@@ -32,6 +32,9 @@ SKY_KEPT = ("to_world", "scale", "sampling_weight")
 GAUSSIANS, SKY = "gaussian_texture", "gaussian_environment"
 """Names of the plugins in scenes."""
 
+RELIEF = {"bumpmap": "heights of a bump map", "normalmap": "vectors of a normal map"}
+"""What turns the light on a surface, by the material that uses it: renderings judge it."""
+
 UDIM = re.compile(r"<udim>|<uvtile>|%\(udim\)d", re.IGNORECASE)
 """Placeholders of Mari, Mudbox and Houdini for the number of a tile in file names."""
 
@@ -53,8 +56,8 @@ class Use(NamedTuple):
         Whether the values are data.
     wrap : str
         Wrap mode.
-    is_height : bool
-        Whether a bump map uses it.
+    relief : str
+        Whether it is the `RELIEF` of a surface, or "".
     name : str
         Its name in reports.
     """
@@ -65,7 +68,7 @@ class Use(NamedTuple):
     file: str
     raw: bool
     wrap: str
-    is_height: bool
+    relief: str
     name: str
 
 
@@ -74,6 +77,14 @@ class Parsed(NamedTuple):
 
     config: mi.parser.ParserConfig
     state: mi.parser.ParserState
+
+    def copied(self) -> Parsed:
+        """Return a copy to instantiate: a scene that was instantiated cannot be written."""
+        state = mi.parser.ParserState(self.state)
+        for node in state.nodes:
+            if "data" in node.props and is_bitmap(node):  # an instance takes the tensor away
+                node.props["data"] = mi.TensorXf(np.array(node.props["data"], np.float32))
+        return Parsed(self.config, state)
 
 
 def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None) -> Parsed:
@@ -109,8 +120,6 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
         for node in state.nodes:
             _make_absolute(node.props)
     for node in state.nodes:
-        if "data" in node.props and is_bitmap(node):  # an instance takes the tensor away
-            node.props["data"] = mi.TensorXf(np.array(node.props["data"], np.float32))
         kinds = {GAUSSIANS: texture_kind(), SKY: mi.ObjectType.Emitter}
         if kind := kinds.get(node.props.plugin_name()):  # Mitsuba does not know plugins in Python
             node.type = kind
@@ -149,6 +158,13 @@ def file_keys(props: Properties) -> list[str]:
     return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 
 
+def references(props: Properties) -> dict[str, int]:
+    """Return the indices of the nodes that a parsed node has in its slots."""
+    kind = mi.Properties.Type.ResolvedReference
+    slots = (slot for slot in props.keys() if props.type(slot) == kind)  # noqa: SIM118
+    return {slot: props[slot].index() for slot in slots}
+
+
 def uses_of(
     parsed: Parsed, key_of: Callable[[int, str], str | None]
 ) -> tuple[list[Use], list[tuple[str, str]]]:
@@ -169,9 +185,8 @@ def uses_of(
     nodes = parsed.state.nodes
     parents: dict[int, list[tuple[int, str]]] = {}
     for index, node in enumerate(nodes):
-        for slot in node.props.keys():  # noqa: SIM118  it is no mapping
-            if node.props.type(slot) == mi.Properties.Type.ResolvedReference:
-                parents.setdefault(node.props[slot].index(), []).append((index, slot))
+        for slot, child in references(node.props).items():
+            parents.setdefault(child, []).append((index, slot))
     uses, left = [], list[tuple[str, str]]()
     for index, node in enumerate(nodes):
         props = node.props
@@ -189,7 +204,8 @@ def uses_of(
             continue
         file = os.path.realpath(props["filename"]) if "filename" in props else f"{slot}-{index}"
         raw, wrap = bool(props.get("raw", False)), str(props.get("wrap_mode", "repeat"))
-        uses.append(Use(index, parent, slot, file, raw, wrap, "bumpmap" in parents_of, name))
+        relief = RELIEF.get(parents_of[0], "")
+        uses.append(Use(index, parent, slot, file, raw, wrap, relief, name))
     return uses, left
 
 
@@ -214,8 +230,8 @@ def _reason(props: Properties, parents: list[str]) -> str:
     """Return why the properties or users of a bitmap require a bitmap, or nothing."""
     if not parents:
         return "nothing uses it"
-    if "bumpmap" in parents and len(set(parents)) > 1:
-        return "heights of a bump map that are something else too"
+    if len(set(parents)) > 1 and (relief := {*parents} & {*RELIEF}):
+        return f"{RELIEF[min(relief)]} that are something else too"
     if str(props.get("filter_type", "bilinear")) != "bilinear":
         return "its filter shows single texels"
     return ""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -18,6 +18,8 @@ from ..backend.doors import door
 from ..backend.messages import warn
 from ..backend.progress import shows_progress
 from ..backend.types import PathLike, Record
+from ..fitting.options import Goal
+from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import FIELDS, Gaussians
 from ..image.io import ImageError
 from ..image.metrics import psnr
@@ -38,15 +40,24 @@ from .bitmaps import (
     label,
     parse,
     read_pixels,
+    references,
     uses_of,
 )
-from .costs import Cost, costs_of, of_environment, of_texture
-from .fit_environment import fit_environment
-from .fit_uses import Original, fit_heights, fit_picture, replace_bitmap
-from .rendering import Progress, compare, pictures
+from .fit_environment import BYTES, fit_environment
+from .fit_uses import Original, fit_picture, fit_relief, replace_bitmap
+from .rendering import Progress, compare, pictures, silent
 
 SCENE = "scene.xml"
 """Name of the new scene in its folder."""
+
+NEGLIGIBLE = 1 << 14
+"""Bytes that are not worth saving: the smallest images take less."""
+
+MOST_OVERLAP = 32.0
+"""Mean number of Gaussians at a point from which on the bitmap is better: a lookup then takes eight
+times as long as in a bitmap (4 times with the 15 of a usual fit, 15 with 96; llvm, CPU time). Time
+itself would decide otherwise on a busy machine. Lookups are a small part of a rendering: the
+picture of a coated ball takes 1.1 times as long where they take two to three times as long."""
 
 NO_SHAPE = "no shape outside of groups has it, so that no camera sees it directly"
 
@@ -64,18 +75,15 @@ class ConvertedTexture(NamedTuple):
     width, height, channels : int
     bytes : int
         Memory of its bitmaps in the scene, see `eigengs_dr.plugins.resident_bytes`.
-    lookup_ns : float
-        Time of a lookup in the bitmap, in nanoseconds, on all cores of this machine; of an
-        environment map, of a lookup and a direction that is sampled.
     gaussians : int
     gaussian_bytes : int
         Memory of the textures of Gaussians in the scene. Those of one wrap mode share it.
-    gaussian_lookup_ns : float
-        Time of a lookup in the Gaussians.
+    overlap : float
+        Mean number of Gaussians at a point of the image: what a lookup sums.
     psnr : float
         Lowest PSNR in dB with which a camera sees it, see `eigengs_dr.fit_for_scene`; of a bump
-        map, lowest PSNR between the renderings with and without this set alone; of an environment
-        map, the lower PSNR of its picture and of the light that it gives to surfaces.
+        or normal map, lowest PSNR between the renderings with and without this set alone; of an
+        environment map, the lower PSNR of its picture and of the light that it gives to surfaces.
     """
 
     names: tuple[str, ...]
@@ -84,10 +92,9 @@ class ConvertedTexture(NamedTuple):
     height: int
     channels: int
     bytes: int
-    lookup_ns: float
     gaussians: int
     gaussian_bytes: int
-    gaussian_lookup_ns: float
+    overlap: float
     psnr: float
 
 
@@ -102,7 +109,7 @@ class ConvertedScene(NamedTuple):
     textures : list of ConvertedTexture
         Bitmaps that became Gaussians.
     better : list of ConvertedTexture
-        Bitmaps that stayed, since they take less memory or time than Gaussians.
+        Bitmaps that stayed, since they take less memory than Gaussians, or many overlap.
     left : list of (str, str)
         What else stayed, and why.
     psnr : list of float
@@ -146,11 +153,10 @@ def convert_scene(
 ) -> ConvertedScene:
     """Replace the bitmaps of a scene by as many Gaussians as its cameras resolve.
 
-    Uses of one image share a set. A bitmap that takes less memory than its Gaussians, or an eighth
-    of their time, is better and stays. The function leaves alone what Gaussians would spoil or
-    cannot replace: bump maps with which the renderings would miss the PSNR,
-    images of two values such as masks, data beyond 0 and 1, and images of no shape or that no
-    camera sees.
+    Uses of one image share a set. A bitmap that takes less memory than its Gaussians, or where many
+    of them overlap, is better and stays. The function leaves alone what Gaussians would spoil or
+    cannot replace: bump and normal maps with which the renderings would miss the PSNR, images of
+    two values such as masks, data beyond 0 and 1, and images of no shape or that no camera sees.
 
     Parameters
     ----------
@@ -159,7 +165,8 @@ def convert_scene(
     output : path-like
         Folder to write; it must not exist, or be empty. It is written as a whole, or not at all.
     target_psnr : float, optional
-        Lowest PSNR in dB with which a camera sees a texture, see `eigengs_dr.fit_for_scene`.
+        Lowest PSNR in dB with which a camera sees a texture, see `eigengs_dr.fit_for_scene`, and
+        the goal of the renderings: where they need more, a texture gets up to 6 dB more.
     iterations : int, optional
         Steps of refinement for each number of Gaussians.
     spp : int, optional
@@ -213,8 +220,8 @@ def convert_scene(
     with lock_output(output):
         remove_stale(target.parent)
         with atomic_folder(output) as work:
-            make = partial(parse, scene, parameters)
-            result = _convert_into(work, target, make, settings, progress or _silent)
+            parsed = parse(scene, parameters)
+            result = _convert_into(work, target, parsed, settings, progress or silent)
     for camera in result.missed(target_psnr):
         warn(
             f"{output}: camera {camera} sees psnr_rgb {result.psnr[camera - 1]:.1f} dB between the "
@@ -238,31 +245,27 @@ def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
         raise ValueError(f"{output}: exists and is not empty; choose another folder")
 
 
-def _silent(label: str, done: int, total: int) -> None:
-    """Show no progress."""
-
-
 def _convert_into(
     work: Path,
     target: Path,
-    make: Callable[[], Parsed],
+    parsed: Parsed,
     settings: Settings,
     progress: Progress,
 ) -> ConvertedScene:
-    """Write a scene and its files into a folder that becomes the target; `make` parses it."""
-    again = make()
-    original = Original(make, settings.spp)
-    uses, left = uses_of(again, original.key_of)
+    """Write a scene and its files into a folder that becomes the target."""
+    progress("scene", 0, 1)
+    original = Original(parsed, settings.spp)
+    uses, left = uses_of(parsed, original.key_of)
     result = ConvertedScene(work / SCENE, [], [], left, [], [])
     replacements = dict[int, str]()
-    groups: dict[tuple[str, bool, bool], list[Use]] = {}
+    groups: dict[tuple[str, bool, str], list[Use]] = {}
     on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
         if any(original.textures([use])[0] in hierarchy for hierarchy in on_shapes):
-            groups.setdefault((use.file, use.raw, use.is_height), []).append(use)
+            groups.setdefault((use.file, use.raw, use.relief), []).append(use)
         else:
             left.append((use.name, NO_SHAPE))
-    sky = environment_of(again)
+    sky = environment_of(parsed)
     total = len(groups) + (sky is not None)
 
     def add(outcome: ConvertedTexture | str, nodes: dict[int, str]) -> None:
@@ -275,25 +278,27 @@ def _convert_into(
             result.textures.append(outcome)
             replacements.update(dict.fromkeys(nodes, outcome.file))
 
-    for number, group in enumerate(groups.values()):
-        progress("textures", number, total)
-        file = work / _file_name(
-            group[0].file, group[0].raw, {texture.file for texture in result.textures}
-        )
-        pixels = read_pixels(again.state.nodes[group[0].node].props)
-        outcome = _convert(original, group, pixels, file, settings)
+    def shown(number: int, name: str) -> Progress:
+        """Return what shows the stages of one of the images."""
+        return lambda label, *done: progress(f"{number}/{total} {name}: {label}", *done)
+
+    for number, group in enumerate(groups.values(), 1):
+        used = {texture.file for texture in result.textures}
+        file = work / _file_name(group[0].file, group[0].raw, used)
+        pixels = read_pixels(parsed.state.nodes[group[0].node].props)
+        show = shown(number, Path(group[0].file).name)
+        outcome = _convert(original, group, pixels, file, settings, show, len(groups))
         add(outcome, {use.node: use.name for use in group})
     if sky is not None:
-        progress("textures", len(groups), total)
-        props = again.state.nodes[sky].props
+        props = parsed.state.nodes[sky].props
         name = label(props, original.keys.get(original.scene.environment(), "environment"))
         path = str(props["filename"]) if "filename" in props else "sky"
         file = work / _file_name(path, False, {texture.file for texture in result.textures})
-        add(_convert_sky(original, name, read_pixels(props), file, settings), {sky: name})
-    progress("textures", total, total)
-    _mark_integrator(original, again)
-    _rewrite(again, replacements, work, target)
-    result.scene.write_text(_to_xml(again), encoding="utf-8")
+        show = shown(total, Path(path).name)
+        add(_convert_sky(original, name, read_pixels(props), file, settings, show), {sky: name})
+    _mark_integrator(original, parsed)
+    _rewrite(parsed, replacements, work, target)
+    result.scene.write_text(_to_xml(parsed), encoding="utf-8")
     if settings.spp != 0:
         progress("renderings", 0, 2)
         after = pictures(mi.load_file(str(result.scene)), settings.spp)
@@ -315,44 +320,55 @@ def _convert(
     pixels: NDArray[np.float32],
     file: Path,
     settings: Settings,
+    show: Progress,
+    share: int,
 ) -> ConvertedTexture | str:
     """Fit the image of some uses and save the set, or return why it must stay.
 
-    If the bitmap is better, there is no file.
+    Of the errors that renderings may have, it gets one of so many shares. If the bitmap is better,
+    there is no file.
     """
-    use, asked = group[0], (settings.target_psnr, settings.iterations)
+    use, bitmaps = group[0], original.textures(group)
+    held = sum(map(resident_bytes, bitmaps))
     try:
-        if use.is_height:
-            g, seen = fit_heights(original, group, pixels, *asked, file)
+        if use.relief:
+            most = None if settings.replace_all else (held + NEGLIGIBLE) // BYTES
+            needed = settings.target_psnr + 10 * math.log10(share)
+            goal = Goal(needed, max_gaussians=most)
+            g, seen = fit_relief(original, group, pixels, goal, settings.iterations, file, show)
         else:
-            g, seen = fit_picture(original, group, pixels, *asked)
-            g.save(file)
+            asked = settings.target_psnr, settings.iterations
+            g, seen = fit_picture(original, group, pixels, *asked, file, show, share)
     except (Unsuitable, ImageError) as error:
+        file.unlink(missing_ok=True)
         return str(error)
     saved, wraps = {"type": GAUSSIANS, "filename": str(file)}, {use.wrap for use in group}
     sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted(wraps)]
-    look = of_texture(use.raw or use.is_height, g.channels)
-    costs = costs_of((original.textures(group), sets), look)
-    return _chosen(tuple(use.name for use in group), file, g, seen, costs, settings)
+    both = [held, sum(map(resident_bytes, sets))]
+    return _chosen(tuple(use.name for use in group), file, g, seen, both, settings)
 
 
 def _convert_sky(
-    original: Original, name: str, pixels: NDArray[np.float32], file: Path, settings: Settings
+    original: Original,
+    name: str,
+    pixels: NDArray[np.float32],
+    file: Path,
+    settings: Settings,
+    show: Progress,
 ) -> ConvertedTexture | str:
     """Fit an environment map and save the set, or return why it must stay."""
     sky = original.scene.environment()
     try:
         check_rotation(sky.world_transform())
-        g, seen = fit_environment(
-            original.scene, pixels, settings.target_psnr, settings.iterations, resident_bytes(sky)
-        )
+        asked = settings.target_psnr, settings.iterations, resident_bytes(sky)
+        g, seen = fit_environment(original.scene, pixels, *asked, show)
     except (Unsuitable, ImageError) as error:
         return str(error)
     except ValueError:
         return "an environment map that its to_world scales or shears"
     g.save(file)
-    costs = costs_of(([sky], [mi.load_dict({"type": SKY, "filename": str(file)})]), of_environment)
-    return _chosen((name,), file, g, seen, costs, settings)
+    held = list(map(resident_bytes, (sky, mi.load_dict({"type": SKY, "filename": str(file)}))))
+    return _chosen((name,), file, g, seen, held, settings)
 
 
 def _chosen(
@@ -360,12 +376,16 @@ def _chosen(
     file: Path,
     g: Gaussians,
     seen: float,
-    costs: list[Cost],
+    held: list[int],
     settings: Settings,
 ) -> ConvertedTexture:
-    """Report an image, and remove the file of its set if the bitmap is better."""
-    bitmap, gaussians = costs
-    stays = bitmap.is_better_than(gaussians) and not settings.replace_all
+    """Report an image, and remove the file of its set if the bitmap is better.
+
+    `held` are the bytes of the bitmaps, and of the Gaussians.
+    """
+    overlap = overlap_of(g)
+    is_better = held[1] - held[0] > NEGLIGIBLE or overlap > MOST_OVERLAP
+    stays = is_better and not settings.replace_all
     if stays:
         file.unlink()
     return ConvertedTexture(
@@ -374,20 +394,26 @@ def _chosen(
         width=g.width,
         height=g.height,
         channels=g.channels,
-        bytes=bitmap.bytes,
-        lookup_ns=bitmap.nanoseconds,
+        bytes=held[0],
         gaussians=len(g),
-        gaussian_bytes=gaussians.bytes,
-        gaussian_lookup_ns=gaussians.nanoseconds,
+        gaussian_bytes=held[1],
+        overlap=overlap,
         psnr=seen,
     )
+
+
+def overlap_of(g: Gaussians) -> float:
+    """Return the mean number of Gaussians at a point of the image: their areas by its own."""
+    a, _, c = g.to_arrays()["factor"].T
+    return float(np.minimum(math.pi * CUTOFF**2 / (a * c) / (g.width * g.height), 1).sum())
 
 
 def _file_name(image: str, raw: bool, used: set[str]) -> str:
     """Name the file of a set after its image."""
     stem = Path(image).stem
-    names = [f"{stem}.npz", f"{stem}-data.npz", *(f"{stem}-{k}.npz" for k in range(2, 1000))]
-    return next(name for name in names[raw and f"{stem}.npz" in used :] if name not in used)
+    data = [f"{stem}-data.npz"] if raw else []
+    names = chain([f"{stem}.npz"], data, (f"{stem}-{k}.npz" for k in count(2)))
+    return next(name for name in names if name not in used)
 
 
 # --- The scene -----------------------------------------------------------------------------------
@@ -440,11 +466,16 @@ def _save_set(props: Properties, folder: Path, file: str) -> None:
 
 
 def _to_xml(parsed: Parsed) -> str:
-    """Write a parsed scene as XML.
+    """Write a parsed scene as XML, with the ids of all objects.
 
-    Mitsuba writes what a dictionary calls "floor" as ``name="floor"``. Only of an ``id`` does
-    `mitsuba.traverse` make a name.
+    Cameras are chosen by ids and `mitsuba.traverse` makes names of them, but Mitsuba's writer drops
+    those that nothing refers to.
     """
+    nodes, owners = parsed.state.nodes, dict[str, int]()
+    for index in [*references(parsed.state.root.props).values(), *range(len(nodes))]:
+        props = nodes[index].props
+        if owners.setdefault(props.id(), index) != index:
+            props.set_id("")  # of a dictionary, where slots without an id are all called "bsdf"
     try:
         root = ElementTree.fromstring(mi.parser.write_string(parsed.state))
     except RuntimeError as error:
@@ -452,7 +483,17 @@ def _to_xml(parsed: Parsed) -> str:
         raise ValueError(
             f"the scene cannot be written as XML ({reason}); give meshes and volumes by files"
         ) from None
-    for child in root:
-        if "type" in child.attrib and "name" in child.attrib and "id" not in child.attrib:
-            child.set("id", child.attrib.pop("name"))
+    _write_ids(root, parsed.state.root.props, nodes)
     return ElementTree.tostring(root, encoding="unicode")
+
+
+def _write_ids(
+    element: ElementTree.Element, props: Properties, nodes: list[mi.parser.SceneNode]
+) -> None:
+    """Give an element and those in it the ids of their nodes, which the writer visits in turn."""
+    if props.id():
+        element.set("id", props.id())
+    children = [child for child in element if child.tag == "ref" or "type" in child.attrib]
+    for child, index in zip(children, references(props).values(), strict=True):
+        if child.tag != "ref":  # what is written already
+            _write_ids(child, nodes[index].props, nodes)

@@ -25,6 +25,7 @@ from ..plugins.cone import pixel_angle
 from ..raster.render import render
 from .bitmaps import Unsuitable
 from .fit_scene import ENOUGH, shrunk
+from .rendering import Progress, silent
 
 FINER = 2
 """Texels of the fit along a texel that cameras resolve, and points of the comparison along one of
@@ -51,6 +52,7 @@ def fit_environment(
     target_psnr: float,
     iterations: int,
     max_bytes: int,
+    show: Progress = silent,
 ) -> tuple[Gaussians, float]:
     """Find the fewest Gaussians that show an environment map at a PSNR.
 
@@ -66,6 +68,8 @@ def fit_environment(
         Steps of the fits.
     max_bytes : int
         Largest memory of a set.
+    show : callable, optional
+        ``show(label, done, total)``.
 
     Returns
     -------
@@ -98,7 +102,7 @@ def fit_environment(
             iterations=iterations,
             space=space,
             encoding="linear",
-            progress=False,
+            progress=lambda step, steps, row: show("search", step, steps),
         )
         balanced = with_mean_of(target, result.gaussians)
         kept = closeness(_means(balanced), target)

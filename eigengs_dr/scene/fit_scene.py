@@ -8,7 +8,7 @@ which every camera sees the texture at a given PSNR.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -20,8 +20,11 @@ from skimage.transform import resize_local_mean
 
 from ..backend.arrays import types_in
 from ..backend.doors import door
+from ..backend.interrupts import defer_interrupts
+from ..backend.progress import shows_progress
 from ..backend.selection import backend_of, select
 from ..fitting.fewest import fewest
+from ..fitting.fit import FitInterrupted
 from ..fitting.measure import Row
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Affine, Data, Pixels, restored
@@ -36,14 +39,19 @@ from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
 from ..raster.render import render
 from .bitmaps import Unsuitable
-from .target import MARGIN, error_weights, seen_by, smoothest_target
+from .rendering import Progress, silent
+from .target import error_weights, seen_by, smoothest_target
 from .visibility import Box, Visibility, visibility
 
 COLORS = ("linear", "radiance", "data")
 """Names of the spaces of textures: linear light to 1, or of any range, or data."""
 
 PIXELS = 4
-"""Pixels per Gaussian at the start of the search."""
+"""Fewest pixels per Gaussian at the start of the search."""
+
+FEWER, GAIN = (64, 16, 4, 1), 8.0
+"""Parts of that number that are placed in turn, and decibels that a search gains: the first part
+that is no further below the goal is the start. A fit of few Gaussians needs few texels."""
 
 ENOUGH = 2.0
 """Smallest number of texels per pixel without an enlargement. With fewer texels the image is
@@ -55,6 +63,9 @@ takes a quarter of the time. 1,024 x 1,024 texels at 6 and more texels per pixel
 DETAIL = 64
 """Fewest seen texels per Gaussian in a fit. A target with four times as many is halved, again and
 again: 200 Gaussians show no more of an enlarged image, and a step takes the time of its texels."""
+
+ROUNDING = 1e-3
+"""By how much data may exceed 0 and 1."""
 
 FINER = 3
 """Factor of the enlargement; odd, so that the centres of texels stay samples."""
@@ -83,7 +94,12 @@ class SceneFit(NamedTuple):
     visibility: Visibility
     tried: list[tuple[int, float]]
 
+    def __repr__(self) -> str:
+        g, seen = self.gaussians, ", ".join(f"{psnr:.2f}" for psnr in self.psnr)
+        return f"SceneFit({len(g)} Gaussians, {g.width}x{g.height} pixels, psnr=({seen}))"
 
+
+@shows_progress
 @door
 def fit_for_scene(
     scene: Any,
@@ -95,6 +111,7 @@ def fit_for_scene(
     iterations: int = 400,
     wrap_mode: str | Sequence[str] = "repeat",
     encoding: str | None = None,
+    progress: Any = None,
 ) -> SceneFit:
     """Find the fewest Gaussians with which all cameras of a scene see an image at a given PSNR.
 
@@ -123,6 +140,9 @@ def fit_for_scene(
         See `eigengs_dr.scene.visibility.visibility`.
     encoding : {"srgb", "linear"}, optional
         What the pixels are, see `eigengs_dr.fit`.
+    progress : bool or callable, optional
+        By default a bar, in a terminal or a notebook, after two seconds; False shows none.
+        ``progress(label, done, total)``.
 
     Returns
     -------
@@ -133,6 +153,8 @@ def fit_for_scene(
     ValueError
         If the image or an argument is unusable, the scene has no such texture, no pixel sees it, or
         the largest number of Gaussians does not suffice.
+    FitInterrupted
+        After Ctrl-C in the search; its ``result`` is the SceneFit of the best set so far.
 
     Examples
     --------
@@ -153,7 +175,43 @@ def fit_for_scene(
             "least 0 and at least 1"
         )
     checked = check_data(image) if space == "data" else check_image(image, encoding=encoding)
+    low, high = float(checked.min()), float(checked.max())
+    if space == "data" and (low < -ROUNDING or high > 1 + ROUNDING):
+        raise ValueError(
+            f"image: data from {low:g} to {high:g}; cameras compare data from 0 to 1: scale it"
+        )
     pixels = checked.clip(0, None if space == "radiance" else 1)
+    return fit_seen(
+        scene,
+        texture,
+        pixels,
+        target_psnr,
+        space,
+        max_gaussians,
+        iterations,
+        wrap_mode,
+        progress or silent,
+    )
+
+
+def fit_seen(
+    scene: Any,
+    texture: str | Texture | Sequence[str | Texture],
+    pixels: Image,
+    target_psnr: float,
+    space: str,
+    max_gaussians: int | None,
+    iterations: int,
+    wrap_mode: str | Sequence[str],
+    show: Progress = silent,
+    aim: Callable[[Gaussians, float], float] | None = None,
+) -> SceneFit:
+    """Find the fewest Gaussians for checked pixels; see `fit_for_scene`.
+
+    ``aim(gaussians, psnr)`` returns the PSNR to look for, once the cameras have seen a first set at
+    a PSNR; at most `eigengs_dr.scene.target.MARGIN` above `target_psnr`.
+    """
+    show("rays", 0, 1)
     height, width = pixels.shape[:2]
     values = pixels if space == "data" else to_linear(pixels)
     peak = max(1.0, float(values.max())) if space == "radiance" else 1.0
@@ -180,36 +238,52 @@ def fit_for_scene(
         pictures = (seen_by(candidate, rows, kind, peak) for rows in fine.pixel_to_texel)
         return tuple(psnr_of(a, b, compared) for a, b in zip(pictures, goal, strict=True))
 
-    target = smoothest_target(values, fine, lambda t: min(seen(t)) >= target_psnr + MARGIN)
+    def closeness(candidate: Image) -> float:
+        show("target", 0, 1)
+        return min(seen(candidate))
+
+    target = smoothest_target(values, fine, closeness, target_psnr)
     weight = error_weights(fine, target, kind)
 
     max_gaussians = min(max_gaussians or int(native.seen.sum()), fine.seen.size)
     looks = np.minimum(PIXEL / native.footprint[native.seen], 1) ** 2  # pixels per texel, at most 1
-    first = min(max(1, int(looks.sum()) // PIXELS), max_gaussians)
-    objective = _objective(target, weight, fine.seen, first, kind)
+    most = min(max(1, int(looks.sum()) // PIXELS), max_gaussians)
     size = fine.seen.shape[1], fine.seen.shape[0]
+    away = distance_transform_edt(~fine.seen)
 
     def score(gaussians: Gaussians) -> list[Row]:
-        psnr = seen(render(_without_unseen(gaussians.scaled(*size), fine.seen)).numpy())
+        psnr = seen(render(_without_unseen(gaussians.scaled(*size), away)).numpy())
         return [{"psnr_ycbcr": min(psnr), "psnr": psnr}]
 
-    start = DEFAULT.place_and_solve(objective, first)
-    search = fewest(
-        objective, DEFAULT, start, score, ("psnr_ycbcr", target_psnr), max_gaussians, iterations
-    )
-    if search.stopped != "met":
-        reached = search.row["psnr_ycbcr"]
+    def whole(gaussians: Gaussians) -> Gaussians:
+        kept = _without_unseen(gaussians.scaled(*size), away)
+        mean = kept.mean + type(kept.mean)(box.left + corner.left, box.top + corner.top)
+        placed = replace(kept, mean=mean, width=fine_width, height=fine_height, space=space)
+        return restored(placed.scaled(width, height), Affine(peak))
+
+    for count in (-(-most // fewer) for fewer in FEWER):
+        objective = _objective(target, weight, fine.seen, count, kind)
+        start = DEFAULT.place_and_solve(objective, count)
+        [row] = score(start)
+        if row["psnr_ycbcr"] >= target_psnr - GAIN:
+            break
+    aimed = ("psnr_ycbcr", aim(whole(start), row["psnr_ycbcr"]) if aim else target_psnr)
+    with defer_interrupts() as interrupted:
+        search = fewest(
+            objective, DEFAULT, start, score, aimed, max_gaussians, iterations,
+            progress=lambda step, steps, row: show("search", step, steps), interrupted=interrupted,
+        )  # fmt: skip
+    reached = search.row["psnr_ycbcr"]
+    if search.stopped == "out of reach" and reached < target_psnr:
         raise Unsuitable(
             f"{len(search.gaussians)} Gaussians reach {reached:.1f} dB, but the cameras shall see "
             f"{target_psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
         )
-    gaussians = _without_unseen(search.gaussians.scaled(*size), fine.seen)
-    left, top = box.left + corner.left, box.top + corner.top
-    mean = gaussians.mean + type(gaussians.mean)(left, top)
-    placed = replace(gaussians, mean=mean, width=fine_width, height=fine_height, space=space)
     tried = [(row["gaussians"], row["psnr_ycbcr"]) for row in search.trace]
-    whole = restored(placed.scaled(width, height), Affine(peak))
-    return SceneFit(whole, search.row["psnr"], native, tried)
+    found = SceneFit(whole(search.gaussians), search.row["psnr"], native, tried)
+    if search.stopped == "interrupted":
+        raise FitInterrupted(found)  # type: ignore[arg-type]
+    return found
 
 
 def _objective(
@@ -256,12 +330,15 @@ def _crop_to_seen(values: Image, view: Visibility) -> tuple[Image, Visibility, B
     return np.ascontiguousarray(box.of(values)), cut, box
 
 
-def _without_unseen(gaussians: Gaussians, seen: NDArray[np.bool_]) -> Gaussians:
-    """Keep the Gaussians that may reach a seen texel, by their longer axes; at least one."""
+def _without_unseen(gaussians: Gaussians, away: NDArray[np.floating]) -> Gaussians:
+    """Keep the Gaussians that may reach a seen texel, by their longer axes; at least one.
+
+    `away` holds the distance of each texel from the nearest seen one.
+    """
     arrays = gaussians.to_arrays()
     mean, factor = arrays["mean"], arrays["factor"]
-    column = mean[:, 0].astype(int).clip(0, seen.shape[1] - 1)
-    row = mean[:, 1].astype(int).clip(0, seen.shape[0] - 1)
-    away = distance_transform_edt(~seen)[row, column]
-    reaches = away <= np.maximum(CUTOFF * max_deviation(*factor.T), away.min())
+    column = mean[:, 0].astype(int).clip(0, away.shape[1] - 1)
+    row = mean[:, 1].astype(int).clip(0, away.shape[0] - 1)
+    far = away[row, column]
+    reaches = far <= np.maximum(CUTOFF * max_deviation(*factor.T), far.min())
     return gaussians[np.flatnonzero(reaches)]

@@ -1,36 +1,50 @@
-"""Gaussians for the uses of an image in a scene: pictures as cameras see them, and heights.
+"""Gaussians for the uses of an image in a scene: pictures as cameras see them, and relief.
 
-Cameras see the slopes of a bump map, not its heights, and bitmaps have facets where Gaussians are
-smooth. So heights are fitted texel by texel, more closely than renderings need, and the renderings
-decide.
+Cameras see the slopes of a bump map and the light on a normal map, not their values, and bitmaps
+have facets where Gaussians are smooth. So values are fitted texel by texel, more closely than
+renderings need, and the renderings decide.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import zoom
 
 from ..fitting.fit import fit
+from ..fitting.options import Goal
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import psnr
 from ..plugins.versions import Properties
-from .bitmaps import GAUSSIANS, KEPT, SKY, SKY_KEPT, Parsed, Unsuitable, Use, space_of
-from .fit_scene import fit_for_scene, halved
-from .rendering import pictures
+from .bitmaps import GAUSSIANS, KEPT, RELIEF, SKY, SKY_KEPT, Parsed, Unsuitable, Use, space_of
+from .fit_scene import FINER, fit_seen, halved
+from .rendering import Progress, pictures
+from .target import MARGIN
 from .visibility import visibility
 
-CLOSER = (10.0, 15.0, 20.0)
-"""PSNR of the heights above that required of the renderings, in dB, tried in turn. Heights of waves
-and of smooth noise, 128 x 128 texels on 48 x 48 pixels, kept 41 and 43 dB between the renderings
-where they had 49 and 63 dB themselves, and those of tiles 34 where they had 57: the slopes of a
-bitmap jump at its texels."""
+CLOSER = (5.0, 10.0, 15.0, 20.0)
+"""PSNR of heights and normals above that required of the renderings, in dB, tried in turn, but for
+those that add less than what was missing. Heights of waves and of smooth noise, 128 x 128 texels on
+48 x 48 pixels, kept 41 and 43 dB between the renderings where they had 49 and 63 dB themselves."""
+
+FACETS = 1.0
+"""Decibels by which renderings of a smooth surface through all texels may miss the goal before a
+fit: those of tiles kept 34 dB, since the slopes of a bitmap jump at its texels, and no set of the
+tiles kept more."""
+
+LARGEST = 1 << 20
+"""Most texels of a bitmap of which a smooth surface is made."""
+
+SPLINES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}
+"""How SciPy continues an image, by the wrap mode of a bitmap."""
 
 NUMBERED = re.compile(r"object_\d+")
 """Name that Mitsuba gives to objects without an id."""
@@ -45,22 +59,21 @@ class Original:
 
     Attributes
     ----------
-    make : callable
-        Parses it again: an instantiated scene cannot be written or changed.
+    source : Parsed
     spp : int or None
         Samples per pixel of renderings, by default those of the cameras.
     parsed : Parsed
-        The parsed scene, whose references to textures are their instances.
+        A copy of it, whose references to textures are their instances.
     scene : mitsuba.Scene
     """
 
-    make: Callable[[], Parsed]
+    source: Parsed
     spp: int | None
     parsed: Parsed = field(init=False)
     scene: mi.Scene = field(init=False)
 
     def __post_init__(self) -> None:
-        self.parsed = self.make()
+        self.parsed = self.source.copied()
         self.scene = mi.parser.instantiate(self.parsed.config, self.parsed.state)
 
     @cached_property
@@ -88,11 +101,11 @@ class Original:
         """Return the instances of bitmaps."""
         return [self.parsed.state.nodes[use.parent].props[use.slot] for use in uses]
 
-    def psnr_with(self, file: Path, uses: list[Use]) -> float:
-        """Return the lowest PSNR of a camera if only this set replaces its bitmap."""
-        other = self.make()
+    def psnr_with(self, change: Callable[[Properties], None], uses: list[Use]) -> float:
+        """Return the lowest PSNR of a camera if only the bitmaps of some uses are changed."""
+        other = self.source.copied()
         for use in uses:
-            replace_bitmap(other.state.nodes[use.node].props, str(file))
+            change(other.state.nodes[use.node].props)
         seen = pictures(mi.parser.instantiate(other.config, other.state), self.spp)
         return min(psnr(a, b) for a, b in zip(self.pictures, seen, strict=True))
 
@@ -113,8 +126,14 @@ def fit_picture(
     pixels: NDArray[np.float32],
     target_psnr: float,
     iterations: int,
+    file: Path,
+    show: Progress,
+    share: int = 1,
 ) -> tuple[Gaussians, float]:
-    """Fit an image for its uses.
+    """Fit an image for its uses, and save the set.
+
+    Cameras see it at the PSNR in even light. Lamps may amplify what is dark, and one of several
+    images may leave a part of the errors alone, so a first set is rendered in place of the bitmap.
 
     Returns
     -------
@@ -127,37 +146,46 @@ def fit_picture(
     Unsuitable
         If it must stay a bitmap.
     """
+
+    def aim(gaussians: Gaussians, seen: float) -> float:
+        gaussians.save(file)
+        lost = seen - original.psnr_with(partial(replace_bitmap, file=str(file)), group)
+        needed = target_psnr + 10 * math.log10(share) + lost
+        return min(max(needed, target_psnr), target_psnr + MARGIN)
+
     use = group[0]
-    # Raw colours are still colours; pixels in memory are usually raw.
-    plugin = original.parsed.state.nodes[use.parent].props.plugin_name()
-    is_data = pixels.shape[2] == 1 or plugin == "normalmap"
-    result = fit_for_scene(
+    result = fit_seen(
         original.scene,
         original.textures(group),
-        pixels,
+        pixels.clip(0),
         target_psnr,
-        space_of(pixels, use.raw and is_data),
-        iterations=iterations,
-        wrap_mode=[use.wrap for use in group],
-        encoding="linear",
+        # Raw colours are still colours; pixels in memory are usually raw.
+        space_of(pixels, use.raw and pixels.shape[2] == 1),
+        None,
+        iterations,
+        [use.wrap for use in group],
+        show,
+        None if original.spp == 0 else aim,
     )
+    result.gaussians.save(file)
     return result.gaussians, min(result.psnr)
 
 
-def fit_heights(
+def fit_relief(
     original: Original,
     group: list[Use],
     pixels: NDArray[np.float32],
-    target_psnr: float,
+    goal: Goal,
     iterations: int,
     file: Path,
+    show: Progress,
 ) -> tuple[Gaussians, float]:
-    """Fit the heights of bump maps, and save the set.
+    """Fit the heights of bump maps or the vectors of normal maps, and save the set.
 
     Returns
     -------
     gaussians : Gaussians
-        Of one channel.
+        Of one channel, or of three.
     psnr : float
         Lowest PSNR in dB between the renderings of a camera.
 
@@ -166,29 +194,55 @@ def fit_heights(
     Unsuitable
         If no set keeps the PSNR between the renderings, or nothing is to be rendered.
     """
+    use = group[0]
     if original.spp == 0:
-        raise Unsuitable("heights of a bump map: renderings decide, and none was asked for")
-    heights = pixels if pixels.shape[2] == 1 else (pixels @ LUMINANCE)[..., None]
-    space_of(heights, True)  # it raises where Gaussians cannot hold them
-    height, width, _ = heights.shape
+        raise Unsuitable(f"{use.relief}: renderings decide, and none was asked for")
+    is_height = use.relief == RELIEF["bumpmap"]
+    values = (pixels @ LUMINANCE)[..., None] if is_height and pixels.shape[2] == 3 else pixels
+    space_of(values, True)  # it raises where Gaussians cannot hold them
+    height, width, _ = values.shape
     wraps = [use.wrap for use in group]
+    show("rays", 0, 1)
     seen = visibility(original.scene, original.textures(group), width, height, wraps)
-    heights, weight = (halved(v, seen) for v in (heights, np.float32(seen.seen)[..., None]))
-    reached = list[str]()
+    fitted, weight = (halved(v, seen) for v in (values, np.float32(seen.seen)[..., None]))
+    if fitted.shape == values.shape and height * width <= LARGEST:
+        show("trial", 0, 1)
+        kept = original.psnr_with(partial(_make_smooth, values), group)
+        if kept < goal.psnr - FACETS:
+            raise Unsuitable(
+                f"{use.relief}: the renderings keep {kept:.1f} dB if they are only made smooth"
+            )
+    reached, least = list[str](), 0.0
     for more in CLOSER:
+        if more < least:
+            continue
         result = fit(
-            heights,
-            target_psnr=min(target_psnr + more, 99.0),
+            fitted,
+            target_psnr=replace(goal, psnr=min(goal.psnr + more, 99.0)),
             iterations=iterations,
             space="data",
             weight=weight[..., 0],
-            progress=False,
+            progress=lambda step, steps, row: show("search", step, steps),
         )
         gaussians = result.gaussians.scaled(width, height)
         gaussians.save(file)
-        kept = original.psnr_with(file, group)
-        if kept >= target_psnr:
+        kept = original.psnr_with(partial(replace_bitmap, file=str(file)), group)
+        if kept >= goal.psnr:
             return gaussians, kept
         file.unlink()
         reached.append(f"{kept:.1f} dB with {len(gaussians):,} Gaussians")
-    raise Unsuitable(f"heights of a bump map: the renderings keep {', '.join(reached)}")
+        if result.stopped == "out of reach":
+            reached[-1] += ", the most that are allowed"
+            break
+        least = more + goal.psnr - kept
+    raise Unsuitable(f"{use.relief}: the renderings keep {', '.join(reached)}")
+
+
+def _make_smooth(values: NDArray[np.float32], props: Properties) -> None:
+    """Turn the properties of a bitmap into those of a smooth surface through its texels."""
+    mode = SPLINES[str(props.get("wrap_mode", "repeat"))]
+    finer = zoom(values, (FINER, FINER, 1), order=3, mode=mode, grid_mode=True)
+    for key in ("filename", "bitmap", "data"):
+        if key in props:
+            del props[key]
+    props["data"], props["raw"] = mi.TensorXf(finer.clip(0, 1)), True

@@ -18,6 +18,11 @@ from ..plugins.follow import follow_where_asked
 Progress = Callable[[str, int, int], None]
 """``progress(label, done, total)``."""
 
+
+def silent(label: str, done: int, total: int) -> None:
+    """Show no progress."""
+
+
 SAMPLES_PER_PASS = 1 << 24
 """Largest number of samples in one pass. The state of a sample takes about 20 bytes; progress and
 Ctrl-C wait for the end of a pass."""

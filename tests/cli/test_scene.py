@@ -249,7 +249,7 @@ def test_without_mitsuba(scene, tmp_path):
 
 
 def test_convert(tmp_path, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.scene.costs.NEGLIGIBLE", 0)  # the photo is small
+    monkeypatch.setattr("eigengs_dr.scene.convert.NEGLIGIBLE", 0)  # the photo is small
     scene = sky(save_images(tmp_path))
     settings = ("--psnr", 34, "--iterations", 5, "-D", "spp=2", *LLVM, "--report", tmp_path / "r")
     told = said("convert", scene, "-o", tmp_path / "new", "--replace-all", *settings)

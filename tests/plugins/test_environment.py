@@ -56,6 +56,22 @@ class TestPicture:
         expected = np.broadcast_to(expected.clip(0, top), found.shape)
         np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-4)
 
+    def test_the_more_texels_the_closer_is_an_envmap(self):
+        """Its rows go from pole to pole."""
+        g = sky(size=(32, 16))
+        d = np.random.default_rng(1).normal(size=(4096, 3)) * [1, 2, 1]  # many near the poles
+        d = np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+        d = np.ascontiguousarray(d.T)
+        expected = seen(mi.load_dict(environment_of(g)), d)
+        off = [
+            np.sqrt(np.square(seen(mi.load_dict(baked), d) - expected).mean())
+            for baked in (bake_environment(g, 32 * k) for k in (1, 2, 4, 8))
+        ]
+        assert off[1] < 0.4 * off[0] and off[2] < 0.6 * off[1] and off[3] < off[2]
+        for rows in (0, 1):
+            with pytest.raises(ValueError, match=f"{rows} rows; the set and the bitmap must"):
+                bake_environment(g, 32, rows)
+
     @in_all
     @pytest.mark.parametrize("name", TURNS)
     def test_is_that_of_an_envmap(self, variant, name):

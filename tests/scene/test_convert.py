@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,13 +14,14 @@ from _helpers.texture import gaussians
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.io import load_image
 from eigengs_dr.plugins import texture_of
-from eigengs_dr.scene import costs
+from eigengs_dr.scene import convert, fit_uses
 from eigengs_dr.scene.rendering import pictures
 from eigengs_dr.storage.locks import lock_output
 
 pytestmark = pytest.mark.mitsuba
 
 QUICK = {"target_psnr": 30, "iterations": 20, "replace_all": True}
+QUICKEST = {"target_psnr": 20, "iterations": 1, "replace_all": True}
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
         "rough.npz": ("rough.png (principled.roughness)",),
     }
     for texture in found.textures:
-        assert texture.psnr >= 30 and texture.lookup_ns > 0 and texture.gaussian_lookup_ns > 0
+        assert texture.psnr >= 30 and texture.overlap > 0
         saved = eg.Gaussians.load(tmp_path / "new" / texture.file)
         assert len(saved) == texture.gaussians
         assert saved.space == ("linear" if texture.file == "photo.npz" else "data")
@@ -58,8 +60,7 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
 
 def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     """A small photo takes less memory than its Gaussians, a large gradient takes more."""
-    monkeypatch.setattr(costs, "SLOWEST", np.inf)  # a busy machine times anything
-    monkeypatch.setattr(costs, "NEGLIGIBLE", 0)  # the photo is small
+    monkeypatch.setattr(convert, "NEGLIGIBLE", 0)  # the photo is small
     y, x = np.mgrid[:512, :512] / 512
     eg.save_image(folder / "soft.png", np.stack([0.2 + 0.5 * x, y * x, 0.5 + 0 * x], axis=2))
     text = wall(folder).read_text()
@@ -80,29 +81,31 @@ def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     assert bitmaps_in(found.scene) == len(found.better)
 
 
-def test_which_bitmap_is_better():
-    """One that takes less memory, or an eighth of the time."""
-    small, large = costs.Cost(100_000, 10.0), costs.Cost(200_000, 10.0)
-    assert small.is_better_than(large) and not small.is_better_than(small)
-    assert not small.is_better_than(small._replace(bytes=101_000))
-    assert not large.is_better_than(small._replace(nanoseconds=79.0))
-    assert large.is_better_than(small._replace(nanoseconds=81.0))
+def many_at_a_point(count):
+    """A set of wide Gaussians, of which so many overlap."""
+    side, deviation = 512, 20.0
+    number = round(count * side**2 / (np.pi * 9 * deviation**2))
+    mean = np.random.default_rng(0).uniform(0, side, (number, 2))
+    factor = np.tile([1 / deviation, 0, 1 / deviation], (number, 1))
+    return eg.Gaussians.from_arrays(mean, factor, np.full((number, 3), 0.01), size=(side, side))
 
 
-@pytest.mark.parametrize("kind", ["llvm_ad_mono", "llvm_ad_spectral"])
-def test_costs_of_data_and_colours_in_other_variants(folder, kind):
-    mi.set_variant(kind)
-    eg.register_plugins()
-    for file, raw, channels, space in (
-        ("photo.png", False, 3, "linear"),
-        ("rough.png", True, 1, "data"),
-        ("normals.png", True, 3, "data"),
+def test_where_many_gaussians_overlap_the_bitmap_is_better(tmp_path):
+    """A count decides, not a clock, and so does memory."""
+    settings = convert.Settings(40.0, 10, 0, False)
+    for count, held, stays in (
+        (20, [1 << 20, 1000], False),
+        (50, [1 << 20, 1000], True),
+        (20, [1000, 17_000], False),
+        (20, [1000, 18_000], True),
     ):
-        bitmap = mi.load_dict({"type": "bitmap", "filename": str(folder / file), "raw": raw})
-        set_of = mi.load_dict(texture_of(gaussians(space, channels)))
-        look = costs.of_texture(raw, channels)
-        for cost in costs.costs_of([[bitmap], [set_of, set_of]], look):
-            assert cost.bytes > 0 and 0 < cost.nanoseconds < 1e9
+        g, file = many_at_a_point(count), tmp_path / "set.npz"
+        assert convert.overlap_of(g) == pytest.approx(count, rel=0.02)
+        g.save(file)
+        for chosen in (settings, settings._replace(replace_all=True)):
+            found = convert._chosen(("name",), file, g, 40.0, held, chosen)
+            assert (found.file == "") == (not file.exists()) == (stays and chosen is settings)
+            g.save(file)
 
 
 def test_what_stays_and_why(folder, tmp_path):
@@ -145,6 +148,42 @@ def test_a_dictionary_with_a_mesh_and_a_bump_map_that_stays(folder, tmp_path):
     assert not (tmp_path / "new" / "rough.npz").exists()
 
 
+def test_ids_are_kept(folder, tmp_path):
+    """Also those that nothing refers to: of cameras, shapes, emitters, materials and textures."""
+    text = wall(folder).read_text().replace("<emitter", '<emitter id="sky"')
+    for number, kind in enumerate(["sensor", "sensor", "shape", "shape"]):
+        text = text.replace(f'<{kind} type="', f'<{kind} id="object-{number}" type="', 1)
+    text = text.replace('<bsdf type="principled"', '<bsdf type="principled" id="coat"')
+    text = text.replace('name="roughness" type', 'id="grain" name="roughness" type')
+    (folder / "named.xml").write_text(text)
+    found = eg.convert_scene(folder / "named.xml", tmp_path / "new", spp=0, **QUICKEST)
+    ids = [
+        {e.attrib["id"]: e.attrib["type"] for e in ElementTree.parse(file).iter("*")
+         if "id" in e.attrib and e.tag != "ref"}
+        for file in (folder / "named.xml", found.scene)
+    ]  # fmt: skip
+    bitmaps = {name for name, kind in ids[0].items() if kind == "bitmap"}
+    assert bitmaps == {"photo", "grain"}
+    assert ids[1] == ids[0] | dict.fromkeys(bitmaps, "gaussian_texture")
+    names = [
+        {k for k in mi.traverse(mi.load_file(str(file))).keys() if "to_world" in k}  # noqa: SIM118
+        for file in (folder / "named.xml", found.scene)
+    ]
+    assert names[1] == names[0] == {f"object-{k}.to_world" for k in range(4)}
+
+
+def test_ids_of_a_dictionary(folder, tmp_path):
+    """Slots are called alike in many objects, and one of them may be an object of the scene."""
+    photo = {"type": "bitmap", "filename": str(folder / "photo.png")}
+    coat = {"type": "diffuse", "id": "coat", "reflectance": {"type": "rgb", "value": 0.2}}
+    other = {"type": "sphere", "radius": 0.1, "bsdf": coat}
+    scene = plain(mi, folder, photo, other=other, bsdf={"type": "sphere", "bsdf": {"type": "null"}})
+    found = eg.convert_scene(scene, tmp_path / "new", spp=0, **QUICKEST)
+    ids = [e.attrib.get("id") for e in ElementTree.parse(found.scene).iter("*")]
+    assert {"cube", "other", "coat", "bsdf", "sensor"} <= {*ids}
+    assert "bsdf.to_world" in mi.traverse(mi.load_file(str(found.scene)))
+
+
 def bumpy(folder, name, **settings):
     """A wall with soft waves of 128 x 128 texels, which a camera sees at 24 x 24 pixels."""
     y, x = np.mgrid[:128, :128] / 128
@@ -176,9 +215,51 @@ def test_a_bump_map_without_renderings_stays(folder, tmp_path):
     assert found.textures == [] and "renderings decide, and none was asked for" in reason
 
 
+def test_a_normal_map_whose_glints_would_go_stays(folder, tmp_path):
+    """Its vectors look alike in the mean of each pixel, and nothing of what they reflect does."""
+    noise = np.random.default_rng(0).normal(0, 0.3, (64, 64, 2))
+    n = np.concatenate([noise, np.ones((64, 64, 1))], axis=2)
+    eg.save_image(folder / "glints.png", 0.5 + 0.5 * n / np.linalg.norm(n, axis=2, keepdims=True))
+    glints = {"type": "bitmap", "filename": str(folder / "glints.png"), "raw": True}
+    metal = {"type": "roughconductor", "alpha": 0.05}
+    wall = {"type": "rectangle", "bsdf": {"type": "normalmap", "normalmap": glints, "bsdf": metal}}
+    lamp = {"type": "point", "position": [1, 1, 3], "intensity": 8.0}
+    scene = {**room(mi, folder), "cube": wall, "lamp": lamp}
+    found = eg.convert_scene(scene, tmp_path / "new", spp=16, **QUICK)
+    [(name, reason)] = found.left
+    assert found.textures == [] and name.startswith("glints.png")
+    assert reason.startswith("vectors of a normal map: the renderings keep ")
+    assert min(found.psnr) > 60
+
+
+def test_what_cannot_be_smooth_is_refused_without_a_fit(folder, tmp_path, monkeypatch):
+    """A chequered bump map: one rendering tells."""
+    monkeypatch.setattr(fit_uses, "fit", None)
+    scene = bumpy(folder, "tiles.png")
+    y, x = np.mgrid[:32, :32] // 2
+    eg.save_image(folder / "tiles.png", 0.3 + 0.4 * ((x + y) % 2))
+    found = eg.convert_scene(scene, tmp_path / "new", spp=16, **{**QUICK, "target_psnr": 40})
+    [(_, reason)] = found.left
+    assert reason.startswith("heights of a bump map: the renderings keep ")
+    assert reason.endswith(" dB if they are only made smooth")
+
+
+def test_progress_from_the_first_second(folder, tmp_path):
+    calls = []
+    scene = plain(mi, folder, {"type": "bitmap", "filename": str(folder / "photo.png")})
+    show = lambda *call: calls.append(call)  # noqa: E731
+    eg.convert_scene(scene, tmp_path / "new", progress=show, **QUICKEST)
+    labels = list(dict.fromkeys(label for label, _, _ in calls))
+    stages = ("rays", "target", "search")
+    assert labels == ["scene", *(f"1/1 photo.png: {s}" for s in stages), "renderings"]
+    assert all(0 <= done <= total for _, done, total in calls)
+
+
 def test_nothing_is_rendered_on_request(folder, tmp_path):
     found = eg.convert_scene(wall(folder), tmp_path / "new", spp=0, target_psnr=20, iterations=1)
     assert found.psnr == [] and not list((tmp_path / "new").glob("*.png"))
+    [(_, reason)] = found.left
+    assert reason.startswith("vectors of a normal map: renderings decide")
 
 
 def test_mistakes(folder, tmp_path):

@@ -72,7 +72,7 @@ class TestTarget:
         image = photo()
         rows = blocks(48, 6)
         found = Visibility(np.full((48, 48), 2.4, np.float32), [rows])
-        target = back_project(image, found, 1.0)
+        *_, target = back_project(image, found, 1.0)
         blurred = gaussian_filter(image, (2.4, 2.4, 0), mode="nearest")
 
         def missed(t):
@@ -192,6 +192,7 @@ class TestFit:
         ({"max_gaussians": 2, "iterations": 0}, "2 Gaussians reach"),
         ({"texture": "poster"}, f"not in the scene.*{NAME}"),
         ({"image": np.zeros((4, 4, 2), np.float32)}, "shape"),
+        ({"image": photo() - 0.5, "space": "data"}, r"image: data from -0\.\d+ to .*from 0 to 1"),
     ],
 )
 def test_mistakes_cost_a_line(arguments, words):
@@ -199,3 +200,21 @@ def test_mistakes_cost_a_line(arguments, words):
     with pytest.raises(ValueError, match=words) as error:
         eg.fit_for_scene(scene_of(camera([0, 0, 5.0])), **arguments)
     assert "\n" not in str(error.value)
+
+
+def test_ctrl_c_keeps_the_best_set():
+    calls = []
+
+    def stop(label, done, total):
+        calls.append(label)
+        if label == "search" and done >= 20:
+            raise KeyboardInterrupt
+
+    scene = scene_of(camera([0, 0, 5.0]))
+    with pytest.raises(eg.FitInterrupted) as stopped:
+        eg.fit_for_scene(scene, NAME, photo(), BOUND, iterations=STEPS, progress=stop)
+    found = stopped.value.result
+    assert list(dict.fromkeys(calls)) == ["rays", "target", "search"]
+    assert min(found.psnr) in [psnr for _, psnr in found.tried]
+    text = f"SceneFit({len(found.gaussians)} Gaussians, 48x48 pixels, psnr=({found.psnr[0]:.2f}))"
+    assert repr(found) == text
