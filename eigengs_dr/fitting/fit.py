@@ -503,9 +503,12 @@ def _refined(
             progress,
             interrupted,
         )
-        return [refinement], seconds_init
-    state = begin(begun, objective.grid.images, chosen)
-    refined = refine(objective, method, state, iterations, score, key, progress, interrupted)
+        refined = [refinement]
+    else:
+        state = begin(begun, objective.grid.images, chosen)
+        refined = refine(objective, method, state, iterations, score, key, progress, interrupted)
+    if isinstance(objective, LossObjective) and refined[0].stopped != "interrupted":
+        objective.calls.check_use()
     if counts:
         sets = [sort_levels(one.gaussians, objective, counts) for one in refined]
         refined = [replace(one, gaussians=g) for one, g in zip(refined, sets, strict=True)]

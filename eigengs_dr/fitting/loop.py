@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -143,7 +143,8 @@ class Refinement:
         """Return the result with another row of its trace, and the set if it is the best."""
         self.trace.append(row)
         best = not self.row or objective.merit(row) > objective.merit(self.row)
-        stopped = "exact" if row.get("psnr_ycbcr", 0.0) > MAX_PSNR else self.stopped
+        exact = row.get("psnr_ycbcr", 0.0) > MAX_PSNR and "loss" not in row
+        stopped = "exact" if exact else self.stopped
         step = row["iteration"]
         if best:
             return replace(self, gaussians=gaussians, row=row, stopped=stopped, iterations=step)
@@ -207,14 +208,18 @@ class Best:
         ]
 
     def end_early(self) -> None:
-        """Measure the best set with a surplus, and that of the last step, both without it."""
+        """Measure the best set with a surplus, and that of the last step, both without it.
+
+        A loss or a judge that ended the descent may end this too: then the rows so far count.
+        """
         if len(self.refinements) > 1:
             raise KeyboardInterrupt
         larger = [self.larger] if self.larger else []
-        for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
-            if step not in [row["iteration"] for row in self.refinements[0].trace]:
-                near = self.objective.around(gaussians)
-                self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
+        with suppress(KeyboardInterrupt):
+            for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
+                if step not in [row["iteration"] for row in self.refinements[0].trace]:
+                    near = self.objective.around(gaussians)
+                    self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
         self.refinements = [
             replace(one, stopped="interrupted", iterations=self.step) for one in self.refinements
         ]

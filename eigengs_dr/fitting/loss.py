@@ -175,32 +175,54 @@ AS_THEY_ARE = ("rgb", "linear", "radiance", "data")
 
 @dataclass
 class Calls:
-    """The number of calls of a loss for its derivative, and its values since `check`.
+    """What the calls of a loss for its derivative have shown so far.
 
-    `broken` is the last step that `check_slopes` looked at, if its derivative was not finite.
+    Attributes
+    ----------
+    step : int
+        Number of steps taken.
+    unit : float or None
+        The power of 2^16 that brings the sum of the absolute derivatives closest to 1, as found at
+        the first one that is not 0. Otherwise the epsilon of an optimiser would stop the fit of a
+        small loss. The usual losses, means over the picture, keep their unit.
+    depends, is_zero : bool
+        Whether a value depended on the picture, and whether all values were 0.
+    broken : int or None
+        The last step that `check_slopes` looked at, if its derivative was not finite.
     """
 
     step: int = 0
+    unit: float | None = None
+    depends: bool = False
+    is_zero: bool = True
+    broken: int | None = None
     checked: int = 0
     total: Any = 0.0
-    broken: int | None = None
 
-    def add(self, value: Any, slopes: Sequence[Float]) -> None:
-        """Count a call; the first value is checked at once."""
+    def add(self, value: Any, size: Float) -> None:
+        """Count a step, by the value and the size of its derivative; the first is checked."""
         self.step, self.total = self.step + 1, self.total + value
         dr.schedule(self.total)
         if self.step == 1 or self.step - self.checked >= CHECK_EVERY:
             self.check()
         if self.step % CHECK_EVERY == 1:
-            self.check_slopes(slopes)
+            self.check_slopes(size)
 
-    def check_slopes(self, slopes: Sequence[Float]) -> None:
+    def in_unit(self, slopes: Sequence[Float], size: Float) -> list[Float]:
+        """Return derivatives in the unit of the descent."""
+        if self.unit is None:
+            total = float(size.numpy()[0])
+            if 0 < total < math.inf:
+                self.unit = 2.0 ** min(-16 * round(math.log2(total) / 16), LARGEST_EXPONENT)
+        return [slope * (self.unit or 1.0) for slope in slopes]
+
+    def check_slopes(self, size: Float) -> None:
         """Raise ValueError if derivatives are not finite, as they were not at the last check.
 
         The descent recovers from one such step, as of a noisy rendering, and not from all.
         """
         step, before = self.step - 1, self.broken
-        self.broken = step if not all(bool(dr.all(dr.isfinite(s))) for s in slopes) else None
+        self.broken = None if math.isfinite(size.numpy()[0]) else step
         if self.broken is not None and before is not None:
             raise ValueError(
                 f"loss: its value is finite, but not its derivative at steps {before} and {step}; "
@@ -216,7 +238,22 @@ class Calls:
         if not math.isfinite(total):
             steps = f"step {first}" if self.step - first == 1 else f"steps {first}-{self.step - 1}"
             raise ValueError(f"loss: its value is {total:g} at {steps}; it must be finite")
+        self.is_zero &= total == 0
 
+    def check_use(self) -> None:
+        """Raise ValueError if no step of a fit had a derivative, unless its loss was least, 0."""
+        self.check()
+        idle = self.step > 0 and self.unit is None and self.broken is None
+        if idle and not (self.depends and self.is_zero):
+            raise ValueError(
+                "loss: its value does not depend on the picture at any step; compute it by Dr.Jit "
+                "from the picture that it is given (a NumPy array has no derivative, and dr.freeze "
+                "passes none on)"
+            )
+
+
+LARGEST_EXPONENT = 112
+"""Of a power of 2^16 in single precision."""
 
 CHECK_EVERY = 10
 """Calls after which the values are read back; each read waits for the device."""
@@ -272,18 +309,22 @@ class LossObjective(Pixels):
                 sums, pictures = draw(
                     state.moving.packed, list(background), state.lists[-1], radius
                 )
-                return Slope(to_slope(sums, self.step(pictures)))
+                slopes, size = self.step(pictures)
+                return Slope(to_slope(sums, slopes), size)
 
             yield model_at
 
-    def step(self, pictures: Sequence[Float]) -> list[Float]:
-        """Return the derivatives by the pictures of a step; parameters of the user get theirs."""
+    def step(self, pictures: Sequence[Float]) -> tuple[list[Float], Float]:
+        """Return the derivatives by the pictures of a step, and their size, see `derivative`.
+
+        Parameters of the user get theirs, and step.
+        """
         parameters = self.loss.parameters
-        value, slopes = self.derivative(pictures, parameters)
+        value, slopes, size = self.derivative(pictures, parameters)
         if parameters is not None:
             parameters.step()
-        self.calls.add(value, slopes)
-        return slopes
+        self.calls.add(value, size)
+        return slopes, size
 
     def draw(
         self, packed: Float, background: list, lists: TileLists, radius: float
@@ -338,27 +379,29 @@ class LossObjective(Pixels):
 
     def derivative(
         self, pictures: Sequence[Float], parameters: Any = None
-    ) -> tuple[Float, list[Float]]:
-        """Return the value of the loss, and its derivatives by the pictures.
+    ) -> tuple[Float, list[Float], Float]:
+        """Return the value of the loss, its derivatives by the pictures, and their size.
 
-        Derivatives by parameters of the user stay in the parameters; no other array gets any. The
-        function may render: if the collector freed another scene meanwhile, the process might end.
+        The derivatives are in a unit of their own, see `Calls.unit`; the size is the sum of their
+        absolute values, 0 if the loss has no derivative at this step. Derivatives by parameters of
+        the user stay in the parameters; no other array gets any. The function may render: if the
+        collector freed another scene meanwhile, the process might end.
         """
         with dr.resume_grad(), collector_off():
-            leaves = [self._tensor(k, rows) for k, rows in enumerate(pictures)]
-            dr.enable_grad(leaves)
+            leaves = self._leaves(pictures)
             value = self._number(self.loss.function(self._named(leaves), self.calls.step))
-            if not dr.grad_enabled(value):
-                raise ValueError(
-                    "loss: its value does not depend on the picture; compute it by Dr.Jit from the "
-                    "picture that it is given (a NumPy array has no derivative)"
-                )
-            dr.set_grad(value, 1)
-            # Forward from here marks what depends on these; backward then visits nothing else.
-            marked = [*leaves, *(parameters.values() if parameters is not None else ())]
-            dr.enqueue(dr.ADMode.Forward, marked)
-            dr.traverse(dr.ADMode.Backward)
-            return dr.detach(value), [dr.grad(leaf).array for leaf in leaves]
+            dr.clear_grad(leaves)  # of what the function has differentiated itself
+            if dr.grad_enabled(value):
+                self.calls.depends = True
+                dr.set_grad(value, 1)
+                # Forward from here marks what depends on these; backward then visits nothing else.
+                marked = [*leaves, *(parameters.values() if parameters is not None else ())]
+                dr.enqueue(dr.ADMode.Forward, marked)
+                dr.traverse(dr.ADMode.Backward)
+            slopes = [dr.grad(leaf).array for leaf in leaves]
+        dr.make_opaque(slopes)
+        size = sum(dr.sum(dr.abs(slope)) for slope in slopes)
+        return dr.detach(value), self.calls.in_unit(slopes, size), size
 
     def judged(self, gaussians: Gaussians) -> dict[str, float]:
         """Return the loss of a set for its row, see `Loss.judge`; and its margin to a target."""
@@ -381,11 +424,11 @@ class LossObjective(Pixels):
 
     def judge(self, pictures: Sequence[Float]) -> float:
         """Return the value by which pictures, as rows of pixels, are compared."""
-        with dr.suspend_grad():
-            picture = self._named([self._tensor(k, rows) for k, rows in enumerate(pictures)])
-            judge = self.loss.judge
-            value = self.loss.function(picture, 0) if judge is None else judge(picture)
-            number = float(np.asarray(self._number(value)).reshape(-1)[0])
+        judge = self.loss.judge
+        with dr.resume_grad(), collector_off():  # the function may differentiate, as in a step
+            picture = self._named(self._leaves(pictures))
+            value = self.loss.function(picture, 0) if judge is None else judge(dr.detach(picture))
+        number = _one_number(value)
         if not math.isfinite(number):
             name = "its value" if judge is None else "the judge"
             raise ValueError(f"loss: {name} is {number:g} for a picture; it must be finite")
@@ -400,18 +443,21 @@ class LossObjective(Pixels):
             If it is none.
         """
         Float = self.types.Float
-        if isinstance(value, float):
+        if isinstance(value, (int, float)):
             return Float(value)
         if not dr.is_array_v(value) or not dr.is_float_v(value):
             raise ValueError(f"loss: it returned {type(value).__name__}; return a number of Dr.Jit")
         if dr.is_tensor_v(value):
             value = value.array
         if dr.width(value) != 1 or dr.depth_v(value) != 1:
-            raise ValueError(
-                f"loss: it returned an array of shape {value.shape}; return one number, such as "
-                "dr.mean(x, axis=None)"
-            )
+            raise _too_many(value.shape)
         return Float(value)
+
+    def _leaves(self, pictures: Sequence[Float]) -> list[Tensor]:
+        """Return pictures, rows of pixels, as tensors with derivatives of their own."""
+        leaves = [self._tensor(k, rows) for k, rows in enumerate(pictures)]
+        dr.enable_grad(leaves)
+        return leaves
 
     def _tensor(self, number: int, rows: Float) -> Tensor:
         size = self.grid.height, self.grid.width, len(self.views[number].channels)
@@ -420,7 +466,7 @@ class LossObjective(Pixels):
     def _named(self, pictures: Sequence[Tensor]) -> Any:
         if not self.views[0].name:
             return pictures[0]
-        return {view.name: p for view, p in zip(self.views, pictures, strict=True)}
+        return {_Name(view.name): p for view, p in zip(self.views, pictures, strict=True)}
 
     def around(self, gaussians: Gaussians) -> Pixels:
         """Return the squared error of the image, weighed as the loss weighs it near a set.
@@ -454,3 +500,44 @@ class LossObjective(Pixels):
     def image(self) -> Pixels:
         """Return the squared error of the image alone."""
         return Pixels(**{name: getattr(self, name) for name in Pixels.__dataclass_fields__})
+
+
+class _Name(str):
+    """The name of a map as a key of what a loss is given.
+
+    Dr.Jit 1.5 reduces a dict by its keys, and these by their letters, which are text again, until
+    the process ends.
+    """
+
+    __slots__ = ()
+
+    def __iter__(self) -> Iterator[str]:
+        raise TypeError(
+            f"loss: its pictures are a dict, which Dr.Jit does not reduce; take each by its name, "
+            f"such as pictures[{str(self)!r}]"
+        )
+
+
+def _one_number(value: Any) -> float:
+    """Return a number of Python, NumPy, PyTorch or Dr.Jit, or an array of one, as a float.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    shape = getattr(value, "shape", ())
+    if math.prod(shape) != 1:
+        raise _too_many(shape)
+    array = np.asarray(dr.detach(value)) if dr.is_array_v(value) else value
+    number = array.item() if hasattr(array, "item") else array
+    if not isinstance(number, (int, float)):
+        raise ValueError(f"loss: it returned {type(value).__name__}; return a number")
+    return float(number)
+
+
+def _too_many(shape: Sequence[int]) -> ValueError:
+    return ValueError(
+        f"loss: it returned an array of shape {tuple(shape)}; return one number, such as "
+        "dr.mean(x, axis=None)"
+    )
