@@ -27,8 +27,8 @@ LEAST_SIDE = 4
 """Smallest length of the shorter side of the coarsest level, in texels."""
 
 
-NOISY = Adam(0.5, 0.999, 1e-16)
-"""Adam for derivatives with the noise of a rendering; its epsilon is far below those by a texel."""
+NOISY = Adam(0.5, 0.999, 1e-8)
+"""Adam for derivatives with the noise of a rendering."""
 
 
 @dataclass(frozen=True)

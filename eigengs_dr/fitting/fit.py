@@ -125,7 +125,7 @@ class Fit:
 
 
 class FitInterrupted(KeyboardInterrupt):
-    """The error of a fit that Ctrl-C or SIGTERM interrupted.
+    """The error of a fit that Ctrl-C, SIGTERM or a `KeyboardInterrupt` of a loss interrupted.
 
     Attributes
     ----------
@@ -213,7 +213,8 @@ def fit(
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         A callable is called every 10 steps as ``progress(iteration, iterations, row)`` with the
-        last row of the trace, or a row of a set with more Gaussians than requested.
+        last row of the trace, or a row of a set with more Gaussians than requested. It may raise
+        `KeyboardInterrupt` to end the fit.
     encoding : {"srgb", "linear"}, optional
         What the pixels of the image are: sRGB codes, or light as in renderings. By default as the
         image declares (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
@@ -237,11 +238,14 @@ def fit(
     BackendError
         If the backend is not available.
     FitInterrupted
-        After Ctrl-C or SIGTERM: a `KeyboardInterrupt` that holds the best set so far.
+        After Ctrl-C, SIGTERM, or a `KeyboardInterrupt` of the loss, its judge or `progress`: a
+        `KeyboardInterrupt` that holds the best set so far.
 
     Notes
     -----
-    On one machine and backend, equal seeds give bit-identical results.
+    On one machine and backend, equal seeds give bit-identical results, unless the derivative of a
+    loss has other bits at each call: Dr.Jit adds those of values that the loss broadcasts, as in
+    ``color * alpha`` of one channel, in any order.
 
     The factors of the errors of maps that the function finds are one over the root mean square
     error after a first colour solve, so that all maps gain alike in decibels; or with goals, one

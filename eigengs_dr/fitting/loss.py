@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import drjit as dr
 import numpy as np
 
+from ..backend.arguments import plain_numbers
 from ..backend.arrays import types_of
 from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor
@@ -45,18 +46,20 @@ class Loss:
     function : callable
         ``function(picture, step) -> number``. The picture is a tensor (H, W, C) of Dr.Jit, as
         `eigengs_dr.render` returns it; for maps, a dict of tensors. The number is an array or a
-        tensor of Dr.Jit of one value that depends on the picture. The step counts the calls for
-        derivatives from 0: it may choose a camera, or seed random numbers.
+        tensor of Dr.Jit of one value that depends on the picture; where it does not, at some steps,
+        nothing moves. The step is the number of steps taken before, over the whole fit: it may
+        choose a camera, or seed random numbers. Rows of the trace call the function for step 0,
+        and controls between steps for the next one.
     bounds : (float, float), optional
         Smallest and largest value of the picture, such as ``(0, 1)``: the function sees the picture
         clipped, and sums outside are pulled back.
-    parameters : optimiser, optional
+    parameters : optimiser of Dr.Jit, optional
         Your own optimiser, such as a ``drjit.opt.Adam``, that steps along: the derivatives by its
         parameters are computed too, and then its ``step()`` is called.
     judge : callable, optional
         ``judge(picture) -> number``: what the rows of the trace measure and the best set minimises,
         such as the error in photos that the function does not see. By default
-        ``function(picture, 0)``.
+        ``function(picture, 0)``. Its number may be one of Python, NumPy or PyTorch too.
     target : float, optional
         Value to reach with as few Gaussians as possible, instead of their number.
     space : str or mapping of str to str, optional
@@ -65,9 +68,10 @@ class Loss:
     Raises
     ------
     ValueError
-        If the bounds do not rise, or the target is not above 0.
+        If the bounds are not two finite numbers that rise, or the target is no number above 0.
     TypeError
-        If the function or the judge takes other arguments, or the parameters are no optimiser.
+        If the function or the judge takes other arguments, the function is frozen, or the
+        parameters are no optimiser.
 
     Examples
     --------
@@ -95,18 +99,39 @@ class Loss:
             )
         if not callable(self.function):
             raise TypeError(f"Loss: {self.function!r} is no function of (picture, step)")
+        if hasattr(self.function, "n_recordings"):
+            raise TypeError(
+                "Loss: the function is frozen by drjit.freeze, which passes no derivative on; give "
+                "the function itself"
+            )
         _check_arguments("function", self.function, "picture, step")
         if self.judge is not None:
             _check_arguments("judge", self.judge, "picture")
-        if self.parameters is not None and not hasattr(self.parameters, "step"):
+        steps = hasattr(self.parameters, "step") and hasattr(self.parameters, "values")
+        if self.parameters is not None and not steps:
             raise TypeError(
-                f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser, such "
-                "as drjit.opt.Adam"
+                f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser of "
+                "Dr.Jit, such as drjit.opt.Adam"
             )
-        if self.bounds is not None and not self.bounds[0] < self.bounds[1]:
-            raise ValueError(f"Loss: bounds are {self.bounds}; the first must be the smaller")
+        if self.bounds is not None:
+            object.__setattr__(self, "bounds", _check_bounds(self.bounds))
+        for name, value in plain_numbers(vars(self), Loss.__annotations__).items():
+            object.__setattr__(self, name, value)
         if self.target is not None and not 0 < self.target < math.inf:
             raise ValueError(f"Loss: target is {self.target}; it must be finite and above 0")
+
+
+def _check_bounds(bounds: Any) -> tuple[float, float]:
+    """Return bounds as two numbers; raise ValueError unless they are finite and rise."""
+    try:
+        low, high = (plain_numbers({"": b}, {"": "float"})[""] for b in bounds)
+        if not math.isfinite(high - low):
+            raise ValueError
+    except (TypeError, ValueError):
+        raise ValueError(f"Loss: bounds are {bounds!r}; give two numbers, such as (0, 1)") from None
+    if not low < high:
+        raise ValueError(f"Loss: bounds are {bounds}; the first must be the smaller")
+    return low, high
 
 
 def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:
@@ -182,9 +207,9 @@ class Calls:
     step : int
         Number of steps taken.
     unit : float or None
-        The power of 2^16 that brings the sum of the absolute derivatives closest to 1, as found at
-        the first one that is not 0. Otherwise the epsilon of an optimiser would stop the fit of a
-        small loss. The usual losses, means over the picture, keep their unit.
+        Power of two that brings the mean absolute derivative by a value of the picture to about
+        `USUAL`, as found at the first one that is not 0. Otherwise the unit of a loss would decide
+        what the epsilon of an optimiser holds back.
     depends, is_zero : bool
         Whether a value depended on the picture, and whether all values were 0.
     broken : int or None
@@ -211,9 +236,9 @@ class Calls:
     def in_unit(self, slopes: Sequence[Float], size: Float) -> list[Float]:
         """Return derivatives in the unit of the descent."""
         if self.unit is None:
-            total = float(size.numpy()[0])
-            if 0 < total < math.inf:
-                self.unit = 2.0 ** min(-16 * round(math.log2(total) / 16), LARGEST_EXPONENT)
+            mean = float(size.numpy()[0]) / sum(map(dr.width, slopes))
+            if 0 < mean < math.inf:
+                self.unit = 2.0 ** min(round(math.log2(USUAL / mean)), 126)  # of single precision
         return [slope * (self.unit or 1.0) for slope in slopes]
 
     def check_slopes(self, size: Float) -> None:
@@ -252,8 +277,10 @@ class Calls:
             )
 
 
-LARGEST_EXPONENT = 112
-"""Of a power of 2^16 in single precision."""
+USUAL = 2.0**-15
+"""About the mean absolute derivative of a squared error by the values of a picture of 64x64 pixels.
+With 1e-10 in place of the epsilon 1e-8 of `eigengs_dr.fitting.coarse.NOISY`, Gaussians where a loss
+has next to no weight disturb the others: twice the loss."""
 
 CHECK_EVERY = 10
 """Calls after which the values are read back; each read waits for the device."""
@@ -389,7 +416,7 @@ class LossObjective(Pixels):
         """
         with dr.resume_grad(), collector_off():
             leaves = self._leaves(pictures)
-            value = self._number(self.loss.function(self._named(leaves), self.calls.step))
+            value = self._number(_call(self.loss.function, self._named(leaves), self.calls.step))
             dr.clear_grad(leaves)  # of what the function has differentiated itself
             if dr.grad_enabled(value):
                 self.calls.depends = True
@@ -424,10 +451,13 @@ class LossObjective(Pixels):
 
     def judge(self, pictures: Sequence[Float]) -> float:
         """Return the value by which pictures, as rows of pixels, are compared."""
-        judge = self.loss.judge
+        function, judge = self.loss.function, self.loss.judge
         with dr.resume_grad(), collector_off():  # the function may differentiate, as in a step
             picture = self._named(self._leaves(pictures))
-            value = self.loss.function(picture, 0) if judge is None else judge(dr.detach(picture))
+            if judge is None:
+                value = _call(function, picture, 0)
+            else:
+                value = _call(judge, dr.detach(picture))
         number = _one_number(value)
         if not math.isfinite(number):
             name = "its value" if judge is None else "the judge"
@@ -513,9 +543,20 @@ class _Name(str):
 
     def __iter__(self) -> Iterator[str]:
         raise TypeError(
-            f"loss: its pictures are a dict, which Dr.Jit does not reduce; take each by its name, "
+            "loss: its pictures are a dict, which Dr.Jit does not reduce; take each by its name, "
             f"such as pictures[{str(self)!r}]"
         )
+        yield ""  # so that the error comes with the first letter, where Dr.Jit passes it on
+
+
+def _call(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function of the user, which may end the fit from an operation of Dr.Jit too."""
+    try:
+        return function(*arguments)
+    except RuntimeError as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps exceptions
+            raise KeyboardInterrupt from error
+        raise
 
 
 def _one_number(value: Any) -> float:

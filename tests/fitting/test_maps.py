@@ -166,7 +166,7 @@ ROUGH = SMALL["roughness"]
             "map 'roughness': space 'hsv' is not in ycbcr",
         ),
         ({"albedo": eg.Map(SMALL["albedo"], weight=0)}, {}, "'albedo': weight is 0; it must be"),
-        ({"albedo": eg.Map(SMALL["albedo"], weight=np.nan)}, {}, "weight is nan; it must be above"),
+        ({"albedo": eg.Map(SMALL["albedo"], weight=np.nan)}, {}, "weight is nan; it must be"),
         (SMALL | {"ao": eg.Map(ROUGH, goal=30)}, {}, "map 'albedo' has no goal; give each map one"),
         ({"ao": eg.Map(ROUGH, goal=np.nan)}, {}, "map 'ao': target_psnr is nan"),
         ({"ao": eg.Map(ROUGH, goal=30)}, {"gaussians": 9}, "exclude each other"),
