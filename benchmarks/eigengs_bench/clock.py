@@ -67,10 +67,12 @@ def start(image: Image, options: FitOptions) -> Run:
         count = options.count_for(width * height)
         placed = method.place_and_solve(objective, count, options.seed)
         return Run(objective, begin(placed, chosen=method.place != Adaptive()))
-    objective, begun = start_from(source, objective, method, pixels, moves=True)
+    objective, begun, chosen = start_from(
+        source, objective, method, pixels, options.iterations, options.seed
+    )
     base = objective.pictures[0].base
     mean_image = 0.0 if base is None else objective.picture(base).numpy()
-    return Run(objective, begin(begun, chosen=True), mean_image)
+    return Run(objective, begin(begun, chosen=chosen), mean_image)
 
 
 def follow(
@@ -83,7 +85,7 @@ def follow(
     The time of the start counts; the clock stops between moments.
     """
     spent, resumed = 0.0, time.perf_counter()
-    objective, state, mean_image = start(image, options)
+    objective, state, mean_image = start(image, replace(options, iterations=iterations))
     steps = descend(objective, options.method, state, iterations, options.seed)
     for iteration in range(iterations + 1):
         if iteration:

@@ -35,7 +35,8 @@ def plain_numbers(values: Mapping[str, object], annotations: Mapping[str, str]) 
     return {
         name: _plain(name, value, KINDS[annotations[name]])
         for name, value in values.items()
-        if annotations.get(name) in KINDS and value is not None
+        if annotations.get(name) in KINDS
+        and not (value is None and annotations[name].endswith("None"))
     }
 
 

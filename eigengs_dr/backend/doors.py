@@ -21,14 +21,20 @@ def door(function: Function) -> Function:
     """Decorate a public function that uses Dr.Jit.
 
     No other thread uses Dr.Jit during a call. Without the lock, threads crash the process or hang,
-    see `eigengs_dr.backend.recording`. NumPy numbers are accepted, see `takes_numbers`.
+    see `eigengs_dr.backend.recording`. NumPy numbers are accepted, see `takes_numbers`. Errors of
+    functions of the user pass as they are.
     """
     plain = takes_numbers(function)
 
     @wraps(function)
     def call(*values: object, **options: object) -> object:
         with exclusive():
-            return plain(*values, **options)
+            try:
+                return plain(*values, **options)
+            except RuntimeError as error:
+                if isinstance(error.__cause__, StopIteration):  # generators change its type
+                    raise error.__cause__ from None
+                raise
 
     return cast(Function, call)
 

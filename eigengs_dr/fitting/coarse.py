@@ -7,7 +7,7 @@ size (Weier et al. 2025, doi 10.1145/3730855), so coarse levels move many texels
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -166,14 +166,9 @@ def _sum_levels(values: Sequence[Float], levels: Sequence[Level]) -> Float:
     return total
 
 
-def coarse_picture(
-    objective: LossObjective,
-    coarse: Coarse,
-    steps: int,
-    start: Sequence[float],
-    unit: float = 1.0,
-    ended: Callable[[int], bool] = lambda step: False,
-) -> Float:
+def texel_sums(
+    objective: LossObjective, coarse: Coarse, steps: int, start: Sequence[float], unit: float = 1.0
+) -> Generator[Float, None, None]:
     """Descend on a loss by a pyramid of texels.
 
     Parameters
@@ -185,13 +180,11 @@ def coarse_picture(
         The channels of all texels before the first step.
     unit : float, optional
         The range of the values, for the rate.
-    ended : callable, optional
-        ``ended(step)`` is called before each step, and at the end; True ends the descent.
 
-    Returns
-    -------
+    Yields
+    ------
     Float, shape (H * W * C,)
-        The sums of all levels, as rows of pixels.
+        The sums of all levels before the first step and after each, as rows of pixels.
     """
     types, optimizer = objective.types, coarse.optimizer
     levels = levels_of(*objective.size, objective.channels)
@@ -199,33 +192,34 @@ def coarse_picture(
     def advance(
         values: list,
         moments: list,
+        time: Float,
         sums: Float,
         slopes: list[Float],
-        rate: Float,
-        time: Float,
-    ) -> tuple[list, list, Float, list[Float]]:
+        size: Float,
+    ) -> tuple[list, list, Float, Float, list[Float]]:
         slope: Any = objective.pull_back(sums, slopes)
+        rests, later = size == 0, time + 1  # without a derivative nothing moves
+        falling = 0.5 + 0.5 * dr.cos(time * (math.pi / steps))
+        rate = dr.fma(falling, (1 - coarse.decay), coarse.decay) * (coarse.rate * unit)
         for k, value in enumerate(values):
             if k:
                 slope = shrink(slope, levels[k - 1], levels[k])
             dr.eval(slope)
-            values[k], moments[k] = optimizer.step(value, slope, moments[k], rate, time)
+            moved = optimizer.step(value, slope, moments[k], rate, later)
+            values[k], moments[k] = dr.select(rests, (value, moments[k]), moved)
         sums = _sum_levels(values, levels)
-        return values, moments, sums, objective.seen(sums)
+        return values, moments, dr.select(rests, time, later), sums, objective.seen(sums)
 
     values: list = [dr.zeros(types.Float, level.values) for level in levels[:-1]]
     values.append(types.Float(np.tile(start, levels[-1].values // len(start))))
     dr.make_opaque(values)
     moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)
-    pictures = objective.seen(sums)
+    pictures, time = objective.seen(sums), dr.opaque(types.Float, 0)
     with freeze_program(advance) as take_step:
-        for step in range(steps):
-            if ended(step):
-                break
-            slopes = objective.step(pictures)
-            falling = 0.5 + 0.5 * math.cos(math.pi * step / steps)
-            rate = coarse.rate * unit * (coarse.decay + (1 - coarse.decay) * falling)
-            numbers = (dr.opaque(types.Float, number) for number in (rate, step + 1))
-            values, moments, sums, pictures = take_step(values, moments, sums, slopes, *numbers)
-    ended(steps)
-    return sums
+        yield sums
+        for _ in range(steps):
+            slopes, size = objective.step(pictures)
+            values, moments, time, sums, pictures = take_step(
+                values, moments, time, sums, slopes, size
+            )
+            yield sums

@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import ArrayTypes, make_divisor, types_of, upload
-from ..backend.types import Float, FloatLike, Rows, UInt
+from ..backend.types import Float, FloatLike, Mask, Rows, UInt
 from ..gaussian.gaussians import Gaussians, take
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.binning.lists import TileLists
@@ -250,7 +250,9 @@ def step_program(objective: Pixels, method: Method) -> StepProgram:
             before = gradient or [0.0] * len(sums)
             gradient = [g + s * factor for g, s in zip(before, sums, strict=True)]
         sizes = lists[0].sizes
-        return _move(method, moving, fixed, gradient, rates, index, (sizes.width, sizes.height))
+        size = sizes.width, sizes.height
+        rests = model.size == 0 if isinstance(model, Slope) else None
+        return _move(method, moving, fixed, gradient, rates, index, size, rests)
 
     return step
 
@@ -263,8 +265,12 @@ def _move(
     rates: Float,
     index: UInt,
     size: tuple,
+    rests: Mask | None,
 ) -> tuple[Moving, Gaussians]:
-    """Take the step of the optimiser; all of it is one kernel with a lane per Gaussian."""
+    """Take the step of the optimiser; all of it is one kernel with a lane per Gaussian.
+
+    Nothing moves, nor does the optimiser's state, if it `rests`.
+    """
     Float, coordinates = type(moving.packed), method.coordinates
     slopes = _pull_back(coordinates, fixed, moving.variables, gradient, size)
     time = moving.time + 1
@@ -277,6 +283,9 @@ def _move(
         variables[name], moments[name] = method.optimizer.step(
             moving.variables[name], slopes[name], moving.moments[name], rate, time
         )
+    if rests is not None:
+        before = moving.variables, moving.moments, moving.time
+        variables, moments, time = dr.select(rests, before, (variables, moments, time))
     variables = coordinates.project(fixed, variables, size)
     moved = coordinates.decode(fixed, variables, size)
     return Moving(variables, moments, time, moving.speed, pack(moved), moving.rate_scale), moved

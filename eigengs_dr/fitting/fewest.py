@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -140,16 +140,21 @@ def fewest(
     tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
     planned = MAX_TRIES * tries + fit + MAX_POLISHES * polish
     run = _Run(objective, method, start, score, goal, key, progress, interrupted, planned)
-    estimate = _estimate(run, max_count, tries)
-    if not run.ended() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
-        longest = round(MAX_LENGTH * iterations)
-        trial = _fit_estimate(run, estimate, max_count, fit, longest)
-        # If the iterations are few, or two fits have used them up, polish all the same.
-        sure = SURE_DROPS if trial.missing <= 0 else SURE_POLISHES
-        max_steps = max(longest, run.step + sure * polish)
-        _polish(run, trial, max_count, polish, max_steps)
+    try:
+        run.score(start)
+        estimate = _estimate(run, max_count, tries)
+        if not run.ended() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
+            longest = round(MAX_LENGTH * iterations)
+            trial = _fit_estimate(run, estimate, max_count, fit, longest)
+            # If the iterations are few, or two fits have used them up, polish all the same.
+            sure = SURE_DROPS if trial.missing <= 0 else SURE_POLISHES
+            max_steps = max(longest, run.step + sure * polish)
+            _polish(run, trial, max_count, polish, max_steps)
+    except KeyboardInterrupt:  # of a loss or a judge
+        run.stopped = True
     if run.ended():
-        _trim(run)
+        with suppress(KeyboardInterrupt):
+            _trim(run)
     met = "met" if run.best.missing <= 0 else "out of reach"
     stopped = "interrupted" if run.ended() else met
     return Refinement(run.best.gaussians, run.trace, run.step, stopped, run.best.row)
@@ -183,7 +188,7 @@ class _Run:
     best: _Trial = field(init=False)
 
     def __post_init__(self) -> None:
-        self.best = self.score(self.start)
+        self.best = _Trial(self.start, math.inf, {})
 
     def descend(
         self, gaussians: Gaussians, steps: int, share: float = 1.0, surplus: int = 0
@@ -195,14 +200,17 @@ class _Run:
         self.planned, before = max(self.planned, self.step + steps), self.step
         current = replace(begin(gaussians), count=len(gaussians) - surplus, surplus=surplus)
         states = descend(self.objective, method, current, steps, self.key + before)
-        with closing(states):
-            for step, current in enumerate(states, 1):  # noqa: B007
-                self.step = before + step
-                if self.progress and self.step % 10 == 0:
-                    dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
-                    self.show(self.trace[-1])
-                if self.ended():
-                    break
+        try:
+            with closing(states):
+                for step, current in enumerate(states, 1):  # noqa: B007
+                    self.step = before + step
+                    if self.progress and self.step % 10 == 0:
+                        dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
+                        self.show(self.trace[-1])
+                    if self.ended():
+                        break
+        except KeyboardInterrupt:  # of a loss; its set may be better than those measured
+            self.stopped = True
         fitted = dr.detach(current.gaussians)
         # An interrupt may come before the last relocation.
         return self.score(prune(fitted, self.objective.around(fitted), current.count))

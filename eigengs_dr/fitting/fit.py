@@ -59,8 +59,8 @@ class Fit:
         the result. With a weight, the squared errors of all PSNRs are weighted, by the mean over
         the channels.
         With a loss the key is loss, see `eigengs_dr.Loss.judge`; with an image there are PSNRs
-        too. Without an image the first row shows the picture of the texels, and rows with the
-        key gaussians the numbers that were tried.
+        too. Without an image the first row shows the picture of the texels, without the key
+        gaussians; rows with the same iteration follow for the numbers that were tried.
         With space "data", psnr_ycbcr is the PSNR of the data, with their range as the peak, or 1
         for codes between 0 and 1; psnr_rgb is that of codes after rounding to 8 bits, and NaN for
         other data, which have none. With space "normal" both have the peak 1. With space "radiance"
@@ -126,7 +126,7 @@ class Fit:
 
 
 class FitInterrupted(KeyboardInterrupt):
-    """The error of a fit that Ctrl-C or SIGTERM interrupted.
+    """The error of a fit that Ctrl-C, SIGTERM or a `KeyboardInterrupt` of a loss interrupted.
 
     Attributes
     ----------
@@ -215,7 +215,8 @@ def fit(
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
         A callable is called every 10 steps as ``progress(iteration, iterations, row)`` with the
-        last row of the trace, or a row of a set with more Gaussians than requested.
+        last row of the trace, or a row of a set with more Gaussians than requested. It may raise
+        `KeyboardInterrupt` to end the fit.
     encoding : {"srgb", "linear"}, optional
         What the pixels of the image are: sRGB codes, or light as in renderings. By default as the
         image declares (a file of floats holds light, a ``mitsuba.Bitmap`` has a flag), else "srgb".
@@ -239,11 +240,14 @@ def fit(
     BackendError
         If the backend is not available.
     FitInterrupted
-        After Ctrl-C or SIGTERM: a `KeyboardInterrupt` that holds the best set so far.
+        After Ctrl-C, SIGTERM, or a `KeyboardInterrupt` of the loss, its judge or `progress`: a
+        `KeyboardInterrupt` that holds the best set so far.
 
     Notes
     -----
-    On one machine and backend, equal seeds give bit-identical results.
+    On one machine and backend, equal seeds give bit-identical results, unless the derivative of a
+    loss has other bits at each call: Dr.Jit adds those of values that the loss broadcasts, as in
+    ``color * alpha`` of one channel, in any order.
 
     The factors of the errors of maps that the function finds are one over the root mean square
     error after a first colour solve, so that all maps gain alike in decibels; or with goals, one
@@ -508,9 +512,12 @@ def _refined(
             progress,
             interrupted,
         )
-        return [refinement], seconds_init
-    state = begin(begun, objective.grid.images, chosen)
-    refined = refine(objective, method, state, iterations, score, key, progress, interrupted)
+        refined = [refinement]
+    else:
+        state = begin(begun, objective.grid.images, chosen)
+        refined = refine(objective, method, state, iterations, score, key, progress, interrupted)
+    if isinstance(objective, LossObjective) and refined[0].stopped != "interrupted":
+        objective.calls.check_use()
     if counts:
         sets = [sort_levels(one.gaussians, objective, counts) for one in refined]
         refined = [replace(one, gaussians=g) for one, g in zip(refined, sets, strict=True)]

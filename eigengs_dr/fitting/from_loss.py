@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -17,7 +18,7 @@ from ..gaussian.channels import TextureMap, check_maps, slices
 from ..gaussian.gaussians import Gaussians
 from ..image.color import LIGHT, SPACES, to_coded, to_log
 from ..storage.npz import BadValue
-from .coarse import Coarse, coarse_picture
+from .coarse import Coarse, texel_sums
 from .descent import begin
 from .loop import FitProgress, Refinement, descend, last, refine
 from .loss import Loss, LossObjective, View
@@ -28,6 +29,9 @@ from .options import FitOptions, max_gaussians_for
 
 Spaces: TypeAlias = "str | Mapping[str, str] | None"
 """The space of a picture, or those of several maps by name; data have one channel."""
+
+MayEnd: TypeAlias = Callable[[], AbstractContextManager[None]]
+"""A block in which a function of the user may end the fit by a `KeyboardInterrupt`."""
 
 PIXELS_PER_GAUSSIAN = 16
 """Pixels of the picture per Gaussian, if nothing indicates how many the scene needs. On the scenes
@@ -134,14 +138,19 @@ def refine_loss(
     """
     stopped = False
 
-    def show(step: int, row: Row) -> None:
-        """Call `progress`, which may end the fit by a `KeyboardInterrupt`."""
+    @contextmanager
+    def may_end() -> Iterator[None]:
+        """Let a function of the user end the fit by a `KeyboardInterrupt`."""
         nonlocal stopped
+        try:
+            yield
+        except KeyboardInterrupt:
+            stopped = True
+
+    def show(step: int, row: Row) -> None:
         if progress and not stopped:
-            try:
+            with may_end():
                 progress(step, options.iterations, row)
-            except KeyboardInterrupt:
-                stopped = True
 
     def timed(row: Row) -> Row:
         return {"seconds": time.perf_counter() - started, **row}
@@ -157,10 +166,11 @@ def refine_loss(
         place = options.method.place
         coarse = place if isinstance(place, Coarse) else Coarse()
         steps = round(coarse.share * options.iterations)
-        objective = _descend_texels(problem, coarse, steps, ended)
+        objective = _descend_texels(problem, coarse, steps, ended, may_end)
         steps_taken = objective.calls.step
-        trace = [{"loss": objective.judge(objective.seen(_rows(objective)))}]
-        start, numbers = _start(objective, options, coarse, ended)
+        with may_end():
+            trace = [{"loss": objective.judge(objective.seen(_rows(objective)))}]
+        start, numbers = _start(objective, options, coarse, ended, may_end)
         trace = [timed({"iteration": steps_taken, **row}) for row in trace + numbers]
     else:
         objective = problem.near(np.zeros(problem.size[0] * problem.size[1] * problem.channels))
@@ -177,6 +187,8 @@ def refine_loss(
         progress and (lambda step, steps, row: show(step + steps_taken, row)),
         ended,
     )[0]
+    if refined.stopped != "interrupted":
+        objective.calls.check_use()
     rows = [{**row, "iteration": row["iteration"] + steps_taken} for row in refined.trace]
     refinement = replace(refined, trace=trace + rows, iterations=refined.iterations + steps_taken)
     return refinement, seconds_init
@@ -189,13 +201,17 @@ def _rows(objective: LossObjective) -> Float:
 
 
 def _descend_texels(
-    problem: Problem, coarse: Coarse, steps: int, ended: Callable[[int], bool]
+    problem: Problem, coarse: Coarse, steps: int, ended: Callable[[int], bool], may_end: MayEnd
 ) -> LossObjective:
     """Return the objective of a loss near the picture of a pyramid of texels."""
     no_end = all(view.space == "log" for view in problem.views)
     grey, (low, high) = problem.grey(), problem.loss.bounds or (0.0, BRIGHT if no_end else 1.0)
     objective = problem.near(np.tile(grey, problem.size[0] * problem.size[1]))
-    sums = coarse_picture(objective, coarse, steps, grey.tolist(), high - low, ended)
+    states = texel_sums(objective, coarse, steps, grey.tolist(), high - low)
+    with closing(states), may_end():
+        for step, sums in enumerate(states):  # noqa: B007
+            if ended(step):
+                break
     return replace(problem.near(sums.numpy()), calls=objective.calls)
 
 
@@ -204,6 +220,7 @@ def _start(
     options: FitOptions,
     coarse: Coarse,
     ended: Callable[[], bool],
+    may_end: MayEnd,
 ) -> tuple[Gaussians, list[Row]]:
     """Fit Gaussians to the image of an objective; also return rows for the numbers tried."""
     width, height = objective.size
@@ -219,14 +236,17 @@ def _start(
     if options.gaussians is not None or (loss.judge is None and loss.target is None):
         return fitted(options.count or max(1, pixels // PIXELS_PER_GAUSSIAN)), []
     max_count, count = max_gaussians_for(pixels, objective.channels), pixels // FIRST_PIXELS
-    best, rows = None, []
-    while count <= max_count and not (best is not None and ended()):
-        gaussians = fitted(max(1, count))
-        rows.append({"gaussians": len(gaussians), **objective.judged(gaussians)})
-        if best is not None and rows[-1]["loss"] >= rows[-2]["loss"]:
-            break
-        best, count = gaussians, 2 * max(1, count)
-        if loss.target is not None and rows[-1]["loss"] <= loss.target:
-            break
-    assert best is not None
+    best, rows = fitted(max(1, count)), []
+    gaussians = best
+    with may_end():
+        while True:
+            rows.append({"gaussians": len(gaussians), **objective.judged(gaussians)})
+            if len(rows) > 1 and rows[-1]["loss"] >= rows[-2]["loss"]:
+                break
+            best, count = gaussians, 2 * max(1, count)
+            if loss.target is not None and rows[-1]["loss"] <= loss.target:
+                break
+            if count > max_count or ended():
+                break
+            gaussians = fitted(count)
     return best, rows

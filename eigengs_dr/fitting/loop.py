@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -167,7 +167,7 @@ class Refinement:
         result = replace(self, iterations=row["iteration"])
         if row["gaussians"] != count:
             return result
-        if row.get("psnr_ycbcr", 0.0) > MAX_PSNR:
+        if row.get("psnr_ycbcr", 0.0) > MAX_PSNR and "loss" not in row:
             result = replace(result, stopped="exact")
         if self.row.get("gaussians") == count and objective.merit(row) <= objective.merit(self.row):
             return result
@@ -228,15 +228,19 @@ class Best:
         ]
 
     def end_early(self) -> None:
-        """Measure the best set with a surplus, and that of the last step, both without it."""
+        """Measure the best set with a surplus, and that of the last step, both without it.
+
+        A loss or a judge that ended the descent may end this too: then the rows so far count.
+        """
         if len(self.refinements) > 1:
             raise KeyboardInterrupt
         larger = [self.larger] if self.larger else []
-        for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
-            measured = [row["iteration"] for row in self.refinements[0].trace]
-            if step not in measured or len(gaussians) > self.state.count:
-                near = self.objective.around(gaussians)
-                self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
+        with suppress(KeyboardInterrupt):
+            for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
+                measured = [row["iteration"] for row in self.refinements[0].trace]
+                if step not in measured or len(gaussians) > self.state.count:
+                    near = self.objective.around(gaussians)
+                    self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
         self.refinements = [
             replace(one, stopped="interrupted", iterations=self.step) for one in self.refinements
         ]

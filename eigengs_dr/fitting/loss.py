@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import drjit as dr
 import numpy as np
 
+from ..backend.arguments import plain_numbers
 from ..backend.arrays import types_of
 from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor
@@ -45,18 +46,20 @@ class Loss:
     function : callable
         ``function(picture, step) -> number``. The picture is a tensor (H, W, C) of Dr.Jit, as
         `eigengs_dr.render` returns it; for maps, a dict of tensors. The number is an array or a
-        tensor of Dr.Jit of one value that depends on the picture. The step counts the calls for
-        derivatives from 0: it may choose a camera, or seed random numbers.
+        tensor of Dr.Jit of one value that depends on the picture; where it does not, at some steps,
+        nothing moves. The step is the number of steps taken before, over the whole fit: it may
+        choose a camera, or seed random numbers. Rows of the trace call the function for step 0,
+        and controls between steps for the next one.
     bounds : (float, float), optional
         Smallest and largest value of the picture, such as ``(0, 1)``: the function sees the picture
         clipped, and sums outside are pulled back.
-    parameters : optimiser, optional
+    parameters : optimiser of Dr.Jit, optional
         Your own optimiser, such as a ``drjit.opt.Adam``, that steps along: the derivatives by its
         parameters are computed too, and then its ``step()`` is called.
     judge : callable, optional
         ``judge(picture) -> number``: what the rows of the trace measure and the best set minimises,
         such as the error in photos that the function does not see. By default
-        ``function(picture, 0)``.
+        ``function(picture, 0)``. Its number may be one of Python, NumPy or PyTorch too.
     target : float, optional
         Value to reach with as few Gaussians as possible, instead of their number.
     space : str or mapping of str to str, optional
@@ -65,9 +68,10 @@ class Loss:
     Raises
     ------
     ValueError
-        If the bounds do not rise, or the target is not above 0.
+        If the bounds are not two finite numbers that rise, or the target is no number above 0.
     TypeError
-        If the function or the judge takes other arguments, or the parameters are no optimiser.
+        If the function or the judge takes other arguments, the function is frozen, or the
+        parameters are no optimiser.
 
     Examples
     --------
@@ -95,18 +99,39 @@ class Loss:
             )
         if not callable(self.function):
             raise TypeError(f"Loss: {self.function!r} is no function of (picture, step)")
+        if hasattr(self.function, "n_recordings"):
+            raise TypeError(
+                "Loss: the function is frozen by drjit.freeze, which passes no derivative on; give "
+                "the function itself"
+            )
         _check_arguments("function", self.function, "picture, step")
         if self.judge is not None:
             _check_arguments("judge", self.judge, "picture")
-        if self.parameters is not None and not hasattr(self.parameters, "step"):
+        steps = hasattr(self.parameters, "step") and hasattr(self.parameters, "values")
+        if self.parameters is not None and not steps:
             raise TypeError(
-                f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser, such "
-                "as drjit.opt.Adam"
+                f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser of "
+                "Dr.Jit, such as drjit.opt.Adam"
             )
-        if self.bounds is not None and not self.bounds[0] < self.bounds[1]:
-            raise ValueError(f"Loss: bounds are {self.bounds}; the first must be the smaller")
+        if self.bounds is not None:
+            object.__setattr__(self, "bounds", _check_bounds(self.bounds))
+        for name, value in plain_numbers(vars(self), Loss.__annotations__).items():
+            object.__setattr__(self, name, value)
         if self.target is not None and not 0 < self.target < math.inf:
             raise ValueError(f"Loss: target is {self.target}; it must be finite and above 0")
+
+
+def _check_bounds(bounds: Any) -> tuple[float, float]:
+    """Return bounds as two numbers; raise ValueError unless they are finite and rise."""
+    try:
+        low, high = (plain_numbers({"": b}, {"": "float"})[""] for b in bounds)
+        if not math.isfinite(high - low):
+            raise ValueError
+    except (TypeError, ValueError):
+        raise ValueError(f"Loss: bounds are {bounds!r}; give two numbers, such as (0, 1)") from None
+    if not low < high:
+        raise ValueError(f"Loss: bounds are {bounds}; the first must be the smaller")
+    return low, high
 
 
 def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:
@@ -175,32 +200,54 @@ AS_THEY_ARE = ("rgb", "linear", "radiance", "data")
 
 @dataclass
 class Calls:
-    """The number of calls of a loss for its derivative, and its values since `check`.
+    """What the calls of a loss for its derivative have shown so far.
 
-    `broken` is the last step that `check_slopes` looked at, if its derivative was not finite.
+    Attributes
+    ----------
+    step : int
+        Number of steps taken.
+    unit : float or None
+        Power of two that brings the mean absolute derivative by a value of the picture to about
+        `USUAL`, as found at the first one that is not 0. Otherwise the unit of a loss would decide
+        what the epsilon of an optimiser holds back.
+    depends, is_zero : bool
+        Whether a value depended on the picture, and whether all values were 0.
+    broken : int or None
+        The last step that `check_slopes` looked at, if its derivative was not finite.
     """
 
     step: int = 0
+    unit: float | None = None
+    depends: bool = False
+    is_zero: bool = True
+    broken: int | None = None
     checked: int = 0
     total: Any = 0.0
-    broken: int | None = None
 
-    def add(self, value: Any, slopes: Sequence[Float]) -> None:
-        """Count a call; the first value is checked at once."""
+    def add(self, value: Any, size: Float) -> None:
+        """Count a step, by the value and the size of its derivative; the first is checked."""
         self.step, self.total = self.step + 1, self.total + value
         dr.schedule(self.total)
         if self.step == 1 or self.step - self.checked >= CHECK_EVERY:
             self.check()
         if self.step % CHECK_EVERY == 1:
-            self.check_slopes(slopes)
+            self.check_slopes(size)
 
-    def check_slopes(self, slopes: Sequence[Float]) -> None:
+    def in_unit(self, slopes: Sequence[Float], size: Float) -> list[Float]:
+        """Return derivatives in the unit of the descent."""
+        if self.unit is None:
+            mean = float(size.numpy()[0]) / sum(map(dr.width, slopes))
+            if 0 < mean < math.inf:
+                self.unit = 2.0 ** min(round(math.log2(USUAL / mean)), 126)  # of single precision
+        return [slope * (self.unit or 1.0) for slope in slopes]
+
+    def check_slopes(self, size: Float) -> None:
         """Raise ValueError if derivatives are not finite, as they were not at the last check.
 
         The descent recovers from one such step, as of a noisy rendering, and not from all.
         """
         step, before = self.step - 1, self.broken
-        self.broken = step if not all(bool(dr.all(dr.isfinite(s))) for s in slopes) else None
+        self.broken = None if math.isfinite(size.numpy()[0]) else step
         if self.broken is not None and before is not None:
             raise ValueError(
                 f"loss: its value is finite, but not its derivative at steps {before} and {step}; "
@@ -216,7 +263,24 @@ class Calls:
         if not math.isfinite(total):
             steps = f"step {first}" if self.step - first == 1 else f"steps {first}-{self.step - 1}"
             raise ValueError(f"loss: its value is {total:g} at {steps}; it must be finite")
+        self.is_zero &= total == 0
 
+    def check_use(self) -> None:
+        """Raise ValueError if no step of a fit had a derivative, unless its loss was least, 0."""
+        self.check()
+        idle = self.step > 0 and self.unit is None and self.broken is None
+        if idle and not (self.depends and self.is_zero):
+            raise ValueError(
+                "loss: its value does not depend on the picture at any step; compute it by Dr.Jit "
+                "from the picture that it is given (a NumPy array has no derivative, and dr.freeze "
+                "passes none on)"
+            )
+
+
+USUAL = 2.0**-15
+"""About the mean absolute derivative of a squared error by the values of a picture of 64x64 pixels.
+With 1e-10 in place of the epsilon 1e-8 of `eigengs_dr.fitting.coarse.NOISY`, Gaussians where a loss
+has next to no weight disturb the others: twice the loss."""
 
 CHECK_EVERY = 10
 """Calls after which the values are read back; each read waits for the device."""
@@ -272,18 +336,22 @@ class LossObjective(Pixels):
                 sums, pictures = draw(
                     state.moving.packed, list(background), state.lists[-1], radius
                 )
-                return Slope(to_slope(sums, self.step(pictures)))
+                slopes, size = self.step(pictures)
+                return Slope(to_slope(sums, slopes), size)
 
             yield model_at
 
-    def step(self, pictures: Sequence[Float]) -> list[Float]:
-        """Return the derivatives by the pictures of a step; parameters of the user get theirs."""
+    def step(self, pictures: Sequence[Float]) -> tuple[list[Float], Float]:
+        """Return the derivatives by the pictures of a step, and their size, see `derivative`.
+
+        Parameters of the user get theirs, and step.
+        """
         parameters = self.loss.parameters
-        value, slopes = self.derivative(pictures, parameters)
+        value, slopes, size = self.derivative(pictures, parameters)
         if parameters is not None:
             parameters.step()
-        self.calls.add(value, slopes)
-        return slopes
+        self.calls.add(value, size)
+        return slopes, size
 
     def draw(
         self, packed: Float, background: list, lists: TileLists, radius: float
@@ -338,27 +406,29 @@ class LossObjective(Pixels):
 
     def derivative(
         self, pictures: Sequence[Float], parameters: Any = None
-    ) -> tuple[Float, list[Float]]:
-        """Return the value of the loss, and its derivatives by the pictures.
+    ) -> tuple[Float, list[Float], Float]:
+        """Return the value of the loss, its derivatives by the pictures, and their size.
 
-        Derivatives by parameters of the user stay in the parameters; no other array gets any. The
-        function may render: if the collector freed another scene meanwhile, the process might end.
+        The derivatives are in a unit of their own, see `Calls.unit`; the size is the sum of their
+        absolute values, 0 if the loss has no derivative at this step. Derivatives by parameters of
+        the user stay in the parameters; no other array gets any. The function may render: if the
+        collector freed another scene meanwhile, the process might end.
         """
         with dr.resume_grad(), collector_off():
-            leaves = [self._tensor(k, rows) for k, rows in enumerate(pictures)]
-            dr.enable_grad(leaves)
-            value = self._number(self.loss.function(self._named(leaves), self.calls.step))
-            if not dr.grad_enabled(value):
-                raise ValueError(
-                    "loss: its value does not depend on the picture; compute it by Dr.Jit from the "
-                    "picture that it is given (a NumPy array has no derivative)"
-                )
-            dr.set_grad(value, 1)
-            # Forward from here marks what depends on these; backward then visits nothing else.
-            marked = [*leaves, *(parameters.values() if parameters is not None else ())]
-            dr.enqueue(dr.ADMode.Forward, marked)
-            dr.traverse(dr.ADMode.Backward)
-            return dr.detach(value), [dr.grad(leaf).array for leaf in leaves]
+            leaves = self._leaves(pictures)
+            value = self._number(_call(self.loss.function, self._named(leaves), self.calls.step))
+            dr.clear_grad(leaves)  # of what the function has differentiated itself
+            if dr.grad_enabled(value):
+                self.calls.depends = True
+                dr.set_grad(value, 1)
+                # Forward from here marks what depends on these; backward then visits nothing else.
+                marked = [*leaves, *(parameters.values() if parameters is not None else ())]
+                dr.enqueue(dr.ADMode.Forward, marked)
+                dr.traverse(dr.ADMode.Backward)
+            slopes = [dr.grad(leaf).array for leaf in leaves]
+        dr.make_opaque(slopes)
+        size = sum(dr.sum(dr.abs(slope)) for slope in slopes)
+        return dr.detach(value), self.calls.in_unit(slopes, size), size
 
     def judged(self, gaussians: Gaussians) -> dict[str, float]:
         """Return the loss of a set for its row, see `Loss.judge`; and its margin to a target."""
@@ -381,11 +451,14 @@ class LossObjective(Pixels):
 
     def judge(self, pictures: Sequence[Float]) -> float:
         """Return the value by which pictures, as rows of pixels, are compared."""
-        with dr.suspend_grad():
-            picture = self._named([self._tensor(k, rows) for k, rows in enumerate(pictures)])
-            judge = self.loss.judge
-            value = self.loss.function(picture, 0) if judge is None else judge(picture)
-            number = float(np.asarray(self._number(value)).reshape(-1)[0])
+        function, judge = self.loss.function, self.loss.judge
+        with dr.resume_grad(), collector_off():  # the function may differentiate, as in a step
+            picture = self._named(self._leaves(pictures))
+            if judge is None:
+                value = _call(function, picture, 0)
+            else:
+                value = _call(judge, dr.detach(picture))
+        number = _one_number(value)
         if not math.isfinite(number):
             name = "its value" if judge is None else "the judge"
             raise ValueError(f"loss: {name} is {number:g} for a picture; it must be finite")
@@ -400,18 +473,21 @@ class LossObjective(Pixels):
             If it is none.
         """
         Float = self.types.Float
-        if isinstance(value, float):
+        if isinstance(value, (int, float)):
             return Float(value)
         if not dr.is_array_v(value) or not dr.is_float_v(value):
             raise ValueError(f"loss: it returned {type(value).__name__}; return a number of Dr.Jit")
         if dr.is_tensor_v(value):
             value = value.array
         if dr.width(value) != 1 or dr.depth_v(value) != 1:
-            raise ValueError(
-                f"loss: it returned an array of shape {value.shape}; return one number, such as "
-                "dr.mean(x, axis=None)"
-            )
+            raise _too_many(value.shape)
         return Float(value)
+
+    def _leaves(self, pictures: Sequence[Float]) -> list[Tensor]:
+        """Return pictures, rows of pixels, as tensors with derivatives of their own."""
+        leaves = [self._tensor(k, rows) for k, rows in enumerate(pictures)]
+        dr.enable_grad(leaves)
+        return leaves
 
     def _tensor(self, number: int, rows: Float) -> Tensor:
         size = self.grid.height, self.grid.width, len(self.views[number].channels)
@@ -420,7 +496,7 @@ class LossObjective(Pixels):
     def _named(self, pictures: Sequence[Tensor]) -> Any:
         if not self.views[0].name:
             return pictures[0]
-        return {view.name: p for view, p in zip(self.views, pictures, strict=True)}
+        return {_Name(view.name): p for view, p in zip(self.views, pictures, strict=True)}
 
     def around(self, gaussians: Gaussians) -> Pixels:
         """Return the squared error of the image, weighed as the loss weighs it near a set.
@@ -454,3 +530,55 @@ class LossObjective(Pixels):
     def image(self) -> Pixels:
         """Return the squared error of the image alone."""
         return Pixels(**{name: getattr(self, name) for name in Pixels.__dataclass_fields__})
+
+
+class _Name(str):
+    """The name of a map as a key of what a loss is given.
+
+    Dr.Jit 1.5 reduces a dict by its keys, and these by their letters, which are text again, until
+    the process ends.
+    """
+
+    __slots__ = ()
+
+    def __iter__(self) -> Iterator[str]:
+        raise TypeError(
+            "loss: its pictures are a dict, which Dr.Jit does not reduce; take each by its name, "
+            f"such as pictures[{str(self)!r}]"
+        )
+        yield ""  # so that the error comes with the first letter, where Dr.Jit passes it on
+
+
+def _call(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function of the user, which may end the fit from an operation of Dr.Jit too."""
+    try:
+        return function(*arguments)
+    except RuntimeError as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps exceptions
+            raise KeyboardInterrupt from error
+        raise
+
+
+def _one_number(value: Any) -> float:
+    """Return a number of Python, NumPy, PyTorch or Dr.Jit, or an array of one, as a float.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    shape = getattr(value, "shape", ())
+    if math.prod(shape) != 1:
+        raise _too_many(shape)
+    array = np.asarray(dr.detach(value)) if dr.is_array_v(value) else value
+    number = array.item() if hasattr(array, "item") else array
+    if not isinstance(number, (int, float)):
+        raise ValueError(f"loss: it returned {type(value).__name__}; return a number")
+    return float(number)
+
+
+def _too_many(shape: Sequence[int]) -> ValueError:
+    return ValueError(
+        f"loss: it returned an array of shape {tuple(shape)}; return one number, such as "
+        "dr.mean(x, axis=None)"
+    )

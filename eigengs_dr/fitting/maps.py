@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.arguments import plain_numbers
 from ..backend.arrays import ArrayTypes
 from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space
 from ..gaussian.gaussians import Gaussians
@@ -33,6 +34,11 @@ MIN_MSE = (1 / 255) ** 2 / 12
 """Mean squared error of rounding to 8 bits: maps below it do not get more weight."""
 
 
+MIN_WEIGHT = 1e-6
+"""Smallest weight of a map; the largest is its inverse. Squares of maps that are 1e20 times as
+large overflow single precision."""
+
+
 @dataclass(frozen=True)
 class Map:
     """A map in a mapping of images that needs more than pixels.
@@ -44,7 +50,8 @@ class Map:
         By default "linear" for albedo, color and the like, "normal" for normals, and "data" for
         other names, see `eigengs_dr.gaussian.channels.usual_space`.
     weight : float
-        Factor of its errors, above 0. It multiplies the factor that `eigengs_dr.fit` finds.
+        Factor of its errors, from 1e-6 to 1e6. It multiplies the factor that `eigengs_dr.fit`
+        finds.
     goal : float or None
         The PSNR in dB that it must reach; by default that of the fit.
     """
@@ -122,18 +129,19 @@ def _read_map(
         check_name(name)
     except BadValue as error:
         raise ValueError(str(error)) from None
-    if not (np.isfinite(given.weight) and given.weight > 0):
-        raise ValueError(f"map {name!r}: weight is {given.weight}; it must be above 0")
     try:
+        weights = plain_numbers(vars(given), Map.__annotations__)
+        if not MIN_WEIGHT <= weights["weight"] <= 1 / MIN_WEIGHT:
+            raise ValueError(f"weight is {given.weight}; it must be from 1e-6 to 1e6")
         pixels, space = read_pixels(given.image, given.space or usual_space(name), weight, encoding)
         reached = goal.psnr if goal else None
-        reached = reached if given.goal is None else Goal(given.goal).psnr
+        reached = Goal(weights["goal"]).psnr if "goal" in weights else reached
     except ValueError as error:
         text = str(error).removeprefix("image: ")
         raise type(error)(f"map {name!r}: {text}") from None
     if rendered_as(space) is None and space != "normal":
         pixels = _without_copies(pixels)
-    return MapImage(name, space, pixels, data_of(pixels, space), given.weight, reached)
+    return MapImage(name, space, pixels, data_of(pixels, space), weights["weight"], reached)
 
 
 def _without_copies(pixels: Image) -> Image:

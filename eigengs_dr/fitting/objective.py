@@ -103,9 +103,12 @@ class Slope(NamedTuple):
     ----------
     derivative : Float, shape (pixels * channels,)
         In tile layout, times half the number of values, as `Quadratic.compare` returns it.
+    size : Float, shape (1,)
+        0 if there is no derivative at this step, which then moves nothing.
     """
 
     derivative: Float
+    size: Float
 
     def compare(
         self, packed: Float, background: list, lists: TileLists, radius: float

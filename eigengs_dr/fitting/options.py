@@ -52,7 +52,8 @@ def refuse_unknown(given: Collection[str], names: Collection[str]) -> None:
     """Raise TypeError for an unknown option, and name the option that it resembles."""
     for name in given:
         if name not in names:
-            [*close] = get_close_matches(name, names, 1)
+            parts = [known for known in names if name in known.split("_")]
+            close = parts or get_close_matches(name, names, 1)
             advice = f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(names)}"
             raise TypeError(f"unknown option {name!r}; {advice}")
 

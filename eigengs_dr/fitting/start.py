@@ -168,8 +168,8 @@ def keep_fitting(
 
 def _fits_better(gaussians: Gaussians, first: Float, second: Float) -> NDArray[np.bool_]:
     """Return where the first error (pixels,) of what a Gaussian owns is at most the second."""
-    first, second = Owners.of(gaussians).collect(first, second)
-    return (first <= second).numpy()
+    shares = [share.numpy() for share in Owners.of(gaussians).collect(first, second)]
+    return np.less_equal(*shares)
 
 
 def _mixed(

@@ -193,13 +193,18 @@ def check_weight(weight: ArrayLike | None) -> Singles | None:
     Raises
     ------
     ValueError
-        If a factor is negative or not finite, or all are 0.
+        If a factor is no number, negative or not finite, or all are 0.
     """
     if weight is None:
         return None
-    if np.iscomplexobj(weight) or np.ma.is_masked(weight):
-        raise ValueError("weight: factors of the errors are complex or masked; pass real numbers")
-    factors = np.asarray(weight, np.float32)
+    try:
+        given = np.asarray(weight)
+    except ValueError:  # rows of unequal length
+        raise ValueError("weight: not an array; expected shape (H, W) or (H, W, C)") from None
+    if given.dtype.kind not in "biuf" or np.ma.is_masked(weight):
+        kind = "masked values" if np.ma.is_masked(weight) else given.dtype
+        raise ValueError(f"weight holds {kind}; expected real numbers, (H, W) or (H, W, C)")
+    factors = np.asarray(given, np.float32)
     if factors.ndim not in (2, 3) or not factors.size:
         raise ValueError(f"weight has shape {factors.shape}; expected (H, W) or (H, W, C)")
     if not np.isfinite(factors).all() or factors.min() < 0:

@@ -240,6 +240,7 @@ def test_arguments_out_of_range(name, value, words):
     [
         ({"method": "default"}, "method is 'default'; pass a Method, such as eigengs_dr.DEFAULT"),
         ({"gausians": 5}, "unknown option 'gausians'; did you mean 'gaussians'?"),
+        ({"target": 36}, "unknown option 'target'; did you mean 'target_psnr'?"),
         ({"init": "grid"}, "unknown option 'init'"),
     ],
 )

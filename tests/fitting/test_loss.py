@@ -1,6 +1,9 @@
 """Fits of losses: an image places as in a fit of it; without an image, texels come first."""
 
+import traceback
 from dataclasses import replace
+from itertools import product
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -10,11 +13,12 @@ from drjit.opt import Adam
 import eigengs_dr as eg
 from eigengs_dr.backend.arrays import _types, types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.coarse import enlarge, levels_of, shrink
+from eigengs_dr.fitting.coarse import Coarse, enlarge, levels_of, shrink, texel_sums
 from eigengs_dr.fitting.loss import LossObjective, View
 from eigengs_dr.fitting.objective import Data, Pixels
 
 SIDE = 48
+TYPES = types_in(select("llvm"))
 IMAGE = eg.sample("coffee")[100 : 100 + SIDE, 200 : 200 + SIDE]
 
 
@@ -59,12 +63,19 @@ def test_ssim_is_higher_than_after_a_fit():
     assert found.psnr_rgb > fit.psnr_rgb - 1.5
 
 
-def test_its_unit_does_not_matter():
-    one, other = (
-        eg.fit(IMAGE, 100, 150, space="rgb", loss=lambda p, s, f=f: f * squares(p)).psnr_rgb
-        for f in (1e-3, 1e3)
-    )
-    assert one == pytest.approx(other, abs=0.5)
+@pytest.mark.parametrize("free", [False, True])
+def test_its_unit_does_not_matter(free):
+    """Powers of two even give equal bits."""
+    given = {"size": (SIDE, SIDE)} if free else {"image": IMAGE}
+    options = {**given, "gaussians": 144, "iterations": 120, "space": "rgb"}
+    images = [
+        eg.fit(**options, loss=lambda p, s, f=f: f * squares(p)).image
+        for f in (1, 1e-6, 1e-3, 1e3, 1e6, 2.0**-30, 2.0**30)
+    ]
+    psnrs = [eg.psnr(image, IMAGE) for image in images]
+    assert max(psnrs) - min(psnrs) < 0.3
+    for image in images[-2:]:
+        np.testing.assert_array_equal(image, images[0])
 
 
 def test_one_seed_gives_one_result():
@@ -182,7 +193,9 @@ def test_a_judge_chooses_the_number():
 
     loss = eg.Loss(noisy, judge=squares)
     found = eg.fit(loss=loss, size=(SIDE, SIDE), iterations=150, space="rgb")
-    tried = [(row["gaussians"], row["loss"]) for row in found.trace if "gaussians" in row]
+    texels, *rows = found.trace
+    same = [row for row in rows if row["iteration"] == texels["iteration"]]
+    tried = [(row["gaussians"], row["loss"]) for row in same[:-1]]  # the last begins the descent
     counts, losses = zip(*tried, strict=True)
     assert list(counts) == [18 * 2**k for k in range(len(counts))] and len(counts) > 1
     assert len(found.gaussians) == min(tried, key=lambda pair: pair[1])[0]
@@ -233,6 +246,110 @@ def test_parameters_of_the_user_step_along():
     assert gain["gain"][0] == pytest.approx(1, abs=0.02)
     assert dr.grad(other)[0] == 7 and dr.grad_enabled(other) and held[0] == 3
     np.testing.assert_array_equal(image, IMAGE)
+
+
+def dropped(picture, weight):
+    """A weight of 0 leaves a number without a derivative."""
+    return weight * squares(picture)
+
+
+def masked(picture, weight):
+    """A mask of 0 leaves a derivative of 0."""
+    mask = type(picture)(np.full((1, 1, 1), weight, np.float32))
+    return dr.mean(dr.square(picture - type(picture)(IMAGE)) * mask, axis=None)
+
+
+@pytest.mark.parametrize("weighed", [dropped, masked])
+def test_a_step_without_a_derivative_moves_nothing(weighed):
+    """Neither Gaussians, whose lists are built at each step here, nor texels."""
+    steady = replace(eg.DEFAULT, controls=(), decay=1.0, drift=0.01)
+    options = {"space": "rgb", "method": steady}
+    loss = eg.Loss(lambda p, s: weighed(p, 0.0 if s in (6, 7, 14) else 1.0), judge=squares)
+    rested = eg.fit(IMAGE, 50, 15, **options, loss=loss).image
+    plain = eg.fit(IMAGE, 50, 12, **options, loss=squares).image
+    np.testing.assert_allclose(rested, plain, atol=1e-5)
+    values, ends = np.full((SIDE, SIDE, 3), 0.5, np.float32), []
+    for every, number in ((3, 18), (1000, 13)):  # the first step rests
+        loss = eg.Loss(lambda p, s, n=every: weighed(p, 1.0 if s % n else 0.0))
+        base = Pixels.of(Data(values, values), "rgb", TYPES)
+        objective = LossObjective.of_loss(loss, [View("", "rgb", range(3))], base)
+        *_, last = texel_sums(objective, replace(Coarse(), decay=1.0), number, [0.5] * 3)
+        ends.append(last.numpy())
+    np.testing.assert_array_equal(*ends)
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_a_loss_needs_a_derivative_at_some_step(free):
+    """But at its least value, 0, there is none."""
+    given = {"size": (SIDE, SIDE)} if free else {"image": IMAGE}
+    options = {**given, "gaussians": 20, "iterations": 8, "space": "rgb"}
+    frozen = dr.freeze(lambda picture, wanted: dr.mean(dr.square(picture - wanted), axis=None))
+    for loss in (
+        lambda p, s: frozen(p, type(p)(IMAGE)),
+        lambda p, s: 0 * squares(p),
+        lambda p, s: squares(dr.detach(p)),
+    ):
+        with pytest.raises(ValueError, match=r"not depend on the picture at any step.*dr\.freeze"):
+            eg.fit(**options, loss=loss)
+    met = eg.fit(**options, loss=lambda p, s: dr.mean(dr.maximum(dr.square(p) - 9, 0), axis=None))
+    assert met.loss == 0 and met.stopped == "iterations"
+
+
+def test_a_loss_differentiates_as_it_likes():
+    """A copy, the picture itself and something else: by rows and by steps, of no effect."""
+
+    def looking(picture, step):
+        copy = type(picture)(dr.detach(picture))
+        dr.enable_grad(copy)
+        dr.backward(squares(copy))
+        dr.backward(squares(picture))
+        assert (dr.grad(copy).numpy() == dr.grad(picture).numpy()).all()
+        dr.set_grad(copy, 1)
+        dr.forward_to(squares(copy))
+        return squares(picture)
+
+    options = {"gaussians": 50, "iterations": 12, "space": "rgb"}
+    plain = eg.fit(IMAGE, **options, loss=squares).image
+    np.testing.assert_array_equal(eg.fit(IMAGE, **options, loss=looking).image, plain)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [float, np.float32, np.float64, np.asarray, lambda x: np.array([x]), lambda x: int(1e6 * x)],
+)
+def test_a_judge_returns_any_number(kind):
+    loss = eg.Loss(squares, judge=lambda p: kind(np.mean((p.numpy() - IMAGE) ** 2)))
+    found = eg.fit(IMAGE, 20, 4, space="rgb", loss=loss)
+    assert found.loss == pytest.approx(kind(np.mean((found.image - IMAGE) ** 2)), rel=1e-4)
+
+
+def test_the_step_is_the_number_of_steps_taken():
+    """Rows of the trace ask for step 0; controls for the next step."""
+    seen = []
+
+    def loss(picture, step):
+        seen.append(step)
+        return squares(picture)
+
+    eg.fit(IMAGE, 50, 40, space="rgb", loss=loss)
+    assert sorted(set(seen)) == list(range(40)) and len(seen) > 45
+    asked = [step for step in seen if step]
+    assert asked == sorted(asked)
+
+
+def test_a_dict_of_maps_is_not_reduced():
+    """Dr.Jit alone ends the process."""
+    with pytest.raises(RuntimeError, match=r"dr\.mean") as error:
+        eg.fit({"albedo": IMAGE}, 10, 4, loss=lambda maps, step: dr.mean(maps, axis=None))
+    text = "".join(traceback.format_exception(error.value))
+    assert "take each by its name, such as pictures['albedo']" in text
+
+
+def test_a_loss_runs_where_the_start_is_the_image():
+    start = eg.fit(IMAGE, 60, 20, space="rgb").gaussians
+    seen = eg.picture_of(start)
+    dark = eg.fit(seen, start=start, loss=lambda p, s: dr.mean(dr.square(p - 0.2)), iterations=30)
+    assert dark.stopped == "iterations" and dark.loss < 0.7 * dark.trace[0]["loss"]
 
 
 def test_pytorch():
@@ -288,9 +405,17 @@ def test_what_is_no_loss_ends_in_one_line(loss, message):
 def test_options_that_do_not_fit_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         eg.fit(**options)
-    for arguments, text in (({"bounds": (1, 0)}, "smaller"), ({"target": 0}, "above 0")):
+    for arguments, text in (
+        ({"bounds": (1, 0)}, "smaller"),
+        ({"bounds": 5}, "bounds are 5; give two numbers"),
+        ({"bounds": (0, None)}, "give two numbers"),
+        ({"bounds": (0, np.inf)}, "give two numbers"),
+        ({"target": 0}, "above 0"),
+        ({"target": "x"}, "target is 'x'; it must be a number"),
+    ):
         with pytest.raises(ValueError, match=text):
             eg.Loss(squares, **arguments)
+    assert eg.Loss(squares, bounds=np.array([0, 1])).bounds == (0, 1)
     with pytest.raises(TypeError, match=r"is a Loss; change one by dataclasses\.replace"):
         eg.Loss(eg.Loss(squares), bounds=(0, 1))
     with pytest.raises(TypeError, match="no function"):
@@ -301,6 +426,10 @@ def test_options_that_do_not_fit_are_refused(options, message):
         eg.Loss(squares, judge=lambda p, step: 0.0)
     with pytest.raises(TypeError, match="give an optimiser"):
         eg.Loss(squares, parameters={"gain": 1})
+    with pytest.raises(TypeError, match="give an optimiser of"):
+        eg.Loss(squares, parameters=SimpleNamespace(step=lambda: None))  # as that of PyTorch
+    with pytest.raises(TypeError, match="function is frozen by"):
+        eg.Loss(dr.freeze(squares))
     with pytest.raises(TypeError, match="fit_many takes no loss; call eigengs_dr"):
         eg.fit_many([IMAGE], loss=squares)
     with pytest.raises(ValueError, match="the judge is nan"):
@@ -324,6 +453,65 @@ def test_an_interrupted_fit_keeps_its_set(last):
     assert result.stopped == "interrupted" and result.loss < 0.05
 
 
+STOPS = {"first": 0, "texels": 3, "later": 25}
+"""Steps at which a loss ends a fit of 40, in half of them texels without an image."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "stop"),
+    [
+        *product(("image", "free", "target"), (*STOPS, "judge", "from a judge on")),
+        ("number", "judge"),
+        ("number", "from a judge on"),
+    ],
+)
+def test_a_loss_or_a_judge_may_end_the_fit(kind, stop):
+    """The best set so far is there, also if it measures no more; other errors pass as they are."""
+    ended = []
+
+    def loss(picture, step):
+        if step >= STOPS.get(stop, 99):
+            raise ended[0]
+        return squares(picture)
+
+    def judge(picture):
+        judged.append(picture)
+        if "judge" in stop and (len(judged) == 2 or ("on" in stop and len(judged) > 2)):
+            raise ended[0]
+        return squares(picture)
+
+    given = {"image": IMAGE} if kind in ("image", "target") else {"size": (SIDE, SIDE)}
+    given |= {} if kind in ("target", "number") else {"gaussians": 30}
+    asked = eg.Loss(loss, judge=judge, target=1e-4 if kind == "target" else None)
+    for error in (KeyboardInterrupt(), StopIteration("mine"), RuntimeError("mine")):
+        ended[:], judged = [error], []
+        with pytest.raises(BaseException) as got:
+            eg.fit(**given, iterations=40, space="rgb", loss=asked)
+        if isinstance(error, KeyboardInterrupt):
+            assert isinstance(got.value, eg.FitInterrupted)
+            result = got.value.result
+            assert result.stopped == "interrupted" and result.image.shape == IMAGE.shape
+            assert len(result.gaussians) == given.get("gaussians", len(result.gaussians))
+            assert result.iterations <= max(40, 2 * STOPS.get(stop, 40))
+        else:
+            assert got.value is error
+
+
+def test_an_operation_of_a_loss_may_end_the_fit():
+    """Dr.Jit wraps the error, as that of a network of PyTorch."""
+
+    class Ends(dr.CustomOp):
+        def eval(self, picture):
+            raise KeyboardInterrupt
+
+    def loss(picture, step):
+        return squares(dr.custom(Ends, picture) if step == 3 else picture)
+
+    with pytest.raises(eg.FitInterrupted) as error:
+        eg.fit(IMAGE, 20, 10, space="rgb", loss=loss)
+    assert error.value.result.iterations == 3
+
+
 @pytest.mark.parametrize("space", ["rgb", "ycbcr", "log", "normal"])
 def test_the_slope_is_a_finite_difference(backend, space):
     """Of sums in tile layout, through what the picture shows."""
@@ -339,8 +527,8 @@ def test_the_slope_is_a_finite_difference(backend, space):
     view = View("", space, range(3), 0.9, 0.05)
     objective = LossObjective.of_loss(eg.Loss(loss), [view], base)
     rows = double.Float(values.ravel())
-    value, slopes = objective.derivative(objective.seen(rows))
-    slope = objective.pull_back(rows, slopes).numpy()
+    value, slopes, size = objective.derivative(objective.seen(rows))
+    slope = objective.pull_back(rows, slopes).numpy() / objective.calls.unit
     for place in random.integers(0, values.size, 12):
         ends = []
         for step in (-1e-6, 1e-6):
@@ -348,7 +536,9 @@ def test_the_slope_is_a_finite_difference(backend, space):
             moved[place] += step
             ends.append(objective.judge(objective.seen(double.Float(moved))))
         assert slope[place] == pytest.approx((ends[1] - ends[0]) / 2e-6, rel=1e-4, abs=1e-6)
-    assert value[0] > 0
+    assert value[0] > 0 and size[0] == pytest.approx(
+        np.abs(slopes[0].numpy()).sum() / objective.calls.unit
+    )
 
 
 def test_the_curvature_of_the_squared_error_is_its_weight():

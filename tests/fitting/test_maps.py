@@ -166,7 +166,22 @@ ROUGH = SMALL["roughness"]
             "map 'roughness': space 'hsv' is not in ycbcr",
         ),
         ({"albedo": eg.Map(SMALL["albedo"], weight=0)}, {}, "'albedo': weight is 0; it must be"),
-        ({"albedo": eg.Map(SMALL["albedo"], weight=np.nan)}, {}, "weight is nan; it must be above"),
+        ({"albedo": eg.Map(SMALL["albedo"], weight=np.nan)}, {}, "weight is nan; it must be"),
+        (
+            {"albedo": eg.Map(SMALL["albedo"], weight=1e20)},
+            {},
+            "is 1e\\+20; it must be from 1e-6 to",
+        ),
+        (
+            {"albedo": eg.Map(SMALL["albedo"], weight="x")},
+            {},
+            "'albedo': weight is 'x'; it must be a",
+        ),
+        (
+            {"albedo": eg.Map(SMALL["albedo"], weight=None)},
+            {},
+            "weight is None; it must be a number",
+        ),
         (SMALL | {"ao": eg.Map(ROUGH, goal=30)}, {}, "map 'albedo' has no goal; give each map one"),
         ({"ao": eg.Map(ROUGH, goal=np.nan)}, {}, "map 'ao': target_psnr is nan"),
         ({"ao": eg.Map(ROUGH, goal=30)}, {"gaussians": 9}, "exclude each other"),
