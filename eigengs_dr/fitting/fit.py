@@ -246,8 +246,8 @@ def fit(
     Notes
     -----
     On one machine and backend, equal seeds give bit-identical results, unless the derivative of a
-    loss has other bits at each call: Dr.Jit adds those of values that the loss broadcasts, as in
-    ``color * alpha`` of one channel, in any order.
+    loss has other bits at each call: Dr.Jit adds those of values that the loss broadcasts, such as
+    alpha in ``color * alpha``, in any order.
 
     The factors of the errors of maps that the function finds are one over the root mean square
     error after a first colour solve, so that all maps gain alike in decibels; or with goals, one
