@@ -49,6 +49,12 @@ _LOCK = threading.RLock()
 _retired: deque[Callable[[], None]] = deque()
 """Functions that free unused programs and arrays; `_clear_retired` calls them."""
 
+_users: set[int] = set()
+"""The threads that have asked for `_LOCK`."""
+
+_blocks = 0
+"""Number of open `exclusive` blocks of the thread that holds `_LOCK`."""
+
 _calls = 0
 """Number of running calls of frozen programs, in the thread that holds `_LOCK`."""
 
@@ -96,8 +102,12 @@ def exclusive() -> Iterator[None]:
     if _is_guest():
         yield
         return
+    global _blocks
+    _users.add(threading.get_ident())
     with _LOCK:
         _clear_retired()
+        kept = find_shared() if _blocks == 0 and len(_users) > 1 else []
+        _blocks += 1
         try:
             yield
         except RuntimeError as error:
@@ -105,7 +115,17 @@ def exclusive() -> Iterator[None]:
                 raise
             raise first from first.__cause__
         finally:
+            _blocks -= 1
+            kept.clear()
             _clear_retired()
+
+
+def find_shared() -> list[object]:
+    """Return what other threads must not free during an `exclusive` block, which keeps it.
+
+    `eigengs_dr.plugins` puts a function here that finds the objects of Mitsuba's scenes.
+    """
+    return []
 
 
 def _first_cause(error: BaseException) -> BaseException:
@@ -301,8 +321,9 @@ def freeze_rendering(function: Program) -> Program:
     """Freeze a function that takes objects of Mitsuba, such as a scene, beside arrays.
 
     Dr.Jit walks what the objects hold at every call, so a change of the scene is noticed. If one of
-    them is written in Python, a thread that drops arrays meanwhile may wait for ever, see above:
-    such a scene belongs to a program of one thread.
+    them is written in Python, a thread that drops arrays or scenes meanwhile may wait for ever, see
+    above, and an array of NumPy that is freed meanwhile ends the process. So once a second thread
+    has taken the lock, the function is called as it is.
 
     Parameters
     ----------
@@ -312,7 +333,7 @@ def freeze_rendering(function: Program) -> Program:
     Returns
     -------
     callable
-        The frozen function; its recordings are freed after it.
+        Its recordings are freed after it.
     """
     frozen = dr.freeze(function, warn_after=MANY_RECORDINGS)
     flushes = 0
@@ -321,6 +342,8 @@ def freeze_rendering(function: Program) -> Program:
     def call(*arguments: object) -> object:
         nonlocal flushes
         with _calling(next(filter(dr.is_array_v, arguments))):
+            if len(_users) > 1:
+                return function(*arguments)
             if flushes != _flushes:
                 frozen.clear()
                 flushes = _flushes
