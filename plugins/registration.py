@@ -9,8 +9,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from eigengs_dr.backend import recording
+
 from .gaussian_environment import gaussian_environment
 from .gaussian_texture import gaussian_texture
+from .living import living_objects
 from .versions import Properties, register_emitter, register_texture
 
 PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
@@ -49,6 +52,7 @@ def register_plugins() -> None:
 
 @cache  # a second callback would register everything twice
 def _follow() -> None:
+    recording.find_shared = living_objects
     mi.detail.add_variant_callback(lambda old, new: _register(new))
 
 

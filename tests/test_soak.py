@@ -1,4 +1,4 @@
-"""Threads that fit, render, load scenes and drop results, for a minute or SOAK_SECONDS."""
+"""Threads that fit, render, recover textures and drop results and scenes, for SOAK_SECONDS."""
 
 import os
 
@@ -16,23 +16,38 @@ import mitsuba as mi
 
 mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()
-from eigengs_dr.plugins import texture_of
+from eigengs_dr.plugins import environment_of, photo_loss, texture_of
 
-end, counts = time.monotonic() + {seconds}, dict.fromkeys(("fit", "render", "scene", "drop"), 0)
+works = "fit", "render", "scene", "recover", "drop"
+end, counts = time.monotonic() + {seconds}, dict.fromkeys(works, 0)
 image = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
 first = eg.fit(image, 60, iterations=3, space="linear", progress=False)
 expected = first.image.tobytes()
-results, failures = [first], []
+results, failures, loaded = [first], [], []
+light = eg.Gaussians.from_arrays(
+    [[8, 4]], [[0.3, 0, 0.3]], [[0.5] * 3], [1.0] * 3, size=(16, 8), space="radiance"
+)
+GREY = np.full((8, 8, 3), 0.5)
 
 
-def wall(texture):
-    return {{
+def wall(texture, sky, integrator):
+    # Load a wall that a camera sees.
+    view = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {{"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb"}}
+    return mi.load_dict({{
         "type": "scene",
-        "integrator": {{"type": "direct"}},
-        "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 8, "height": 8}}}},
-        "sky": {{"type": "constant"}},
+        "integrator": {{"type": integrator}},
+        "sensor": {{"type": "perspective", "film": film, "to_world": view}},
+        "sky": sky,
         "wall": {{"type": "rectangle", "bsdf": {{"type": "diffuse", "reflectance": texture}}}},
-    }}
+    }})
+
+
+def grey_wall(number):
+    # A wall with a bitmap; every other one under a sky of Gaussians.
+    bitmap = {{"type": "bitmap", "data": mi.TensorXf(GREY), "raw": True}}
+    sky = environment_of(light) if number % 2 else {{"type": "constant"}}
+    return wall(bitmap, sky, ("direct", "prb", "path")[number % 3])
 
 
 def fit():
@@ -48,14 +63,27 @@ def render():
 
 def scene():
     with eg.exclusive():
-        loaded = mi.load_dict(wall(texture_of(results[-1].gaussians)))
-        assert np.isfinite(mi.render(loaded, spp=2).numpy()).all()
-        del loaded
+        shown = wall(texture_of(results[-1].gaussians), {{"type": "constant"}}, "direct")
+        assert np.isfinite(mi.render(shown, spp=2).numpy()).all()
+        other = grey_wall(counts["scene"])
+    loaded.extend([shown, other])
+
+
+def recover():
+    with eg.exclusive():
+        seen = grey_wall(counts["recover"])
+    loss = photo_loss(seen, "wall.bsdf.reflectance", [GREY])
+    found = eg.fit(loss=loss, size=(8, 8), gaussians=4, iterations=8, progress=False)
+    assert np.isfinite(found.image).all()
 
 
 def drop():
+    # Drop results and scenes at any time: this needs no lock.
     while len(results) > 1:
         results.pop(0)
+    while loaded:
+        loaded.pop()
+        time.sleep(0.003)
     time.sleep(0.01)
 
 
@@ -69,7 +97,7 @@ def repeat(work):
 
 
 sys.setswitchinterval(1e-6)
-works = [fit, fit, render, scene, drop]
+works = [fit, fit, render, scene, recover, recover, drop]
 threads = [threading.Thread(target=repeat, args=(work,), daemon=True) for work in works]
 for thread in threads:
     thread.start()

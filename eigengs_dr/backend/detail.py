@@ -34,6 +34,11 @@ def new_scope(backend: dr.JitBackend) -> None:
     dr.detail.new_scope(backend)
 
 
+def kernel_misses() -> tuple[int, ...]:
+    """Return how many kernels were missing in memory so far: read from the disk, and compiled."""
+    return tuple(dr.detail.launch_stats()[1:])
+
+
 def indices_of(arrays: object) -> tuple[int, ...]:
     """Return the indices by which Dr.Jit identifies the variables in nested arrays."""
     return tuple(dr.detail.collect_indices(arrays))

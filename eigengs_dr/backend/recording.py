@@ -30,7 +30,7 @@ from typing import Any
 
 import drjit as dr
 
-from .detail import new_scope
+from .detail import kernel_misses, new_scope
 from .types import DrJitArray
 
 Program = Callable[..., Any]
@@ -49,8 +49,21 @@ _LOCK = threading.RLock()
 _retired: deque[Callable[[], None]] = deque()
 """Functions that free unused programs and arrays; `_clear_retired` calls them."""
 
+_users: set[int] = set()
+"""The threads that have asked for `_LOCK`."""
+
+_blocks = 0
+"""Number of open `exclusive` blocks of the thread that holds `_LOCK`."""
+
 _calls = 0
 """Number of running calls of frozen programs, in the thread that holds `_LOCK`."""
+
+_flushes = 0
+"""Number of times that `drjit.flush_kernel_cache` was noticed, see `_count_flushes`."""
+_misses = 0, 0
+"""`kernel_misses` when `_count_flushes` last looked."""
+OUR_KERNEL = 0x2D6A55
+"""A constant that makes a kernel unlike all others."""
 
 _COLLECTOR_LOCK = threading.RLock()
 _pauses = 0
@@ -69,6 +82,9 @@ def exclusive() -> Iterator[None]:
     same time. Blocks of one thread may nest. Scenes may be loaded in a block, because Mitsuba's
     loading threads need no lock. A block must not wait for another thread that waits for the lock.
 
+    An error in a function that Dr.Jit calls, such as Ctrl-C in a loop, leaves the block as what it
+    was, not as the `RuntimeError` that Dr.Jit makes of it.
+
     Returns
     -------
     context manager
@@ -86,12 +102,40 @@ def exclusive() -> Iterator[None]:
     if _is_guest():
         yield
         return
+    global _blocks
+    _users.add(threading.get_ident())
     with _LOCK:
         _clear_retired()
+        kept = find_shared() if _blocks == 0 and len(_users) > 1 else []
+        _blocks += 1
         try:
             yield
+        except RuntimeError as error:
+            if (first := _first_cause(error)) is error:
+                raise
+            raise first from first.__cause__
         finally:
+            _blocks -= 1
+            kept.clear()
             _clear_retired()
+
+
+def find_shared() -> list[object]:
+    """Return what other threads must not free during an `exclusive` block, which keeps it.
+
+    `eigengs_dr.plugins` puts a function here that finds the objects of Mitsuba's scenes.
+    """
+    return []
+
+
+def _first_cause(error: BaseException) -> BaseException:
+    """Return what was raised in a function that Dr.Jit called, which it makes a `RuntimeError`.
+
+    It may be Ctrl-C, or come from an alarm, from another thread or from a function of the user.
+    """
+    while type(error) is RuntimeError and error.__cause__ is not None:
+        error = error.__cause__
+    return error
 
 
 _guests = threading.local()
@@ -206,71 +250,103 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Pr
     call : callable
         Takes the arguments of `function`; `exclusive`, with the collector off.
     """
-    programs: dict[Shape, Program] = {}
-    results: dict[Shape, Shape] = {}
+    programs: dict[Shape, tuple[Program, list[Shape]]] = {}
+    flushes = 0
 
-    def freeze(shape: Shape) -> Program:
+    def freeze(shape: Shape) -> tuple[Program, list[Shape]]:
+        result: list[Shape] = []
+
         def trace(flat: list[DrJitArray]) -> list[DrJitArray]:
             arrays: list[DrJitArray] = []
-            results[shape] = _flatten(function(*_build(shape, iter(flat))), arrays)
+            result[:] = [_flatten(function(*_build(shape, iter(flat))), arrays)]
             return arrays
 
         # Dr.Jit also traverses the closure of a frozen function: this one only holds `trace`.
-        return dr.freeze(lambda flat: trace(flat), warn_after=MANY_RECORDINGS)
+        return dr.freeze(lambda flat: trace(flat), warn_after=MANY_RECORDINGS), result
 
     @wraps(function)
     def call(*arguments: object) -> object:
-        with _calling():
-            arrays: list[DrJitArray] = []
-            shape = _flatten(arguments, arrays)
-            program = programs.pop(shape, None) or freeze(shape)
-            programs[shape] = program  # now the most recently used
+        nonlocal flushes
+        arrays: list[DrJitArray] = []
+        shape = _flatten(arguments, arrays)
+        with _calling(arrays[0]):
+            if flushes != _flushes:
+                programs.clear()
+                flushes = _flushes
+            programs[shape] = programs.pop(shape, None) or freeze(shape)  # the last one used
             if limit is not None and len(programs) > limit:
                 _retire([programs.pop(next(iter(programs)))].clear)
+            program, result = programs[shape]
             flat = program(arrays)
-            return _build(results[shape], iter(flat))
+            return _build(result[0], iter(flat))
 
     return programs, call
 
 
 @contextmanager
-def _calling() -> Iterator[None]:
+def _calling(array: DrJitArray) -> Iterator[None]:
     """Let no other thread use Dr.Jit, and nothing be freed, while a frozen program is called."""
     global _calls
     with exclusive(), collector_off():
+        if not _is_recording():
+            _count_flushes(array)
         _calls += 1
         try:
             yield
-        except RuntimeError as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps exceptions
-                raise KeyboardInterrupt from error
-            raise
         finally:
             _calls -= 1
+
+
+def _count_flushes(array: DrJitArray) -> None:
+    """Notice that `drjit.flush_kernel_cache` was called: programs from before must not be replayed.
+
+    Dr.Jit 1.5 records a program anew if one of its kernels is gone. But it takes a kernel that was
+    compiled again since for the freed one, and then the replay ends the process. So there is danger
+    only after kernels were compiled, and then a launch of a kernel that nothing else has tells
+    whether that was gone, too.
+
+    Parameters
+    ----------
+    array : Dr.Jit array
+        It gives the backend.
+    """
+    global _flushes, _misses
+    if (before := kernel_misses()) != _misses:
+        dr.eval(dr.opaque(dr.uint32_array_t(dr.leaf_t(array)), 1) ^ OUR_KERNEL)
+        _misses = kernel_misses()
+        _flushes += _misses != before
 
 
 def freeze_rendering(function: Program) -> Program:
     """Freeze a function that takes objects of Mitsuba, such as a scene, beside arrays.
 
     Dr.Jit walks what the objects hold at every call, so a change of the scene is noticed. If one of
-    them is written in Python, a thread that drops arrays meanwhile may wait for ever, see above:
-    such a scene belongs to a program of one thread.
+    them is written in Python, a thread that drops arrays or scenes meanwhile may wait for ever, see
+    above, and an array of NumPy that is freed meanwhile ends the process. So once a second thread
+    has taken the lock, the function is called as it is.
 
     Parameters
     ----------
     function : callable
-        Of positional arguments; it uses nothing else that changes.
+        Of positional arguments, among them an array; it uses nothing else that changes.
 
     Returns
     -------
     callable
-        The frozen function; its recordings are freed after it.
+        Its recordings are freed after it.
     """
     frozen = dr.freeze(function, warn_after=MANY_RECORDINGS)
+    flushes = 0
 
     @wraps(function)
     def call(*arguments: object) -> object:
-        with _calling():
+        nonlocal flushes
+        with _calling(next(filter(dr.is_array_v, arguments))):
+            if len(_users) > 1:
+                return function(*arguments)
+            if flushes != _flushes:
+                frozen.clear()
+                flushes = _flushes
             return frozen(*arguments)
 
     weakref.finalize(call, _retired.append, frozen.clear)  # perhaps during a recording
@@ -353,10 +429,14 @@ def _retire(release: Callable[[], None]) -> None:
 
 def _clear_retired() -> None:
     """Free retired objects, unless a program is running or a user's function is being recorded."""
+    while _retired and not _is_recording():
+        _retired.popleft()()
+
+
+def _is_recording() -> bool:
     # A rendering that is traced is a recording, too.
     scopes = dr.JitFlag.FreezingScope, dr.JitFlag.SymbolicScope
-    while _retired and not _calls and not any(map(dr.flag, scopes)):
-        _retired.popleft()()
+    return _calls > 0 or any(map(dr.flag, scopes))
 
 
 @contextmanager

@@ -7,7 +7,14 @@ import numpy as np
 
 import eigengs_dr
 from eigengs_dr.backend.arrays import types_in
-from eigengs_dr.backend.detail import indices_of, llvm_version, new_scope, scope, sorting_index
+from eigengs_dr.backend.detail import (
+    indices_of,
+    kernel_misses,
+    llvm_version,
+    new_scope,
+    scope,
+    sorting_index,
+)
 from eigengs_dr.backend.selection import select
 
 
@@ -25,6 +32,17 @@ def test_scopes_are_numbered(backend):
     assert scope(kind) == before
     new_scope(kind)
     assert scope(kind) != before
+
+
+def test_missing_kernels_are_counted(backend):
+    """A flush of kernels is noticed by them: programs from before would end the process."""
+    one = dr.opaque(select(backend).UInt32, 1)
+    dr.eval(one ^ 0x1234567)
+    before = kernel_misses()
+    dr.eval(one ^ 0x1234567)
+    assert kernel_misses() == before
+    dr.eval(one ^ 0x1234567 ^ (one << 3))
+    assert kernel_misses() != before
 
 
 def test_variables_have_numbers(backend):

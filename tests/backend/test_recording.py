@@ -2,6 +2,8 @@
 
 import gc
 import threading
+import weakref
+from collections import namedtuple
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,6 +17,7 @@ from _helpers.families import small_model
 from _helpers.process import python_path, run_python
 from _helpers.waves import half_read, picture, start
 from eigengs_dr.backend import recording
+from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.executor import LocalExecutor
 from eigengs_dr.backend.recording import (
     LARGEST_RECORDED,
@@ -62,7 +65,7 @@ def test_the_collector_is_left_as_it_was(backend):
         assert not gc.isenabled()
         raise ValueError("no")
 
-    with freeze_program(refuse) as call, pytest.raises(RuntimeError):
+    with freeze_program(refuse) as call, pytest.raises(ValueError, match="no"):
         call(Float(1))
     assert gc.isenabled()
     gc.disable()
@@ -142,6 +145,68 @@ def test_an_interrupt_in_a_recorded_program_stays_one(backend):
 
     with pytest.raises(KeyboardInterrupt):
         program(select(backend).Float(1))
+
+
+def test_errors_keep_their_type(backend):
+    """Dr.Jit makes a RuntimeError of an alarm, say, inside of a program or a loop."""
+    x = select(backend).Float(1)
+
+    @record
+    def program(value):
+        raise TimeoutError("now")
+
+    def late(value):
+        raise TimeoutError("now")
+
+    with pytest.raises(TimeoutError, match="now"):
+        program(x)
+    with pytest.raises(TimeoutError, match="now"):
+        door(lambda: dr.while_loop((x,), lambda x: x < 3, late))()
+    with pytest.raises(RuntimeError, match="of mine"), exclusive():
+        raise RuntimeError("of mine")
+
+
+def test_what_is_kept_of_calls_is_limited(backend):
+    """Also the structures of their results."""
+    x, types = select(backend).Float(1), []
+
+    @record
+    def program(value, number):
+        types.append(weakref.ref(kind := namedtuple("Result", "value")))
+        return kind(value + number)
+
+    for number in range(recording.KEPT_RECORDINGS + 3):
+        assert program(x, number).value == 1 + number
+    gc.collect()
+    assert sum(kind() is not None for kind in types) == recording.KEPT_RECORDINGS
+
+
+FLUSHED = """
+import drjit as dr
+import eigengs_dr as eg
+from _helpers.waves import picture
+
+def fit():
+    return eg.fit(picture(), 40, iterations=4, progress=False).image.tobytes()
+
+def flush(picture, step):
+    if step == 2:
+        dr.flush_kernel_cache()
+    return dr.mean(dr.square(picture), axis=None)
+
+before = fit()
+dr.flush_kernel_cache()
+assert fit() == before
+eg.fit(picture(), 40, iterations=6, loss=flush, progress=False)
+assert fit() == before
+print("whole")
+"""
+
+
+def test_kernels_may_be_flushed():
+    """Dr.Jit 1.5 ends the process where it replays a kernel that was compiled again."""
+    run = run_python(FLUSHED, PYTHONPATH=python_path())
+    assert run.stdout == "whole\n", run.stderr
 
 
 # --- Several threads ---

@@ -359,6 +359,7 @@ def build_pyramid(
             for k, border in enumerate(borders):
                 whole = dr.zeros(types.Float, dr.width(x))
                 dr.scatter(whole, border, ring)
+                dr.eval(whole)  # where all points are at a border, `select` returns it itself
                 inside = dr.gather(types.Float, inner, pixel * len(color) + k, ~edge)
                 seen.append(dr.select(edge, whole, inside))
         parts.append(pack_parameters(seen))

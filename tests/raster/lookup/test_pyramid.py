@@ -160,11 +160,11 @@ def test_double_precision_stays(backend):
 
 
 @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
-@pytest.mark.parametrize("count", [40, MANY])
-def test_the_finest_level_is_the_filtered_sum(backend, wrap, count):
+@pytest.mark.parametrize(("count", "size"), [(40, SIZE), (MANY, SIZE), (9, (1, 8))])
+def test_the_finest_level_is_the_filtered_sum(backend, wrap, count, size):
     """At every point, although most are rendered and only the border is looked up."""
-    sizes, packed, *rest = arrays_of(random_scene(3, count).on(backend), wrap)
-    types, level = types_of(packed.values), coarsen.levels_of(*SIZE, count, wrap)[0]
+    sizes, packed, *rest = arrays_of(random_scene(3, count, size).on(backend), wrap)
+    types, level = types_of(packed.values), coarsen.levels_of(*size, count, wrap)[0]
     index = dr.arange(types.UInt, level.columns * level.rows)
     x = (types.Float(index % level.columns) + 0.5 - level.pad) * level.dx
     y = (types.Float(index // level.columns) + 0.5 - level.pad) * level.dy
