@@ -157,10 +157,11 @@ def outside_of_recordings(compute: Callable[[], Result]) -> Result:
     """Call a function that launches programs, even while Dr.Jit records one.
 
     Renderers call textures while they record a program, in which nothing can be evaluated. Another
-    thread records nothing; this one, which waits for it, may hold the lock.
+    thread records nothing; this one, which waits for it, may hold the lock. So may the caller of a
+    loading thread, in which a material asks for the mean of its texture.
     """
     if not dr.flag(dr.JitFlag.SymbolicScope):
-        return compute()
+        return guest()(compute)()
     with ThreadPoolExecutor(1) as another:
         return another.submit(guest()(compute)).result()
 

@@ -213,6 +213,8 @@ def convert_scene(
         raise TypeError("convert_scene: scene is loaded; give its XML file or its dictionary")
     if not 0 < target_psnr < 60:
         raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
+    if iterations < 0:
+        raise ValueError(f"iterations is {iterations}; it must be at least 0")
     refuse_url(output)
     target = Path(os.path.realpath(output))  # of a link, the folder that it names
     _check_empty(output, target)

@@ -174,6 +174,31 @@ def fit_for_scene(
             f"iterations is {iterations} and max_gaussians is {max_gaussians}; they must be at "
             "least 0 and at least 1"
         )
+    return fit_seen(
+        scene, texture, image, target_psnr, space, max_gaussians, iterations, wrap_mode, encoding,
+        progress or silent,
+    )  # fmt: skip
+
+
+def fit_seen(
+    scene: Any,
+    texture: str | Texture | Sequence[str | Texture],
+    image: ArrayLike,
+    target_psnr: float,
+    space: str,
+    max_gaussians: int | None,
+    iterations: int,
+    wrap_mode: str | Sequence[str],
+    encoding: str | None,
+    show: Progress,
+    aim: Callable[[Gaussians, float], float] | None = None,
+) -> SceneFit:
+    """Find the fewest Gaussians for an image; see `fit_for_scene`.
+
+    ``aim(gaussians, psnr)`` returns the PSNR to look for, once the cameras have seen a first set at
+    a PSNR; at most `eigengs_dr.scene.target.MARGIN` above `target_psnr`.
+    """
+    show("rays", 0, 1)
     checked = check_data(image) if space == "data" else check_image(image, encoding=encoding)
     low, high = float(checked.min()), float(checked.max())
     if space == "data" and (low < -ROUNDING or high > 1 + ROUNDING):
@@ -181,37 +206,6 @@ def fit_for_scene(
             f"image: data from {low:g} to {high:g}; cameras compare data from 0 to 1: scale it"
         )
     pixels = checked.clip(0, None if space == "radiance" else 1)
-    return fit_seen(
-        scene,
-        texture,
-        pixels,
-        target_psnr,
-        space,
-        max_gaussians,
-        iterations,
-        wrap_mode,
-        progress or silent,
-    )
-
-
-def fit_seen(
-    scene: Any,
-    texture: str | Texture | Sequence[str | Texture],
-    pixels: Image,
-    target_psnr: float,
-    space: str,
-    max_gaussians: int | None,
-    iterations: int,
-    wrap_mode: str | Sequence[str],
-    show: Progress = silent,
-    aim: Callable[[Gaussians, float], float] | None = None,
-) -> SceneFit:
-    """Find the fewest Gaussians for checked pixels; see `fit_for_scene`.
-
-    ``aim(gaussians, psnr)`` returns the PSNR to look for, once the cameras have seen a first set at
-    a PSNR; at most `eigengs_dr.scene.target.MARGIN` above `target_psnr`.
-    """
-    show("rays", 0, 1)
     height, width = pixels.shape[:2]
     values = pixels if space == "data" else to_linear(pixels)
     peak = max(1.0, float(values.max())) if space == "radiance" else 1.0

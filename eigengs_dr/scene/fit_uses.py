@@ -157,13 +157,14 @@ def fit_picture(
     result = fit_seen(
         original.scene,
         original.textures(group),
-        pixels.clip(0),
+        pixels,
         target_psnr,
         # Raw colours are still colours; pixels in memory are usually raw.
         space_of(pixels, use.raw and pixels.shape[2] == 1),
         None,
         iterations,
         [use.wrap for use in group],
+        "linear",
         show,
         None if original.spp == 0 else aim,
     )

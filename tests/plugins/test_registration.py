@@ -67,7 +67,7 @@ for n in range(6):
     eg.fit(noise[:64, :64], 200, 0).gaussians.save(rf"FOLDER/{n}.npz")
     gaussians = {"type": "gaussian_texture", "filename": rf"FOLDER/{n}.npz", "prefilter": n / 100}
     for kind in (gaussians, {"type": "bitmap", "filename": rf"FOLDER/{n}.exr"}):
-        paint = {"type": "diffuse", "reflectance": kind}
+        paint = {"type": "roughplastic", "diffuse_reflectance": kind}  # it asks for the mean
         scene[f"{kind['type']}{n}"] = {"type": "sphere", "bsdf": paint}
 with eg.exclusive():
     for _ in range(5):

@@ -72,13 +72,14 @@ def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     assert by_name["soft.png (paint.reflectance)"].bytes == 512 * 512 * 4  # Dr.Jit pads colours
     assert all(t.gaussian_bytes <= t.bytes for t in found.textures)
     assert "photo.png (principled.base_color)" in {t.names[0] for t in found.better}
-    assert found.left == []
+    [(left, reason)] = found.left  # without renderings
+    assert left == "normals.png (normalmap.normalmap)" and "renderings decide" in reason
     for texture in found.better:
         assert texture.file == "" and texture.gaussian_bytes > texture.bytes
         assert texture.psnr >= 50 and texture.gaussians > 0
     files = {path.name for path in (tmp_path / "new").glob("*.npz")}
     assert files == {t.file for t in found.textures}
-    assert bitmaps_in(found.scene) == len(found.better)
+    assert bitmaps_in(found.scene) == len(found.better) + 1
 
 
 def many_at_a_point(count):
