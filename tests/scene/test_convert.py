@@ -136,6 +136,16 @@ def test_renderings_that_miss_the_goal_are_named(folder, tmp_path):
     assert min(found.psnr) < 30
 
 
+def test_the_search_aims_at_the_renderings(folder, tmp_path):
+    """A set that is seen at 32 dB in even light is rendered at 29 under a strong lamp."""
+    eg.save_image(folder / "dim.png", 0.3 * eg.sample("coffee")[:192:6, :192:6])
+    lamp = {"type": "constant", "radiance": {"type": "rgb", "value": 5.0}}
+    scene = plain(mi, folder, {"type": "bitmap", "filename": str(folder / "dim.png")}, lamp=lamp)
+    settings = {"iterations": 40, "spp": 16, "replace_all": True}
+    found = eg.convert_scene(scene, tmp_path / "new", 32, **settings)
+    assert found.psnr[0] > 31.5 and found.textures[0].psnr > 33.5
+
+
 def test_a_dictionary_with_a_mesh_and_a_bump_map_that_stays(folder, tmp_path):
     """A cube shows the facets of 32 x 32 texels, which no Gaussians have."""
     found = eg.convert_scene(room(mi, folder), tmp_path / "new", spp=2, **QUICK)
