@@ -1,4 +1,4 @@
-"""Check that a GPU computes the same as llvm: trials in other processes, one verdict per machine.
+"""Check that a GPU computes the same as llvm: trials in other processes.
 
 A trial, ``eigengs-dr doctor --trial NAME``, is a small computation that prints its figures. Each
 backend runs it in a process of its own, so that a driver that crashes ends only that process.
@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import subprocess
 import sys
-from contextlib import suppress
-from pathlib import Path
 from typing import NamedTuple
 
 from .types import Record
@@ -99,37 +96,3 @@ def run_trial(name: str, backend: str) -> Trial:
         return Trial(answer["seconds"], answer["figures"])
     lines = process.stderr.splitlines()
     return Trial(0.0, [], f"exit code {process.returncode}: {lines[-1] if lines else ''}"[:200])
-
-
-def agrees(backend: str, identity: str) -> bool:
-    """Return whether a fit on a GPU agrees with one on llvm; the trial runs once per machine.
-
-    The verdict is stored in `verdict_file`. If llvm does not work, there is nothing to compare the
-    GPU with, and it counts as correct.
-
-    Parameters
-    ----------
-    backend : {"cuda", "metal"}
-    identity : str
-        The device and the versions that the verdict is valid for. A new identity is tried again.
-    """
-    path = verdict_file()
-    verdicts: dict[str, bool] = {}
-    with suppress(OSError, ValueError):
-        content = json.loads(path.read_text(encoding="utf-8"))
-        verdicts = {str(key): bool(value) for key, value in content.items()}
-    if identity not in verdicts:
-        comparison = compare("fit", backend)
-        if comparison.llvm.problem:
-            return True
-        verdicts[identity] = comparison.agrees
-        with suppress(OSError):  # a home that is read-only: the next process tries again
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(verdicts), encoding="utf-8")  # a damaged file is ignored
-    return verdicts[identity]
-
-
-def verdict_file() -> Path:
-    """Return the file of the verdicts, in the folder of Dr.Jit's kernel cache."""
-    folder = os.environ.get("DRJIT_CACHE_DIR")
-    return (Path(folder) if folder else Path.home() / ".drjit") / "eigengs-dr-gpu.json"

@@ -12,7 +12,6 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-from . import gpu
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path, too_old
 from .messages import warn
 from .types import Record
@@ -33,8 +32,7 @@ def select(backend: str | None = None) -> ModuleType:
     Parameters
     ----------
     backend : {"llvm", "cuda", "metal"}, optional
-        By default "cuda" if the machine has a CUDA GPU on which a small fit agrees with llvm, see
-        `eigengs_dr.backend.gpu.agrees`; else "llvm".
+        By default "cuda" if the machine has a CUDA GPU and a driver, else "llvm".
 
     Returns
     -------
@@ -52,8 +50,7 @@ def select(backend: str | None = None) -> ModuleType:
     Warns
     -----
     UserWarning
-        At the first use of metal in a process: `UNTESTED_ON_METAL`. If there is a GPU whose
-        results differ from llvm.
+        At the first use of metal in a process: `UNTESTED_ON_METAL`.
 
     Examples
     --------
@@ -69,7 +66,7 @@ def select(backend: str | None = None) -> ModuleType:
             raise BackendError("no Metal GPU was found; use backend 'llvm'")
         _announce_metal()
         return dr.metal.ad
-    if backend != "llvm" and _has(dr, "CUDA") and (backend == "cuda" or _cuda_agrees()):
+    if backend != "llvm" and _has(dr, "CUDA"):
         return dr.cuda.ad
     if backend == "cuda":
         raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
@@ -105,21 +102,6 @@ def _has(dr: ModuleType, name: str) -> bool:
 def _announce_metal() -> None:
     """Warn about the status of the metal backend, once in a process."""
     warn(f"backend metal: {UNTESTED_ON_METAL}; compare with backend 'llvm'")
-
-
-@cache  # reads a file or compares fits, and warns once
-def _cuda_agrees() -> bool:
-    """Return whether a fit on cuda agrees with llvm, so that cuda is the default; warn if not."""
-    from .detail import cuda_device
-
-    versions = {name: version_of(name) for name in ("eigengs-dr", "drjit")}
-    agrees = gpu.agrees("cuda", f"{platform.node()} {cuda_device()} {versions}")
-    if not agrees:
-        warn(
-            "backend cuda: a small fit differs from llvm, which is used instead; "
-            "'eigengs-dr doctor --gpu' shows details"
-        )
-    return agrees
 
 
 def describe(backend: str | None = None) -> Record:
