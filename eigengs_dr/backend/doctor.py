@@ -12,7 +12,7 @@ import sys
 from importlib.metadata import requires
 
 from . import libllvm
-from .selection import BACKENDS, UNTESTED_ON_METAL, version_of
+from .selection import BACKENDS, version_of
 from .types import Record
 
 TRIAL = """
@@ -84,14 +84,10 @@ def describe(diagnosis: Record) -> str:
     lines = [f"python   {diagnosis['python']} on {diagnosis['platform']}"]
     for name in BACKENDS:
         trial = diagnosis[name]
-        if name == "metal" and diagnosis["platform"].startswith("Linux"):
-            continue
         if not trial["works"]:
             lines.append(f"{name:8} does not work: {trial['problem']}")
             continue
         versions, detail = trial["versions"], ""
-        if name == "metal":
-            detail = f"; {UNTESTED_ON_METAL}"
         if name == "llvm":
             library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
             detail = f", {library}, {trial['threads']} threads on {trial['cpu']}"

@@ -13,13 +13,10 @@ from pathlib import Path
 from types import ModuleType
 
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path, too_old
-from .messages import warn
 from .types import Record
 
-BACKENDS = ("llvm", "cuda", "metal")
-
-UNTESTED_ON_METAL = "never run; only its names are tested"
-"""Status of Dr.Jit's metal backend, which runs on Macs."""
+BACKENDS = {"llvm": "LLVM", "cuda": "CUDA", "metal": "Metal"}
+"""The backends, and their names in `drjit.JitBackend`; nobody has run "metal", for Macs."""
 
 
 class BackendError(RuntimeError):
@@ -47,11 +44,6 @@ def select(backend: str | None = None) -> ModuleType:
     ValueError
         If `backend` has another value.
 
-    Warns
-    -----
-    UserWarning
-        At the first use of metal in a process: `UNTESTED_ON_METAL`.
-
     Examples
     --------
     >>> from eigengs_dr.backend.selection import select
@@ -61,16 +53,14 @@ def select(backend: str | None = None) -> ModuleType:
     if backend not in (None, *BACKENDS):
         raise ValueError(f"backend {backend!r} is unknown; use {', '.join(map(repr, BACKENDS))}")
     dr = _import_drjit()
-    if backend == "metal":
-        if not _has(dr, "Metal"):
-            raise BackendError("no Metal GPU was found; use backend 'llvm'")
-        _announce_metal()
-        return dr.metal.ad
-    if backend != "llvm" and _has(dr, "CUDA"):
-        return dr.cuda.ad
-    if backend == "cuda":
-        raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
-    if (fault := too_old()) or not _has(dr, "LLVM"):
+    backend = backend or ("cuda" if _has(dr, "cuda") else "llvm")
+    if backend != "llvm":
+        if not _has(dr, backend):
+            name = BACKENDS[backend]
+            raise BackendError(f"no {name} GPU or driver was found; use backend 'llvm'")
+        module: ModuleType = getattr(dr, backend).ad
+        return module
+    if (fault := too_old()) or not _has(dr, "llvm"):
         raise BackendError(f"{fault or load_failure()}; {advice()}")
     from .detail import llvm_version
 
@@ -92,16 +82,9 @@ def backend_of(variant: str) -> str | None:
 
 
 @cache
-def _has(dr: ModuleType, name: str) -> bool:
+def _has(dr: ModuleType, backend: str) -> bool:
     """Return whether Dr.Jit has a backend; cached, because the query waits for Dr.Jit's lock."""
-    kind = getattr(dr.JitBackend, name, None)  # Dr.Jit has Metal since 1.4
-    return kind is not None and bool(dr.has_backend(kind))
-
-
-@cache  # the second call is silent
-def _announce_metal() -> None:
-    """Warn about the status of the metal backend, once in a process."""
-    warn(f"backend metal: {UNTESTED_ON_METAL}; compare with backend 'llvm'")
+    return bool(dr.has_backend(getattr(dr.JitBackend, BACKENDS[backend])))
 
 
 def describe(backend: str | None = None) -> Record:
@@ -129,7 +112,7 @@ def describe(backend: str | None = None) -> Record:
 
     from .detail import llvm_version
 
-    llvm = _has(dr, "LLVM")
+    llvm = _has(dr, "llvm")
     return {
         "backend": name_of(module),
         "threads": dr.thread_count(),

@@ -27,7 +27,7 @@ from .console import MISSED, print_message, table
 @options.as_json
 @click.option("--gpu", is_flag=True, help="Compare the GPU with llvm; takes a few minutes.")
 @click.option("--trial", type=click.Choice(list(ALLOWED)), hidden=True)
-@options.choice("--backend", BACKENDS, "Backend of the GPU to compare with llvm.", True)
+@options.choice("--backend", BACKENDS, "Backend of the GPU.  [default: cuda]", True)
 @click.pass_context
 def doctor(
     context: click.Context, as_json: bool, gpu: bool, trial: str | None, backend: str | None
@@ -49,7 +49,7 @@ def doctor(
         return
     facts = machine.report()
     works = any(facts[name]["works"] for name in BACKENDS)
-    device = backend or ("metal" if facts["metal"]["works"] else "cuda")
+    device = backend or "cuda"
     comparisons: list[Comparison] = []
     if gpu and not facts[device]["works"]:
         raise click.ClickException(f"--gpu: {device} does not work: {facts[device]['problem']}")

@@ -3,13 +3,12 @@
 import json
 import subprocess
 import sys
-import warnings
 from types import ModuleType, SimpleNamespace
 
 import pytest
 
 from _helpers.process import SELECT, run_python
-from eigengs_dr.backend import detail, doctor, gpu, selection
+from eigengs_dr.backend import detail, gpu
 from eigengs_dr.backend import libllvm as module
 from eigengs_dr.backend.libllvm import PATH_VARIABLE
 from eigengs_dr.backend.selection import (
@@ -33,7 +32,6 @@ def fake_drjit(monkeypatch, *, llvm=True, version=(19, 1, 7), cuda=False, metal=
     monkeypatch.setattr(detail, "llvm_version", lambda: version)
     monkeypatch.setitem(sys.modules, "drjit", drjit)
     monkeypatch.delenv(PATH_VARIABLE, raising=False)
-    selection._announce_metal.cache_clear()
     return drjit
 
 
@@ -85,34 +83,13 @@ def test_figures_are_compared_by_their_largest_difference(monkeypatch):
 def test_metal_by_its_names(monkeypatch):
     """By stand-in: Dr.Jit's wheels for Linux have no Metal."""
     drjit = fake_drjit(monkeypatch, metal=True)
-    with pytest.warns(UserWarning, match="backend metal: never run") as told:
-        assert select("metal") is drjit.metal.ad
-    assert "\n" not in str(told[0].message)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # it warns once
-        select("metal")
+    assert select("metal") is drjit.metal.ad
     assert select() is drjit.llvm.ad
     assert name_of(drjit.metal.ad) == backend_of("metal_ad_rgb") == "metal"
     assert backend_of("scalar_rgb") is None
     fake_drjit(monkeypatch)
     with pytest.raises(BackendError, match="no Metal GPU"):
         select("metal")
-
-
-def test_doctor_says_which_backend_was_not_tested():
-    trial = {"works": True, "versions": {"drjit": "1.5.0"}}
-    refused = {"works": False, "problem": "no"}
-    found = {
-        "python": "3.11",
-        "platform": "macOS",
-        "llvm": refused,
-        "cuda": trial,
-        "libllvm": [],
-        "metal": trial,
-    }
-    text = doctor.describe({**found, "mitsuba": {"version": None, "variants": None}})
-    assert "cuda     works: Dr.Jit 1.5.0\n" in text
-    assert "metal    works: Dr.Jit 1.5.0; never run" in text
 
 
 def test_drjit_that_cannot_be_imported(tmp_path):
