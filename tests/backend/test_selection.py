@@ -8,7 +8,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from _helpers.process import SELECT, run_python
-from eigengs_dr.backend import detail, gpu
+from eigengs_dr.backend import detail, doctor
 from eigengs_dr.backend import libllvm as module
 from eigengs_dr.backend.libllvm import PATH_VARIABLE
 from eigengs_dr.backend.selection import (
@@ -65,7 +65,7 @@ def test_cuda_is_the_default_where_there_is_a_gpu(monkeypatch):
 
 
 def test_a_gpu_that_ends_the_process_does_not_agree():
-    found = gpu.compare("fit", "cuda")
+    found = doctor.compare("fit", "cuda")
     if found.gpu.problem == "":
         pytest.skip("a GPU is here")
     assert not found.agrees and "no CUDA GPU or driver" in found.gpu.problem
@@ -73,11 +73,11 @@ def test_a_gpu_that_ends_the_process_does_not_agree():
 
 def test_figures_are_compared_by_their_largest_difference(monkeypatch):
     figures = {"llvm": [2.0, -4.0], "cuda": [2.0, -4.002]}
-    monkeypatch.setattr(gpu, "run_trial", lambda name, b: gpu.Trial(1.0, figures[b]))
-    row = gpu.compare("gradients", "cuda")
+    monkeypatch.setattr(doctor, "run_trial", lambda name, b: doctor.Trial(1.0, figures[b]))
+    row = doctor.compare("scene", "cuda")
     assert row.agrees and row.difference == pytest.approx(5e-4)
     figures["cuda"] = [2.0]
-    assert not gpu.compare("gradients", "cuda").agrees
+    assert not doctor.compare("scene", "cuda").agrees
 
 
 def test_metal_by_its_names(monkeypatch):
