@@ -6,10 +6,10 @@ package neither loads Dr.Jit nor sets a Mitsuba variant.
 
 from __future__ import annotations
 
-from .backend import ending
+from .backend import interrupts
 
-if ending.is_program():  # before the imports, which take half a second
-    ending.end_at_signals()
+if interrupts.is_program():  # before the imports, which take half a second
+    interrupts.end_at_signals()
 
 from pathlib import Path
 from typing import TYPE_CHECKING

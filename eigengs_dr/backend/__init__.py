@@ -8,9 +8,8 @@
 - ``types``: names of types for annotations
 - ``messages``: warnings, and text for a terminal
 - ``progress``: progress bars
-- ``interrupts``: Ctrl-C and SIGTERM between steps
+- ``interrupts``: Ctrl-C and SIGTERM, between steps and at the end of the program
 - ``notebook``: pictures in a notebook
-- ``ending``: how Ctrl-C or SIGTERM ends the program
 - ``executor``: where tasks run, in this process or on a cluster
 - ``doctor``: what works here and what to install
 """

@@ -15,11 +15,6 @@ def llvm_version() -> tuple[int, ...]:
     return tuple(dr.detail.llvm_version())
 
 
-def cuda_device() -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the CUDA version of the driver, and the compute capability of the first GPU."""
-    return dr.detail.cuda_version(), dr.detail.cuda_compute_capability()
-
-
 def scope(backend: dr.JitBackend) -> int:
     """Return the number of the current scope of a `drjit.JitBackend` in this thread.
 

@@ -5,17 +5,19 @@ Each backend is tried in its own process, so that a crash ends only this process
 
 import importlib.util
 import json
+import math
 import os
 import platform
 import subprocess
 import sys
 from importlib.metadata import requires
+from typing import NamedTuple
 
 from . import libllvm
-from .selection import BACKENDS, UNTESTED_ON_METAL, version_of
+from .selection import BACKENDS, version_of
 from .types import Record
 
-TRIAL = """
+PROGRAM = """
 import json, sys
 from eigengs_dr.backend.selection import describe, select
 try:
@@ -84,14 +86,10 @@ def describe(diagnosis: Record) -> str:
     lines = [f"python   {diagnosis['python']} on {diagnosis['platform']}"]
     for name in BACKENDS:
         trial = diagnosis[name]
-        if name == "metal" and diagnosis["platform"].startswith("Linux"):
-            continue
         if not trial["works"]:
             lines.append(f"{name:8} does not work: {trial['problem']}")
             continue
         versions, detail = trial["versions"], ""
-        if name == "metal":
-            detail = f"; {UNTESTED_ON_METAL}"
         if name == "llvm":
             library = f"LLVM {versions['libllvm']} at {versions['libllvm_path']}"
             detail = f", {library}, {trial['threads']} threads on {trial['cpu']}"
@@ -117,8 +115,8 @@ def _mitsuba_line(version: str | None, variants: list[str] | None) -> str:
 
 
 def _try(name: str) -> Record:
-    """Run `TRIAL` with a backend, in another process."""
-    process = _python(TRIAL, name)
+    """Run `PROGRAM` with a backend, in another process."""
+    process = _python(PROGRAM, name)
     if process.returncode == 0:
         return dict(json.loads(process.stdout.splitlines()[-1]))
     code = process.returncode
@@ -139,3 +137,93 @@ def _python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run Python code in a fresh interpreter."""
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+# ---------------------------------------------------------------------------------------------
+#  A GPU against llvm: ``eigengs-dr doctor --trial NAME`` computes something, and prints its figures
+# ---------------------------------------------------------------------------------------------
+
+
+ALLOWED = {"fit": 0.05, "scene": 5e-3}
+"""Largest allowed difference of the figures of each comparison: in dB for "fit", relative to the
+largest figure for "scene". A GPU sums in another order, and some of its instructions have 20 bits.
+"""
+
+TRIAL_SECONDS = 600.0
+"""Time limit of a trial, which spends most of it compiling its programs."""
+
+
+class Trial(NamedTuple):
+    """A trial on one backend.
+
+    Attributes
+    ----------
+    seconds : float
+        Time of the second run in the process, after its programs are compiled.
+    figures : list of float
+    problem : str
+        One line if the trial has failed, otherwise empty.
+    """
+
+    seconds: float
+    figures: list[float]
+    problem: str = ""
+
+
+class Comparison(NamedTuple):
+    """A trial on llvm and on a GPU.
+
+    Attributes
+    ----------
+    name : str
+        A key of `ALLOWED`.
+    llvm, gpu : Trial
+    difference : float
+        See `ALLOWED`; infinite if one of the two has failed.
+    """
+
+    name: str
+    llvm: Trial
+    gpu: Trial
+    difference: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the difference is allowed."""
+        return self.difference <= ALLOWED[self.name]
+
+
+def compare(name: str, backend: str) -> Comparison:
+    """Run a trial on llvm and on a GPU; this takes between a few seconds and a minute.
+
+    Parameters
+    ----------
+    name : str
+        A key of `ALLOWED`.
+    backend : {"cuda", "metal"}
+    """
+    llvm, gpu = run_trial(name, "llvm"), run_trial(name, backend)
+    difference = float("inf")
+    if not (llvm.problem or gpu.problem) and len(llvm.figures) == len(gpu.figures):
+        unit = 1.0 if name == "fit" else max(map(abs, llvm.figures))
+        pairs = zip(llvm.figures, gpu.figures, strict=True)
+        differences = [abs(one - other) / unit for one, other in pairs]
+        if all(map(math.isfinite, differences)):
+            difference = max(differences)
+    return Comparison(name, llvm, gpu, difference)
+
+
+def run_trial(name: str, backend: str) -> Trial:
+    """Run one trial on one backend, in another process."""
+    command = [sys.executable, "-m", "eigengs_dr", "doctor", "--trial", name, "--backend", backend]
+    try:
+        process = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=TRIAL_SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        return Trial(0.0, [], f"not finished after {TRIAL_SECONDS:.0f} s")
+    if process.returncode == 0:
+        answer: Record = json.loads(process.stdout.splitlines()[-1])
+        return Trial(answer["seconds"], answer["figures"])
+    lines = process.stderr.splitlines()
+    return Trial(0.0, [], f"exit code {process.returncode}: {lines[-1] if lines else ''}"[:200])

@@ -1,20 +1,92 @@
-"""Ctrl-C and SIGTERM during a call: the call stops between two steps, or cleans up."""
+"""Ctrl-C and SIGTERM: how they end the program ``eigengs-dr``, and how a block stops or cleans up.
+
+A `KeyboardInterrupt` may be raised at any line: during an import it becomes an error that blames
+the installation, and inside Dr.Jit an abort. From its first line on, the program therefore raises
+none: it deletes its temporary files and exits, except in the blocks of `defer_interrupts` and
+`terminate_as_interrupt`. Programs that import the package keep their signal handlers.
+"""
 
 from __future__ import annotations
 
+import atexit
+import os
 import signal
+import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from .ending import end_program
+NAME = "eigengs-dr"
+"""Name of the program; every line on standard error starts with it."""
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells define it, and after SIGTERM."""
+
+_undo: dict[object, Callable[[], object]] = {}
+"""Functions that the program calls before it exits, the last one first."""
+
+_stderr = -1
+"""A copy of standard error, which is redirected while Dr.Jit is imported."""
 
 Handler = Callable[[int, FrameType | None], object] | int | None
 """What `signal.getsignal` returns."""
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that ask a program to end: Ctrl-C sends SIGINT, schedulers and ``kill`` send SIGTERM."""
+
+
+def is_program() -> bool:
+    """Return whether this process is the program itself, not one that imports the package."""
+    words = sys.orig_argv[1:3]
+    script = os.path.splitext(os.path.basename(words[0]))[0] if words else ""
+    return script == NAME or words == ["-m", "eigengs_dr"]
+
+
+def end_at_signals() -> None:
+    """Make Ctrl-C and SIGTERM end this process with one line; an ignored signal stays ignored."""
+    global _stderr
+    try:
+        _stderr = os.dup(2)
+    except OSError:
+        _stderr = -1  # it is closed
+    atexit.register(_ignore_signals)
+    defaults = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    for number, handler in defaults.items():
+        if signal.getsignal(number) == handler:
+            signal.signal(number, end_program)
+
+
+def end_program(number: int, frame: object) -> None:
+    """Handle a signal: delete unfinished files, then end the process."""
+    _ignore_signals()
+    for undo in reversed([*_undo.values()]):
+        try:
+            undo()
+        except Exception:
+            continue  # the next run deletes it
+    try:
+        clear = b"\r\033[K" if os.isatty(_stderr) else b""  # the line may hold a progress bar
+        os.write(_stderr, clear + f"{NAME}: interrupted\n".encode())
+    finally:
+        os._exit(INTERRUPTED)
+
+
+def _ignore_signals() -> None:
+    """Ignore signals: the exit is under way, and Python is about to drop its handlers."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def undone_at_end(undo: Callable[[], object]) -> Iterator[None]:
+    """Call a function if a signal ends the program during a block."""
+    key = object()
+    _undo[key] = undo
+    try:
+        yield
+    finally:
+        del _undo[key]
 
 
 @contextmanager
@@ -37,7 +109,7 @@ def defer_interrupts() -> Iterator[Callable[[], bool]]:
     False
     """
     received: list[bool] = []
-    with _first_signal(SIGNALS, _is_heard, lambda: received.append(True)):
+    with _first_signal(_is_heard, lambda: received.append(True)):
         yield lambda: bool(received)
 
 
@@ -62,23 +134,17 @@ def terminate_as_interrupt() -> Iterator[None]:
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    with _first_signal(
-        SIGNALS, lambda handler: handler in (signal.SIG_DFL, end_program), interrupt
-    ):
+    with _first_signal(lambda handler: handler in (signal.SIG_DFL, end_program), interrupt):
         yield
 
 
 @contextmanager
-def _first_signal(
-    numbers: Iterable[signal.Signals],
-    replaced: Callable[[Handler], bool],
-    react: Callable[[], None],
-) -> Iterator[None]:
+def _first_signal(replaced: Callable[[Handler], bool], react: Callable[[], None]) -> Iterator[None]:
     """Call a function at the first signal in a block; a second one has its usual effect.
 
     This has an effect in the main thread only, for signals whose handler may be replaced.
     """
-    handlers = {number: signal.getsignal(number) for number in numbers}
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
     handlers = {number: old for number, old in handlers.items() if replaced(old)}
     if threading.current_thread() is not threading.main_thread():
         handlers = {}

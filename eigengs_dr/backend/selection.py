@@ -12,15 +12,11 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-from . import gpu
 from .libllvm import MIN_VERSION, advice, load_failure, loaded_path, too_old
-from .messages import warn
 from .types import Record
 
-BACKENDS = ("llvm", "cuda", "metal")
-
-UNTESTED_ON_METAL = "never run; only its names are tested"
-"""Status of Dr.Jit's metal backend, which runs on Macs."""
+BACKENDS = {"llvm": "LLVM", "cuda": "CUDA", "metal": "Metal"}
+"""The backends, and their names in `drjit.JitBackend`; nobody has run "metal", for Macs."""
 
 
 class BackendError(RuntimeError):
@@ -33,8 +29,7 @@ def select(backend: str | None = None) -> ModuleType:
     Parameters
     ----------
     backend : {"llvm", "cuda", "metal"}, optional
-        By default "cuda" if the machine has a CUDA GPU on which a small fit agrees with llvm, see
-        `eigengs_dr.backend.gpu.agrees`; else "llvm".
+        By default "cuda" if the machine has a CUDA GPU and a driver, else "llvm".
 
     Returns
     -------
@@ -49,12 +44,6 @@ def select(backend: str | None = None) -> ModuleType:
     ValueError
         If `backend` has another value.
 
-    Warns
-    -----
-    UserWarning
-        At the first use of metal in a process: `UNTESTED_ON_METAL`. If there is a GPU whose
-        results differ from llvm.
-
     Examples
     --------
     >>> from eigengs_dr.backend.selection import select
@@ -64,16 +53,14 @@ def select(backend: str | None = None) -> ModuleType:
     if backend not in (None, *BACKENDS):
         raise ValueError(f"backend {backend!r} is unknown; use {', '.join(map(repr, BACKENDS))}")
     dr = _import_drjit()
-    if backend == "metal":
-        if not _has(dr, "Metal"):
-            raise BackendError("no Metal GPU was found; use backend 'llvm'")
-        _announce_metal()
-        return dr.metal.ad
-    if backend != "llvm" and _has(dr, "CUDA") and (backend == "cuda" or _cuda_agrees()):
-        return dr.cuda.ad
-    if backend == "cuda":
-        raise BackendError("no CUDA GPU or driver was found; use backend 'llvm'")
-    if (fault := too_old()) or not _has(dr, "LLVM"):
+    backend = backend or ("cuda" if _has(dr, "cuda") else "llvm")
+    if backend != "llvm":
+        if not _has(dr, backend):
+            name = BACKENDS[backend]
+            raise BackendError(f"no {name} GPU or driver was found; use backend 'llvm'")
+        module: ModuleType = getattr(dr, backend).ad
+        return module
+    if (fault := too_old()) or not _has(dr, "llvm"):
         raise BackendError(f"{fault or load_failure()}; {advice()}")
     from .detail import llvm_version
 
@@ -95,31 +82,9 @@ def backend_of(variant: str) -> str | None:
 
 
 @cache
-def _has(dr: ModuleType, name: str) -> bool:
+def _has(dr: ModuleType, backend: str) -> bool:
     """Return whether Dr.Jit has a backend; cached, because the query waits for Dr.Jit's lock."""
-    kind = getattr(dr.JitBackend, name, None)  # Dr.Jit has Metal since 1.4
-    return kind is not None and bool(dr.has_backend(kind))
-
-
-@cache  # the second call is silent
-def _announce_metal() -> None:
-    """Warn about the status of the metal backend, once in a process."""
-    warn(f"backend metal: {UNTESTED_ON_METAL}; compare with backend 'llvm'")
-
-
-@cache  # reads a file or compares fits, and warns once
-def _cuda_agrees() -> bool:
-    """Return whether a fit on cuda agrees with llvm, so that cuda is the default; warn if not."""
-    from .detail import cuda_device
-
-    versions = {name: version_of(name) for name in ("eigengs-dr", "drjit")}
-    agrees = gpu.agrees("cuda", f"{platform.node()} {cuda_device()} {versions}")
-    if not agrees:
-        warn(
-            "backend cuda: a small fit differs from llvm, which is used instead; "
-            "'eigengs-dr doctor --gpu' shows details"
-        )
-    return agrees
+    return bool(dr.has_backend(getattr(dr.JitBackend, BACKENDS[backend])))
 
 
 def describe(backend: str | None = None) -> Record:
@@ -147,7 +112,7 @@ def describe(backend: str | None = None) -> Record:
 
     from .detail import llvm_version
 
-    llvm = _has(dr, "LLVM")
+    llvm = _has(dr, "llvm")
     return {
         "backend": name_of(module),
         "threads": dr.thread_count(),

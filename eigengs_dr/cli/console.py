@@ -13,9 +13,8 @@ from typing import Any, TypeVar
 
 import click
 
-from ..backend.ending import INTERRUPTED, NAME
 from ..backend.executor import ClusterError
-from ..backend.interrupts import terminate_as_interrupt
+from ..backend.interrupts import INTERRUPTED, NAME, terminate_as_interrupt
 from ..backend.messages import printable
 from ..backend.progress import progress_bar
 from ..backend.selection import BackendError

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import click
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..backend import doctor as machine
-from ..backend.gpu import ALLOWED, Comparison, compare
+from ..backend.doctor import ALLOWED, Comparison, compare
 from ..backend.selection import BACKENDS
 from ..backend.types import Floats, Record
 from . import options
@@ -27,16 +26,16 @@ from .console import MISSED, print_message, table
 @options.as_json
 @click.option("--gpu", is_flag=True, help="Compare the GPU with llvm; takes a few minutes.")
 @click.option("--trial", type=click.Choice(list(ALLOWED)), hidden=True)
-@options.choice("--backend", BACKENDS, "Backend of the GPU to compare with llvm.", True)
+@options.choice("--backend", BACKENDS, "Backend of the GPU.  [default: cuda]", True)
 @click.pass_context
 def doctor(
     context: click.Context, as_json: bool, gpu: bool, trial: str | None, backend: str | None
 ) -> None:
     """Show which backends work on this machine and what to install.
 
-    With --gpu, a small fit, gradients, textures and a scene run on the GPU and on llvm. The table
-    that follows shows their times and differences, ready to be pasted into a report. The exit code
-    is 1 if no backend works, or if the results of the GPU differ.
+    With --gpu, a small fit and a scene run on the GPU and on llvm. The table that follows shows
+    their times and differences, ready to be pasted into a report. The exit code is 1 if no backend
+    works, or if the results of the GPU differ.
 
     \b
     Examples:
@@ -49,7 +48,7 @@ def doctor(
         return
     facts = machine.report()
     works = any(facts[name]["works"] for name in BACKENDS)
-    device = backend or ("metal" if facts["metal"]["works"] else "cuda")
+    device = backend or "cuda"
     comparisons: list[Comparison] = []
     if gpu and not facts[device]["works"]:
         raise click.ClickException(f"--gpu: {device} does not work: {facts[device]['problem']}")
@@ -88,15 +87,10 @@ def _describe(comparisons: list[Comparison], device: str) -> list[str]:
 
 def _run_trial(name: str, backend: str) -> Record:
     """Run a trial twice, the second time with compiled programs; return time and figures."""
-    trials: dict[str, Callable[[str], ArrayLike]] = {
-        "fit": _fit,
-        "gradients": _gradients,
-        "texture": _texture,
-        "scene": _scene,
-    }
-    trials[name](backend)
+    trial: Callable[[str], ArrayLike] = {"fit": _fit, "scene": _scene}[name]
+    trial(backend)
     started = time.perf_counter()
-    figures = np.asarray(trials[name](backend), float)
+    figures = np.asarray(trial(backend), float)
     return {"seconds": time.perf_counter() - started, "figures": figures.ravel().tolist()}
 
 
@@ -115,6 +109,28 @@ def _fit(backend: str) -> list[float]:
     return [row["psnr_rgb"] for row in result.trace] + [result.psnr_ycbcr]
 
 
+def _scene(backend: str) -> Floats:
+    """Return the pixels of a textured rectangle under constant light."""
+    from ..plugins import register_plugins, texture_of  # first: its error names what to install
+
+    # isort: split
+    import mitsuba as mi
+
+    mi.set_variant(f"{backend}_ad_rgb")
+    register_plugins()
+    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    wall = {"type": "diffuse", "reflectance": texture_of(_set(backend))}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "direct"},
+        "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "sky": {"type": "constant"},
+        "wall": {"type": "rectangle", "bsdf": wall},
+    }
+    return np.ravel(mi.render(mi.load_dict(scene), spp=256, seed=0).numpy())
+
+
 def _set(backend: str) -> eg.Gaussians:
     """Return a random set, not a fitted one, so that it is the same on every backend."""
     import eigengs_dr as eg
@@ -131,64 +147,3 @@ def _set(backend: str) -> eg.Gaussians:
         space="linear",
         backend=backend,
     )
-
-
-def _gradients(backend: str) -> Floats:
-    """Return the gradient of a weighted sum of the pixels with respect to all parameters."""
-    import drjit as dr
-
-    import eigengs_dr as eg
-
-    gaussians = _set(backend)
-    parameters = gaussians.mean, gaussians.factor, gaussians.color
-    dr.enable_grad(*parameters)
-    picture = eg.render(gaussians).array
-    weights = dr.sin(dr.arange(type(picture), dr.width(picture)) * 0.37)
-    dr.backward(dr.sum(picture * weights))
-    return np.concatenate([np.ravel(dr.grad(p).numpy()) for p in parameters])
-
-
-def _mitsuba(backend: str) -> ModuleType:
-    """Import Mitsuba with the plugins, and set the variant of a backend."""
-    from ..plugins import register_plugins  # first, because its error names what to install
-
-    # isort: split
-    import mitsuba as mi
-
-    mi.set_variant(f"{backend}_ad_rgb")
-    register_plugins()
-    return mi
-
-
-def _texture(backend: str) -> Floats:
-    """Return lookups of a texture, without and with a prefilter."""
-    mi = _mitsuba(backend)
-    import drjit as dr
-
-    from ..plugins import texture_of
-
-    random = np.random.default_rng(1)
-    si = dr.zeros(mi.SurfaceInteraction3f, 200)
-    si.uv = mi.Point2f(*(mi.Float(row.astype(np.float32)) for row in random.uniform(size=(2, 200))))
-    si.t, si.wi = 2.0, mi.Vector3f(0.6, 0.0, 0.8)  # as seen by a camera at an angle
-    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    textures = [mi.load_dict(texture_of(_set(backend), prefilter=p)) for p in (0.0, 0.05)]
-    return np.concatenate([np.ravel(texture.eval(si).numpy()) for texture in textures])
-
-
-def _scene(backend: str) -> Floats:
-    """Return the pixels of a textured rectangle under constant light."""
-    mi = _mitsuba(backend)
-    from ..plugins import texture_of
-
-    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
-    wall = {"type": "diffuse", "reflectance": texture_of(_set(backend))}
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "direct"},
-        "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
-        "sky": {"type": "constant"},
-        "wall": {"type": "rectangle", "bsdf": wall},
-    }
-    return np.ravel(mi.render(mi.load_dict(scene), spp=256, seed=0).numpy())

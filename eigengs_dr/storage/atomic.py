@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from ..backend.ending import undone_at_end
+from ..backend.interrupts import undone_at_end
 from .locks import PREFIX, hold
 
 

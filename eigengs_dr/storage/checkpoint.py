@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..backend.ending import undone_at_end
+from ..backend.interrupts import undone_at_end
 from ..backend.types import Arrays
 from . import npz
 from .atomic import atomic_folder, refuse_link, remove_folder, remove_stale

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
-from ..backend.ending import undone_at_end
+from ..backend.interrupts import undone_at_end
 
 PREFIX = ".eigengs_dr-"
 """Prefix of the names of temporary files and of lock files beside outputs."""

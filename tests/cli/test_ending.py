@@ -34,7 +34,7 @@ def test_in_a_write(tmp_path, sent):
     code = f"""
 import os, signal
 from pathlib import Path
-from eigengs_dr.backend.ending import end_at_signals
+from eigengs_dr.backend.interrupts import end_at_signals
 from eigengs_dr.storage.atomic import atomic_folder, atomic_write
 from eigengs_dr.storage.checkpoint import open_checkpoint
 folder = Path({str(tmp_path)!r})
