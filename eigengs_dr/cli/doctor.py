@@ -87,10 +87,10 @@ def _describe(comparisons: list[Comparison], device: str) -> list[str]:
 
 def _run_trial(name: str, backend: str) -> Record:
     """Run a trial twice, the second time with compiled programs; return time and figures."""
-    trial: Callable[[str], ArrayLike] = {"fit": _fit, "scene": _scene}[name]
-    trial(backend)
+    trials: dict[str, Callable[[str], ArrayLike]] = {"fit": _fit, "scene": _scene}
+    trials[name](backend)
     started = time.perf_counter()
-    figures = np.asarray(trial(backend), float)
+    figures = np.asarray(trials[name](backend), float)
     return {"seconds": time.perf_counter() - started, "figures": figures.ravel().tolist()}
 
 
