@@ -424,7 +424,7 @@ def tiny(monkeypatch):
 def test_kernels(tiny, backend, tmp_path):
     told = said("bench", "kernels", "--backend", backend, "-o", tmp_path)
     [found] = read(tmp_path / FILE)
-    names = "plain_ms", "fast_ms", "step_ratio", "forward_peak_fraction"
+    names = "step_ms", "forward_ms", "forward_peak_fraction", "step_peak_fraction"
     for name in (*names, "fit_over_steps", "round_in_steps"):
         assert found[name] > 0 and name in told
 
