@@ -17,7 +17,6 @@ from .fitting.loss import Loss
 from .fitting.maps import Map
 from .fitting.method import DEFAULT, Method
 from .fitting.options import Goal, level_counts
-from .fitting.place import lattices
 from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, sample, save_image
 from .image.metrics import ms_ssim, psnr, ssim
@@ -56,7 +55,6 @@ __all__ = [
     "fit_large",
     "fit_many",
     "from_tensors",
-    "lattices",
     "level_counts",
     "load_image",
     "ms_ssim",

@@ -264,7 +264,7 @@ def scaling() -> None:
 
 @question("kernels")
 def kernels() -> None:
-    """Time the renderer and its derivatives against plain Dr.Jit and the machine's peak."""
+    """Time the renderer and its derivatives against the machine's peak."""
 
 
 @question("texture")

@@ -31,8 +31,6 @@ NOISES, NOISY_STEPS = (1, 16), 240  # samples of steps in other descents, and th
 CAMERAS, MATERIAL_CAMERAS, JUDGES, SEED = (3, 16), (6, 8), 4, 1 << 20
 GREY = 0.2  # light of the start
 LAST_RATE, MOMENTUM = 0.05, 0.5  # share to which rates fall by a cosine; of Adam, best for all
-SIDES = (16, 40, 100)  # Gaussians along a side: wide ones move much, as in a pyramid
-CUTOFF = 2.5  # standard deviations: lookups sum fewer Gaussians, for the same PSNR
 PHOTOS = {  # what the maps show; the rates were chosen with "coffee"
     "poster": {"color": "chelsea"},
     "ball": {"color": "astronaut"},
@@ -65,7 +63,6 @@ class Unknown(NamedTuple):
     start: dict[str, Any]
     rates: dict[str, float]
     parameters_of: Callable[[Any], dict[str, Any]] = dict
-    bound: Callable[[Any], None] = lambda values: None
 
 
 def texels(mi: Any, kind: str) -> Unknown:
@@ -96,24 +93,6 @@ def pyramid(mi: Any, kind: str) -> Unknown:
         return result
 
     return Unknown(texels(mi, kind).textures, start, dict.fromkeys(start, 0.004), parameters_of)
-
-
-def lookups(mi: Any, kind: str) -> Unknown:
-    """Describe a texture by lattices of Gaussians, which every sample sums."""
-    from eigengs_dr.plugins import keep_in_bounds, texture_of
-
-    [(name, key)] = NAMES[kind].items()
-    lattices = eg.lattices((TEXELS, TEXELS), SIDES, [GREY] * 3, space="linear")
-    rates = {"mean": 0.2, "factor": 0.02, "color": 0.01, "background": 0.005}
-    texture = texture_of(lattices, cutoff=CUTOFF)
-    tensors = mi.traverse(mi.load_dict(texture))
-    start = {f"{key}.{field}": mi.TensorXf(tensors[field]) for field in rates}
-    named = dict(zip(start, rates.values(), strict=True))
-
-    def bound(values: Any) -> None:
-        keep_in_bounds(values, key, lattices)
-
-    return Unknown({name: texture}, start, named, bound=bound)
 
 
 def coefficients(mi: Any, kind: str) -> Unknown:
@@ -159,10 +138,9 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
     }
 
 
-UNKNOWNS = (texels, pyramid, lookups, coefficients)
+UNKNOWNS = (texels, pyramid, coefficients)
 FROZEN = "frozen"  # the pyramid with the rendering of `photo_loss`, which Dr.Jit replays
-SINGLE = ("lookups", "coefficients")  # of one map
-MOST_LOOKUPS = 240  # steps of these, which are slow
+MOST_SLOW = 240  # steps of coefficients, which are slow, and of one map
 COMPARED = ("pyramid", FROZEN, "fit")  # with other numbers of samples
 
 
@@ -187,7 +165,8 @@ def _jobs(task: Task) -> Iterator[Job]:
             settings += [(NOISY_STEPS, spp) for spp in NOISES]
             for steps, spp in settings:
                 for method in methods:
-                    if method in SINGLE and (len(maps) > 1 or steps > MOST_LOOKUPS):
+                    slow = method == coefficients.__name__
+                    if slow and (len(maps) > 1 or steps > MOST_SLOW):
                         continue
                     if method not in COMPARED and spp != SPP:
                         continue
@@ -230,7 +209,6 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
         values.set_learning_rate({key: rate * r for key, r in unknown.rates.items()})
         dr.backward(error(unknown.parameters_of(values), step))
         values.step()
-        unknown.bound(values)
         if not step:
             dr.sync_thread()
             started = time.perf_counter()
@@ -356,9 +334,9 @@ def _photos(mi: Any, scene: Any, first: int) -> list[Image]:
 #  Tables and a chart
 # ---------------------------------------------------------------------------------------------
 
-METHODS = {"texels": fr.GREY, "pyramid": fr.RED, "lookups": fr.ORANGE, "fit": fr.BLUE}
+METHODS = {"texels": fr.GREY, "pyramid": fr.RED, "fit": fr.BLUE}
 METHODS |= {"coefficients": fr.GREEN, FROZEN: fr.PINK}
-MARKERS = dict(zip(METHODS, "vs^oDP", strict=True))
+MARKERS = dict(zip(METHODS, "vsoDP", strict=True))
 
 
 def summarize(rows: Sequence[Row]) -> Section:

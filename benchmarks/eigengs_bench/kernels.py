@@ -1,4 +1,4 @@
-"""How fast the renderer is: against plain Dr.Jit, and against the machine."""
+"""How fast the renderer is, against the machine."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -21,16 +21,12 @@ from eigengs_dr.fitting.loop import descend, last, refine
 from eigengs_dr.fitting.measure import psnrs
 from eigengs_dr.fitting.objective import Pixels, data_of, picture
 from eigengs_dr.image.resize import center_crop
-from eigengs_dr.raster.binning.lists import TileLists, build_lists
-from eigengs_dr.raster.binning.tiles import Grid
-from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters, kernel_radius
-from eigengs_dr.raster.reference import render_plain
+from eigengs_dr.raster.binning.lists import TileLists
+from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters
 from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize
 
 # The scene: Gaussians of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
-# Tiles of the plain renderer, the best of 4x4, 8x8 and 16x16 in forward and reverse together.
-PLAIN_TILE = (8, 8)
 WARM_UP, ROUNDS = 3, 15  # rounds that compile and settle, and rounds that are measured
 FIT_STEPS, FIT_ROUNDS = 500, 5  # steps of the refinement behind `fit_over_steps`, and how often
 LONG = 1000  # steps of the descent of which one round is timed alone
@@ -38,11 +34,11 @@ PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program tha
 
 
 def run(task: Task) -> list[Row]:
-    """Time the kernels in one run, the variants in turn; every figure is a median.
+    """Time the kernels in one run, in turn; every figure is a median.
 
-    `plain_ms` and `fast_ms` are forward and reverse together, with lists given and programs frozen,
-    the ratios plain over fast. `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without
-    memory; the fractions are evaluations inside the cutoff ellipses over that peak.
+    `step_ms` is forward and reverse together, with lists given and programs frozen.
+    `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without memory; the fractions are
+    evaluations inside the cutoff ellipses over that peak.
     `fit_over_steps` is the time of a refinement over that of its steps alone, without relocation,
     second placement and trace, and `round_in_steps` that of a round of relocation over that of such
     a step.
@@ -81,70 +77,58 @@ def random_scene(types: ArrayTypes) -> eg.Gaussians:
 def kernel_figures(
     types: ArrayTypes, scene: eg.Gaussians, progress: Callable[..., None] = lambda *_: None
 ) -> Row:
-    """Time both renderers, the lists and the peak on a scene."""
-    plain_forward, plain_step = programs(scene, plain=True)
-    fast_forward, fast_step = programs(scene, plain=False)
+    """Time the renderer, the lists and the peak on a scene."""
+    forward, step = programs(scene)
     seeds = dr.linspace(types.Float, 0, 1, PEAK_LANES)
     dr.eval(seeds)
     timed: dict[str, Callable[[], Any]] = {
-        "plain_ms": plain_step,
-        "fast_ms": fast_step,
-        "plain_forward_ms": plain_forward,
-        "fast_forward_ms": fast_forward,
+        "step_ms": step,
+        "forward_ms": forward,
         "lists_ms": lambda: bin_gaussians(replace(scene, cutoff=CUTOFF)),
         "peak_ms": lambda: _peak(seeds),
     }
     ms = interleaved(timed, WARM_UP, ROUNDS, progress)
-    for program in (plain_forward, plain_step, fast_forward, fast_step):
+    for program in (forward, step):
         program.func.clear()  # left to the garbage collector, it may go while another is traced
     useful = pixels_inside(scene)
     peak = PEAK_LANES * PEAK_LOOPS * PEAK_UNROLL / (ms.pop("peak_ms") * 1e6)
     return {
         **ms,
-        "step_ratio": ms["plain_ms"] / ms["fast_ms"],
-        "forward_ratio": ms["plain_forward_ms"] / ms["fast_forward_ms"],
         "peak_evals_per_ns": peak,
-        "forward_peak_fraction": useful / (ms["fast_forward_ms"] * 1e6) / peak,
-        "step_peak_fraction": 2 * useful / (ms["fast_ms"] * 1e6) / peak,
+        "forward_peak_fraction": useful / (ms["forward_ms"] * 1e6) / peak,
+        "step_peak_fraction": 2 * useful / (ms["step_ms"] * 1e6) / peak,
     }
 
 
-def programs(scene: eg.Gaussians, plain: bool) -> tuple[Any, Any]:
+def programs(scene: eg.Gaussians) -> tuple[Any, Any]:
     """Make frozen programs that draw a scene: forward, and forward with reverse.
 
-    ``program.func.clear()`` frees a program. `plain` is `render_plain` instead of `rasterize`.
+    ``program.func.clear()`` frees a program.
     """
-    parameters = decode_parameters(scene)
-    background = parameters.background
-    draw: Callable[..., Any]
-    if plain:
-        grid, draw = Grid(scene.width, scene.height, PLAIN_TILE), render_plain
-        lists = build_lists(parameters.shape, kernel_radius(CUTOFF), grid)
-        values = [*scene.mean, *scene.factor, *parameters.color]
-    else:
-        draw, lists = _rasterize, bin_gaussians(replace(scene, cutoff=CUTOFF))
-        values = [*parameters.shape, *parameters.color]
+    parameters, lists = decode_parameters(scene), bin_gaussians(replace(scene, cutoff=CUTOFF))
+    background, values = parameters.background, [*parameters.shape, *parameters.color]
     dr.eval(values)
     size = scene.height * scene.width * scene.channels
     delta = upload(type(values[0]), np.random.default_rng(1).normal(size=size))
 
     @dr.freeze
     def forward(values: list, background: list, lists: TileLists) -> Any:
-        return draw(values, background, lists, CUTOFF)
+        return draw(values, background, lists)
 
     @dr.freeze
     def step(values: list, background: list, lists: TileLists, delta: Any) -> list:
         dr.enable_grad(values)
-        dr.backward(dr.dot(draw(values, background, lists, CUTOFF), delta))
+        dr.backward(dr.dot(draw(values, background, lists), delta))
         return dr.grad(values)
 
     frozen = partial(step, values, background, lists, delta)
     return partial(forward, values, background, lists), frozen
 
 
-def _rasterize(values: list, background: list, lists: TileLists, cutoff: float) -> Any:
+def draw(values: list, background: list, lists: TileLists) -> Any:
+    """Draw a picture."""
     shape, color = values[:NUM_SHAPE_PARAMS], values[NUM_SHAPE_PARAMS:]
-    return rasterize(KernelParameters(shape, color, background), lists, cutoff)
+    return rasterize(KernelParameters(shape, color, background), lists, CUTOFF)
 
 
 def _peak(q: Any) -> Any:

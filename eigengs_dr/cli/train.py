@@ -37,7 +37,7 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
 )
 @options.choice("--preset", ["default", "eigengs"], "Solve for the weights, or train as the paper.")
 @options.number(
-    "--iterations", "Number of training steps.  [default: 0; eigengs: 15000]", minimum=0
+    "--iterations", "Training steps of the preset eigengs.  [default: 15000]", minimum=1
 )
 @options.choice("--space", ["ycbcr", "rgb"], "Colour space of the components.")
 @options.number("--seed", "Seed of the random numbers.", 0, minimum=0)

@@ -108,9 +108,8 @@ class EigenGS:
             "default" places Gaussians on a grid and solves for all weights by one factorisation.
             "eigengs" trains shapes and weights from a random start, with the paper's settings.
         iterations : int, optional
-            Number of training steps. "default" trains the shapes (0 steps by default; 300 gain
-            0.3 dB), "eigengs" shapes and weights (15,000 by default, which take hours without a
-            GPU).
+            Number of training steps of "eigengs": 15,000 by default, which take hours without a
+            GPU.
         backend : {"llvm", "cuda"}, optional
         progress : bool or callable, optional
             By default a bar, in a terminal or a notebook, after two seconds; False shows none. A

@@ -83,6 +83,11 @@ class TrainOptions:
             )
         if self.preset == "eigengs" and self.training_steps < 1:
             raise ValueError("iterations is 0; preset 'eigengs' needs training, so give at least 1")
+        if self.preset == "default" and self.training_steps:
+            raise ValueError(
+                f"iterations is {self.iterations}; preset 'default' trains nothing, so leave them "
+                "out, or use preset 'eigengs'"
+            )
         if not isinstance(self.frequency_aware, bool) and self.frequency_aware != "auto":
             raise ValueError(
                 f"frequency_aware is {self.frequency_aware!r}; use 'auto', True or False"

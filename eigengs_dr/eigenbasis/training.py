@@ -21,9 +21,9 @@ from ..image.io import ImageError, check_image
 from ..image.metrics import psnr
 from ..image.remote import is_url
 from ..image.resize import center_crop
+from ..paper.joint_training import State
 from ..raster.render import render
 from ..storage.checkpoint import Checkpoint, open_checkpoint
-from .components.bands import State
 from .components.solve import fit_model
 from .eigengs import EigenGS
 from .options import TrainOptions
@@ -194,18 +194,16 @@ def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
 def _model(basis: Eigenbasis, run: Run) -> EigenGS:
     """Fit Gaussians to the components, and save checkpoints."""
     checkpoint, curve = run.checkpoint, _curve(basis, run)
-    run.stop_if_interrupted()
     run.progress("weights", 0, 1)
+    run.stop_if_interrupted()
     saved = time.perf_counter()
 
     def advance(step: int, steps: int, row: Record) -> None:
-        if steps:
-            run.progress("shapes", step, steps)
+        run.progress("shapes", step, steps)
 
     def save(states: list[State]) -> None:
         nonlocal saved
-        trains = run.settings.training_steps > 0
-        if trains and (run.interrupted() or time.perf_counter() - saved > SAVE_SECONDS):
+        if run.interrupted() or time.perf_counter() - saved > SAVE_SECONDS:
             saved = time.perf_counter()
             for band, state in enumerate(states):
                 checkpoint.save(f"shapes-{band}", state)

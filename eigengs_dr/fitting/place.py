@@ -1,25 +1,19 @@
 """Placements: where Gaussians start without a given start, before their colours are known.
 
 `Adaptive` follows the second derivatives of the image; `Grid` and `Random` use only its size.
-`lattices` makes sets without an image, for your own losses.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import index
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import NDArray
 
-from ..backend.doors import door
 from ..gaussian.covariance import factor_from_covariance
-from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.pixels import check_size
 from .objective import Pixels
 from .placement.adaptive import place_adaptive
 
@@ -97,85 +91,6 @@ def grid_of(size: tuple[int, int], count: int) -> Shapes:
     mean = np.stack([place * width / number, (row + 0.5) * height / rows], axis=-1)
     sharpness = 1 / (DEVIATION * spacing)
     return mean, np.tile([sharpness, 0, sharpness], (count, 1))
-
-
-@door
-def lattices(
-    size: tuple[int, int],
-    sides: Sequence[int],
-    background: ArrayLike = (0.5, 0.5, 0.5),
-    *,
-    space: str = "ycbcr",
-    cutoff: float = CUTOFF,
-    backend: str | None = None,
-    dtype: DTypeLike = np.float32,
-) -> Gaussians:
-    """Place Gaussians on lattices from wide to narrow: a set to start from without an image.
-
-    With several lattices, the colours of few wide Gaussians move much of the picture at once, and
-    those of many narrow ones add details, as the levels of a pyramid of texels.
-
-    Parameters
-    ----------
-    size : (int, int)
-        Native width and height in pixels.
-    sides : sequence of int
-        Number of Gaussians of each lattice along the longer side, such as ``(16, 40, 100)``. Along
-        the other side, their number makes the distances as equal as possible, and is at least one.
-    background : array_like, shape (C,), optional
-        What the set shows: the colours of its Gaussians are 0. In units of the space, so that the
-        default is a grey in "ycbcr" and "rgb".
-    space, cutoff : optional
-        See `Gaussians`.
-    backend : {"llvm", "cuda"}, optional
-        By default "cuda" if the machine has a CUDA GPU, else "llvm".
-    dtype : {numpy.float32, numpy.float64}, optional
-        Precision of the arrays.
-
-    Returns
-    -------
-    Gaussians
-        Lattice after lattice, row after row. Standard deviations are 0.65 distances along each
-        axis, within the bounds of `Gaussians.bounded`.
-
-    Raises
-    ------
-    ValueError
-        If `sides` are not whole numbers above 0, or another value is not as above.
-
-    Examples
-    --------
-    >>> import eigengs_dr as eg
-    >>> g = eg.lattices((64, 32), (4, 8), [0.2], space="data")
-    >>> len(g), g.channels, g.mean.numpy()[:, 0].tolist()
-    (40, 1, [8.0, 8.0])
-    """
-    try:
-        counts = sorted(index(n) for n in sides)
-    except TypeError:
-        counts = []
-    if not counts or counts[0] < 1:
-        raise ValueError(
-            f"lattices: sides are {sides!r}; give whole numbers above 0, such as (16, 40, 100)"
-        )
-    longer = max(check_size(size))
-    grids = [tuple(max(1, round(n * side / longer)) for side in size) for n in counts]
-    mean = [(np.indices(grid).T.reshape(-1, 2) + 0.5) * size / grid for grid in grids]
-    factor = [
-        np.tile([nx / size[0], 0, ny / size[1]], (nx * ny, 1)) / DEVIATION for nx, ny in grids
-    ]
-    places, background = np.concatenate(mean), np.asarray(background)
-    return Gaussians.from_arrays(
-        places,
-        np.concatenate(factor),
-        np.zeros((len(places), background.size)),
-        background,
-        size=size,
-        space=space,
-        backend=backend,
-        cutoff=cutoff,
-        dtype=dtype,
-    ).bounded()
 
 
 def random_shapes(size: tuple[int, int], count: int, generator: np.random.Generator) -> Shapes:

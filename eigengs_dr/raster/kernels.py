@@ -248,30 +248,15 @@ def sum_by_image(values: Float, grid: Grid) -> Float:
 
 
 def channel_sums(image: Float, channels: int, grid: Grid) -> list:
-    """Sum each channel of images in tile layout; return a list of Float, shape (images,)."""
-    return _totals(sum_channels(_pixels(image, channels, grid), channels), grid)
+    """Sum each channel of images in tile layout; return a list of Float, shape (images,).
 
-
-def channel_moments(image: Float, channels: int, grid: Grid) -> tuple[list, list]:
-    """Sum the values and the squares of each channel in one pass; see `channel_sums`."""
-    values = _pixels(image, channels, grid)
-    squares = sum_channels([dr.square(v) for v in values], channels)
-    totals = _totals([*sum_channels(values, channels), *squares], grid)
-    return totals[:channels], totals[channels:]
-
-
-def _totals(values: list, grid: Grid) -> list:
-    """Add values of tiles in double precision, so that sums over large images are accurate."""
-    Float, Double = type(values[0]), dr.float64_array_t(type(values[0]))
-    values = [Double(v) for v in values]
-    dr.eval(values)  # one kernel for all
-    return [Float(sum_by_image(v, grid)) for v in values]
-
-
-def _pixels(image: Float, channels: int, grid: Grid) -> list:
-    """Read the values of each tile of images in tile layout."""
-    types = types_of(image)
-    return gather_run(types, image, dr.arange(types.UInt, grid.tiles), grid.pixels * channels, True)
+    In double precision, so that sums over large images are accurate.
+    """
+    types, tiles = types_of(image), dr.arange(types_of(image).UInt, grid.tiles)
+    values = gather_run(types, image, tiles, grid.pixels * channels, True)
+    sums = [dr.float64_array_t(types.Float)(v) for v in sum_channels(values, channels)]
+    dr.eval(sums)  # one kernel for all
+    return [types.Float(sum_by_image(v, grid)) for v in sums]
 
 
 def sum_channels(values: list, channels: int) -> list:

@@ -4,8 +4,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from _helpers.reference import render_exact
 from _helpers.sets import SIZE
-from eigengs_dr.raster.reference import render_exact
 
 CUTOFF = 5.0
 FINE = 4

@@ -9,9 +9,9 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from _helpers.reference import render_exact
 from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.raster.reference import render_exact
 
 SIZE = (22, 17)
 """Width and height: no multiples of a tile. The same for all tests, so that kernels are

@@ -284,7 +284,6 @@ DOORS = {
     "render": lambda g, image: eg.render(g),
     "picture_of": lambda g, image: eg.picture_of(g),
     "tile_lists": lambda g, image: eg.tile_lists(g),
-    "lattices": lambda g, image: eg.lattices((8, 8), (2, 4), backend="llvm"),
     "ssim": lambda g, image: eg.ssim(dr.zeros(dr.llvm.ad.TensorXf, image.shape), image),
     "concatenate": lambda g, image: eg.concatenate([g, g]),
     "to_tensors": lambda g, image: eg.to_tensors(g),

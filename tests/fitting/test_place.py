@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-import eigengs_dr as eg
 from _helpers.halves import objective_of
-from _helpers.photos import coffee
 from _helpers.placements import check_placement, covariances_of, generator, images_and_counts
 from _helpers.sets import few
 from eigengs_dr.fitting.place import (
@@ -15,7 +13,6 @@ from eigengs_dr.fitting.place import (
     Grid,
     Random,
     grid_of,
-    lattices,
     random_shapes,
 )
 from eigengs_dr.paper.placement import RandomColors
@@ -90,53 +87,3 @@ def test_random_is_uniform():
     for values in drawn:
         quantiles = np.quantile(values, [0, 0.25, 0.5, 0.75, 1])
         np.testing.assert_allclose(quantiles, [0, 0.25, 0.5, 0.75, 1], atol=0.02)
-
-
-def test_lattices_go_from_wide_to_narrow(backend):
-    """Every lattice is a grid of points with one shape; the background is all that shows."""
-    found = lattices((60, 40), [12, 3], [0.2, 0.4], space="data", cutoff=2.5, backend=backend)
-    arrays = found.to_arrays()
-    first, second = arrays["mean"][:6], arrays["mean"][6:]
-    np.testing.assert_allclose(first, [[10, 10], [30, 10], [50, 10], [10, 30], [30, 30], [50, 30]])
-    steps = 5 * np.arange(12) + 2.5
-    assert {tuple(point) for point in second.tolist()} == {(x, y) for x in steps for y in steps[:8]}
-    for factor, distance in ((arrays["factor"][:6], 20), (arrays["factor"][6:], 5)):
-        expected = np.array([1, 0, 1]) / (DEVIATION * distance)
-        np.testing.assert_allclose(factor, np.tile(expected, (len(factor), 1)), rtol=1e-6)
-    assert (len(found), found.cutoff, found.space) == (6 + 96, 2.5, "data")
-    picture = eg.render(found, width=9)
-    np.testing.assert_allclose(picture.numpy(), np.broadcast_to([0.2, 0.4], (6, 9, 2)))
-
-
-@pytest.mark.parametrize("size", [(1, 1), (7, 100), (100, 1)])
-def test_lattices_of_any_size(size):
-    found = lattices(size, np.array([1, 9]), dtype=np.float64, backend="llvm")
-    arrays = found.to_arrays()
-    assert arrays["mean"].dtype == np.float64
-    check_placement(arrays["mean"], arrays["factor"], len(found), size)
-    grid = [max(1, round(9 * side / max(size))) for side in size]
-    assert len(found) == 1 + grid[0] * grid[1]
-    assert found.channels == 3
-
-
-def test_equal_colors_of_a_lattice_are_nearly_a_constant():
-    """That is what 0.65 distances are chosen for: a picture of one lattice has no gaps."""
-    found = lattices((64, 64), [8], [0.0], space="data", backend="llvm")
-    found.color += 1
-    middle = eg.render(found, cutoff=6).numpy()[24:40, 24:40]
-    assert middle.std() < 0.01 * middle.mean()
-
-
-@pytest.mark.parametrize("sides", [[], 8, [8, 0], [-1], [2.5], ["8"]])
-def test_lattices_of_no_numbers_are_refused(sides):
-    with pytest.raises(ValueError, match=r"lattices: sides are .* whole numbers above 0") as error:
-        lattices((8, 8), sides)
-    assert "\n" not in str(error.value)
-
-
-def test_lattices_are_a_start_of_a_loss():
-    image = coffee(32)
-    start = lattices((32, 32), (4, 8), space="rgb", backend="llvm")
-    found = eg.fit(image, iterations=30, start=start)
-    assert len(found.gaussians) == len(start)
-    assert found.psnr_rgb > eg.psnr(eg.render(start), image) + 3

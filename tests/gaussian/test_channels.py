@@ -9,10 +9,10 @@ import eigengs_dr as eg
 from _helpers.errors import file_refused
 from _helpers.files import members_of
 from _helpers.materials import MAPS, material
+from _helpers.reference import render_exact
 from _helpers.sets import check_equal
 from eigengs_dr.gaussian.channels import TextureMap, check_maps, slices, usual_space
 from eigengs_dr.gaussian.file import read_map
-from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.storage import npz
 from eigengs_dr.storage.npz import BadValue
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from _helpers.reference import render_plain
 from _helpers.sets import few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import from_log, ycbcr_to_rgb
-from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import bin_gaussians, render
 
 COUNT = 7

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter
 
+from _helpers.reference import render_exact
 from _helpers.sets import (
     COUNT,
     SIZE,
@@ -30,7 +31,6 @@ from eigengs_dr.gaussian.file import CUTOFF, MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import rgb_to_ycbcr, ycbcr_to_rgb
 from eigengs_dr.raster.binning.tiles import TILE, Grid
-from eigengs_dr.raster.reference import render_exact
 from eigengs_dr.raster.render import (
     picture_of,
     render,

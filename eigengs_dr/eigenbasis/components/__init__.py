@@ -2,5 +2,4 @@
 
 - ``bands``: the division of Gaussians and components into bands
 - ``solve``: shapes, then the weights of all Gaussians in all components
-- ``shape_training``: training of shapes on random combinations of components
 """

@@ -13,9 +13,6 @@ from ..pca.basis import Eigenbasis
 
 Planes = NDArray[np.float32]
 
-State = dict[str, NDArray]
-"""The state of the training of a band as plain arrays, for a checkpoint."""
-
 LOW_SHARE = 0.1
 """Share of the Gaussians that represent the low frequencies in a split (from the paper)."""
 
@@ -79,15 +76,10 @@ def low_component_count(basis: Eigenbasis) -> int:
     return min(LOW_COMPONENTS, max(map(len, basis.components)) // 2)
 
 
-def on_grid(band: FrequencyBand) -> State:
-    """Return the initial state of a band: Gaussians on a grid."""
+def on_grid(band: FrequencyBand, backend: str | None = None) -> Gaussians:
+    """Return the Gaussians of a band on a grid, with colours of 0 in the space "data"."""
     mean, factor = grid_of(band.size, band.number)
-    return {"step": np.array(0), "mean": mean, "factor": factor}
-
-
-def shapes_of(state: State, band: FrequencyBand, backend: str | None = None) -> Gaussians:
-    """Return the Gaussians of a state, with colours of 0 in the space "data"."""
-    colors = np.zeros((len(state["mean"]), len(band.components)))
+    colors = np.zeros((len(mean), len(band.components)))
     return Gaussians.from_arrays(
-        state["mean"], state["factor"], colors, size=band.size, space="data", backend=backend
+        mean, factor, colors, size=band.size, space="data", backend=backend
     )

@@ -12,18 +12,11 @@ from numpy.typing import NDArray
 from ...backend.doors import door
 from ...gaussian.gaussians import Gaussians, concatenate, with_colors
 from ...image.metrics import psnr_from_mse
-from ...paper.joint_training import joint_shapes, joint_weights, train_jointly
+from ...paper.joint_training import State, joint_shapes, joint_weights, train_jointly
 from ..normal_equations import BATCH, NormalEquations, squared_norms
 from ..options import TrainOptions
 from ..pca.basis import Eigenbasis
-from .bands import (
-    Planes,
-    State,
-    frequency_bands,
-    low_component_count,
-    shapes_of,
-)
-from .shape_training import train_shapes
+from .bands import Planes, frequency_bands, low_component_count, on_grid
 
 
 @door
@@ -67,10 +60,9 @@ def fit_model(
     steps, joint = options.training_steps, options.preset == "eigengs"
     states = list(states or [])
     started = time.perf_counter()
-    for i, band in enumerate(bands):
+    for i, band in enumerate(bands if joint else ()):
         previous = states[i] if i < len(states) else None
-        train = train_jointly if joint else train_shapes
-        for state in train(band, options.seed + i, steps, backend, previous):
+        for state in train_jointly(band, options.seed + i, steps, backend, previous):
             states[i:] = [state]
             if progress:
                 done = sum(int(state["step"]) for state in states)
@@ -79,10 +71,10 @@ def fit_model(
     trained = time.perf_counter()
     shapes: list[Gaussians] = []
     weights: list[list[Planes]] = []  # of each band, in the components of the band
-    for state, band in zip(states, bands, strict=True):
-        shapes.append((joint_shapes if joint else shapes_of)(state, band, backend))
+    for i, band in enumerate(bands):
+        shapes.append(joint_shapes(states[i], band, backend) if joint else on_grid(band, backend))
         if joint:
-            weights.append(joint_weights(state, band))
+            weights.append(joint_weights(states[i], band))
         elif split:
             band_equations = NormalEquations(shapes[-1])
             weights.append([find_weights(band_equations, planes)[0] for planes in band.components])

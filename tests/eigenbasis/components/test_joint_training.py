@@ -4,6 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from _helpers.reference import render_plain
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.eigenbasis.components.bands import FrequencyBand
@@ -16,7 +17,6 @@ from eigengs_dr.paper.joint_training import (
     joint_weights,
     train_jointly,
 )
-from eigengs_dr.raster.reference import render_plain
 from eigengs_dr.raster.render import bin_gaussians, render
 
 WIDTH, HEIGHT = 23, 18

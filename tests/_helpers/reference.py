@@ -1,15 +1,15 @@
-"""Slow reference renderers for tests and benchmarks."""
+"""Slow reference renderers."""
 
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import types_of
-from ..backend.types import Float, UInt
-from .binning.lists import TileLists
-from .evaluate import weights
-from .parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.backend.types import Float, UInt
+from eigengs_dr.raster.binning.lists import TileLists
+from eigengs_dr.raster.evaluate import weights
+from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
 
 
 def render_plain(values: list, background: list, lists: TileLists, cutoff: float = 3.0) -> Float:
