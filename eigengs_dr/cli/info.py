@@ -145,7 +145,7 @@ def _describe_packed(file: Path) -> Facts:
         set_file.check(data)
     facts = _describe_set(data) | {"sections": [len(part.cell) for part in packed.sections]}
     steps = {f"{name}_step": float(f"{x:.4g}") for name, x in packed.steps._asdict().items()}
-    return facts | steps
+    return facts | steps | ({"psnr": round(packed.psnr, 2)} if isfinite(packed.psnr) else {})
 
 
 def _describe_model(model: eg.EigenGS) -> Facts:

@@ -44,9 +44,9 @@ never released, and are not read."""
 
 MAX_SECTIONS = 1 << 12
 
-_HEADER = struct.Struct("<4sBBBBHIIiiffd")
+_HEADER = struct.Struct("<4sBBBBHIIiiffdf")
 """Magic, version, space, channels, levels of the square of cells, sections, width, height, column
-and row of the first cell, the steps, and the cutoff."""
+and row of the first cell, the steps, the cutoff, and the PSNR."""
 
 _MAP = struct.Struct("<BBBd")
 """An entry of the table of maps, without its name; see `_map_table`."""
@@ -76,6 +76,8 @@ class EgsContent(NamedTuple):
     maps : tuple of TextureMap
         The maps of a set, whose colours and background are multiplied by their weights; empty for
         an image.
+    psnr : float
+        PSNR against the image in dB, see `eigengs_dr.codec.packing.PackResult`; NaN if unknown.
     """
 
     sections: list[Symbols]
@@ -85,6 +87,7 @@ class EgsContent(NamedTuple):
     space: str
     cutoff: float = CUTOFF
     maps: tuple[TextureMap, ...] = ()
+    psnr: float = float("nan")
 
     def set_data(self) -> SetData:
         """Return the set, in single precision."""
@@ -116,6 +119,7 @@ def to_bytes(packed: EgsContent) -> bytes:
         *corner.tolist(),
         *packed.steps,
         packed.cutoff,
+        packed.psnr,
     )
     head += packed.background.astype("<f4").tobytes() + _map_table(packed.maps)
     parts = [head, zlib.crc32(head).to_bytes(4, "little")]
@@ -274,7 +278,7 @@ def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
             f"version is {version}, but this package reads versions {VERSION} and {MAPS_VERSION}; "
             + ("upgrade eigengs-dr" if version > VERSION else "pack the set again")
         )
-    width, height, x, y, color, cell, cutoff = rest
+    width, height, x, y, color, cell, cutoff, psnr = rest
     background = exactly(file, 4 * channels)
     table, maps = _read_maps(file) if version == MAPS_VERSION else (b"", ())
     if exactly(file, 4) != zlib.crc32(head + background + table).to_bytes(4, "little"):
@@ -291,7 +295,7 @@ def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
     if not all(0 < step < np.inf for step in steps):
         raise BadValue(f"the steps are {tuple(steps)}, expected numbers above 0")
     values = np.frombuffer(background, "<f4")
-    content = EgsContent([], steps, values, (width, height), SPACES[space], cutoff, maps)
+    content = EgsContent([], steps, values, (width, height), SPACES[space], cutoff, maps, psnr)
     return levels, count, np.array([x, y]), content
 
 

@@ -141,7 +141,7 @@ def test_files_with_damaged_bytes(tmp_path_factory, data):
 
 def header(**changed):
     names = ["magic", "version", "space", "channels", "levels", "sections"]
-    names += ["width", "height", "x", "y", *Steps._fields, "cutoff"]
+    names += ["width", "height", "x", "y", *Steps._fields, "cutoff", "psnr"]
     values = packed._HEADER.unpack(packed.to_bytes(content())[: packed._HEADER.size])
     head = packed._HEADER.pack(*{**dict(zip(names, values, strict=True)), **changed}.values())
     channels = changed.get("channels", 3)
