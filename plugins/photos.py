@@ -111,9 +111,9 @@ def photo_loss(
     Renderings of few samples are noisy. `mitsuba.render` gives the derivatives other random numbers
     than the picture, so that their product has the right mean.
 
-    Equal seeds give equal renderings, but not equal bits of a fit: several threads of Dr.Jit add the
-    derivatives of samples that share a texel in any order. Six fits of 60 Gaussians, 32x32 texels
-    and 60 steps had six results with two threads, up to 0.05 apart, and one result with
+    Equal seeds give equal renderings, but not equal bits of a fit: several threads of Dr.Jit add
+    the derivatives of samples that share a texel in any order. Six fits of 60 Gaussians, 32x32
+    texels and 60 steps had six results with two threads, up to 0.05 apart, and one result with
     ``drjit.set_thread_count(1)``, with which Mitsuba may wait for ever to read an EXR file.
 
     Examples
