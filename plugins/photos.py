@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -13,10 +14,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from eigengs_dr.backend.arguments import plain_numbers, takes_numbers
 from eigengs_dr.backend.recording import freeze_rendering
 from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
+from eigengs_dr.image.pictures import is_picture
+from eigengs_dr.image.pixels import ImageError, check_encoding, reason_of
 
 from .environment import texels_of
 from .follow import check_scene
@@ -30,6 +34,7 @@ product of the differences of two independent renderings to a photo has the squa
 mean as its mean, without the noise of renderings."""
 
 
+@takes_numbers
 def photo_loss(
     scene: mi.Scene,
     pictures: str | Mapping[str, str],
@@ -42,6 +47,7 @@ def photo_loss(
     bounds: tuple[float, float] | None = (0.0, 1.0),
     parameters: Any = None,
     seed: int = 0,
+    encoding: str | None = None,
 ) -> Loss:
     """Return the squared error of renderings against photos, for `eigengs_dr.fit`.
 
@@ -61,11 +67,12 @@ def photo_loss(
         ``format: "variant"``, to hold floats. Their texels are then light or data, so the ``space``
         of a fit is by default "linear" for three channels, and "data" for one. An ``envmap`` counts
         as a bitmap, of the space "log"; its light has no `bounds`.
-    photos : sequence of array_like or tensor, shape (H, W, 3), path-like or mitsuba.Bitmap
-        Of the size of the film of its sensor each. Floats, such as those of `mitsuba.render`, are
-        linear light; codes of 8 bits are sRGB, and files what they say.
+    photos : sequence of array_like or tensor, shape (H, W, 3), path-like, PIL or mitsuba.Bitmap
+        Of the size of the film of its sensor each; grey is replicated. Numbers of a list, an array
+        or a tensor of Dr.Jit or PyTorch are linear light if they are floats, as those of
+        `mitsuba.render`, and sRGB codes if they are whole; other photos are what they say.
     sensors : sequence of sensors or numbers, optional
-        One for each photo, by default the first ones of the scene.
+        One for each photo, by default those of the scene.
     integrator : mitsuba.Integrator, optional
         By default that of the scene.
     spp : int, optional
@@ -81,7 +88,10 @@ def photo_loss(
         Of other parameters of the scene, by their names there, see `eigengs_dr.Loss`. A
         `mitsuba.ad.Adam` with the key ``"lamp.emitter.radiance.value"`` looks for a light, say.
     seed : int, optional
-        Seed of the renderings and of the choice of the pixels.
+        Seed of the renderings and of the choice of the pixels, at least 0. Seeds that are equal
+        modulo 2^32 give equal renderings.
+    encoding : {"srgb", "linear"}, optional
+        What the numbers of all photos are, instead: "srgb" for arrays of `eigengs_dr.load_image`.
 
     Returns
     -------
@@ -90,13 +100,21 @@ def photo_loss(
     Raises
     ------
     ValueError
-        If a name is unknown, a bitmap does not hold floats, or photos and sensors do not fit
-        together.
+        If a name is unknown, a bitmap holds no floats, has fewer than 2x2 texels or, in a spectral
+        variant, holds colours; if photos and sensors do not fit together, a photo cannot be read,
+        or an argument is out of range. In the fit, if its size is below 2x2.
+    TypeError
+        If the scene, a sensor or the integrator is none.
 
     Notes
     -----
     Renderings of few samples are noisy. `mitsuba.render` gives the derivatives other random numbers
     than the picture, so that their product has the right mean.
+
+    Equal seeds give equal renderings, but not equal bits of a fit: several threads of Dr.Jit add
+    the derivatives of samples that share a texel in any order. Six fits of 60 Gaussians, 32x32
+    texels and 60 steps had six results with two threads, up to 0.05 apart, and one result with
+    ``drjit.set_thread_count(1)``, with which Mitsuba may wait for ever to read an EXR file.
 
     Examples
     --------
@@ -114,34 +132,50 @@ def photo_loss(
     >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40)
     """
     check_scene("photo_loss", scene)
+    check_encoding(encoding)
     if not 0 <= held_out < 1:
         raise ValueError(f"photo_loss: held_out is {held_out}; it must be in [0, 1)")
-    if spp < 1:
-        raise ValueError(f"photo_loss: spp is {spp}; it must be at least 1")
+    for name, number, least in (("spp", spp, 1), ("seed", seed, 0)):
+        if number < least:
+            raise ValueError(f"photo_loss: {name} is {number}; it must be at least {least}")
     known = mi.traverse(scene)
     keys = dict(pictures) if isinstance(pictures, Mapping) else {"": pictures}
     keys = {name: _data_of(known, key) for name, key in keys.items()}
-    for key in parameters.keys() if parameters is not None else ():
-        _check_known(known, key)
     chosen = _sensors_of(scene, sensors, len(photos))
+    integrator = scene.integrator() if integrator is None else integrator
+    if not isinstance(integrator, mi.Integrator):  # None if the scene has none
+        raise TypeError(
+            f"photo_loss: integrator is {integrator!r}; give a loaded one, such as "
+            "mi.load_dict({'type': 'prb'})"
+        )
     targets = [
-        _check_photo(number, photo, sensor.film().crop_size())
+        _check_photo(number, photo, sensor.film().crop_size(), encoding)
         for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
     ]
     judged = sorted({k * len(targets) // JUDGED for k in range(JUDGED)})
     generator = np.random.default_rng(seed)
     shares = [held_out * (number in judged) for number in range(len(targets))]
-    hidden = [
-        mi.TensorXf(np.float32(generator.random((*target.shape[:2], 1)) < share))
+    masks = [
+        generator.random((*target.shape[:2], 1)) < share
         for target, share in zip(targets, shares, strict=True)
     ]
-    integrator = scene.integrator() if integrator is None else integrator
+    for number in judged if held_out else ():
+        count, pixels = int(masks[number].sum()), masks[number].size
+        if not 0 < count < pixels:
+            raise ValueError(
+                f"photo_loss: held_out is {held_out}, {count} of the {pixels} pixels of photo "
+                f"{number}; some must be held out and others not"
+            )
+    hidden = [mi.TensorXf(np.float32(mask)) for mask in masks]
     drawn = scene, known, keys, chosen, integrator, spp
-    taken = _Photos(*drawn, targets, hidden, judged, parameters, seed * STEPS_OF_A_SEED)
+    taken = _Photos(*drawn, targets, hidden, judged, parameters, _first_of(seed))
     spaces = {name: _space_of(known, key) for name, key in keys.items()}
     space = spaces if isinstance(pictures, Mapping) else spaces[""]
     judge = taken.judge if held_out else None
-    return Loss(taken.loss, bounds, parameters, judge, space=space)
+    loss = Loss(taken.loss, bounds, parameters, judge, space=space)
+    for key in parameters.keys() if parameters is not None else ():
+        _check_known(known, key)
+    return loss
 
 
 @dataclass(repr=False)  # that of a scene takes hundreds of lines
@@ -185,7 +219,8 @@ class _Photos:
 
     def loss(self, picture: Any, step: int) -> Any:
         """Return the squared error of the rendering of one photo."""
-        number, seed, texels = step % len(self.photos), self.first + step, self.texels(picture)
+        number, texels = step % len(self.photos), self.texels(picture)
+        seed = (self.first + step) % SEEDS
         if self.parameters is None and dr.grad_enabled(picture):
             return dr.custom(_Frozen, partial(self.slopes, number, seed), texels)
         self.known.update(texels)
@@ -201,16 +236,18 @@ class _Photos:
             # What the user differentiates gets nothing: Mitsuba would add to all derivatives.
             known = ((k, v) for k, v in self.known if k not in texels and dr.grad_enabled(v))
             others = {key: type(value)(value) for key, value in known}
-            self.known.update(leaves | {key: dr.detach(value) for key, value in others.items()})
             drawn = self.scene, self.sensors[number], self.integrator, self.spp
             seen = dr.opaque(mi.UInt32, seed), self.photos[number], 1 - self.hidden[number]
             try:
-                value = self.add_slopes(*drawn, *seen)
-            except RuntimeError:  # Dr.Jit cannot record projective integrators, say
-                self.add_slopes = _add_slopes
-                dr.clear_grad(leaves)
-                value = self.add_slopes(*drawn, *seen)
-            self.known.update(texels | others)
+                self.known.update(leaves | {key: dr.detach(value) for key, value in others.items()})
+                try:
+                    value = self.add_slopes(*drawn, *seen)
+                except RuntimeError:  # Dr.Jit cannot record projective integrators, say
+                    self.add_slopes = _add_slopes
+                    dr.clear_grad(leaves)
+                    value = self.add_slopes(*drawn, *seen)
+            finally:
+                self.known.update(texels | others)
             return value, dr.grad(leaves)
 
     def judge(self, picture: Any) -> Any:
@@ -220,7 +257,7 @@ class _Photos:
         means = [
             _mean(
                 self.difference(number, self.first, samples)
-                * self.difference(number, self.first + 1, samples),
+                * self.difference(number, (self.first + 1) % SEEDS, samples),
                 self.hidden[number],
             )
             for number in self.judged
@@ -235,6 +272,12 @@ class _Photos:
             raise ValueError(
                 f"photo_loss: the bitmaps have the channels {_listed(self.channels)}, the pictures "
                 f"of the fit {_listed(given)}; the names and spaces of eigengs_dr.fit say them"
+            )
+        height, width, _ = next(iter(named.values())).shape
+        if min(height, width) < LEAST:  # Mitsuba would take it once, and then no other one
+            raise ValueError(
+                f"photo_loss: the size of the fit is {width}x{height}; a bitmap of Mitsuba has at "
+                f"least {LEAST}x{LEAST} texels"
             )
         return {key: texels_of(self.known, key, named[name]) for name, key in self.keys.items()}
 
@@ -288,26 +331,49 @@ def _mean(values: Any, weight: Any) -> Any:
     return dr.sum(values * weight, axis=None) / (3 * dr.sum(weight, axis=None))
 
 
-STEPS_OF_A_SEED = 1 << 16
-"""Random numbers of two seeds differ if steps are fewer."""
+SEEDS = 1 << 32
+"""Number of seeds of renderings; the next one is the first again."""
+
+LEAST = 2
+"""Texels of a side from which on Mitsuba takes other bitmaps in place of one."""
+
+
+def _first_of(seed: int) -> int:
+    """Return the seed of the first rendering: those of 65,536 steps differ from seed to seed."""
+    low, high = seed % (1 << 16), seed // (1 << 16)
+    return (low << 16) + high % (1 << 16)
 
 
 def _sensors_of(
     scene: mi.Scene, sensors: Sequence[mi.Sensor | int] | None, count: int
 ) -> list[mi.Sensor]:
-    """Return one sensor for each photo: those that were given, or the first ones of the scene."""
+    """Return one sensor for each photo: those that were given, or those of the scene."""
     if not count:
         raise ValueError("photo_loss: there are no photos; give one for each sensor")
     known = scene.sensors()
-    if sensors is not None and len(sensors) != count:
-        raise ValueError(f"photo_loss: {count} photos, but {len(sensors)} sensors")
-    if sensors is None and count > len(known):
+    if sensors is None and count != len(known):
         raise ValueError(
             f"photo_loss: {count} photos, but the scene has {len(known)} sensors; give sensors=, "
             "one for each photo"
         )
-    named = range(count) if sensors is None else sensors
-    return [known[sensor] if isinstance(sensor, int) else sensor for sensor in named]
+    named = known if sensors is None else sensors
+    if not hasattr(named, "__len__"):
+        raise TypeError(f"photo_loss: sensors is {named!r}; give a list, one for each photo")
+    if len(named) != count:
+        raise ValueError(f"photo_loss: {count} photos, but {len(named)} sensors")
+    return [_sensor_of(known, sensor) for sensor in named]
+
+
+def _sensor_of(known: Sequence[mi.Sensor], sensor: Any) -> mi.Sensor:
+    """Return a sensor, or that of a number in the scene."""
+    if isinstance(sensor, mi.Sensor):
+        return sensor
+    number = plain_numbers({"sensors": sensor}, {"sensors": "int"})["sensors"]
+    if not 0 <= number < len(known):
+        raise ValueError(
+            f"photo_loss: sensors name {number}; those of the scene are 0 to {len(known) - 1}"
+        )
+    return known[number]
 
 
 def _listed(channels: Mapping[str, int]) -> str:
@@ -324,12 +390,25 @@ def _check_known(known: mi.SceneParameters, key: str) -> None:
 
 def _data_of(known: mi.SceneParameters, key: str) -> str:
     """Return the name of the texels of a bitmap among the parameters of a scene."""
+    if not isinstance(key, str):
+        raise TypeError(f"photo_loss: pictures name {key!r}; give the name of a bitmap")
     name = key if key.endswith(".data") else f"{key}.data"
     if name in known:
         if not dr.is_float_v(known[name]):
             raise ValueError(
                 f"photo_loss: the bitmap {key!r} holds bytes, which have no derivative; "
                 'give it <string name="format" value="variant"/>'
+            )
+        height, width, channels = known[name].shape
+        if mi.is_spectral and channels > 1:
+            raise ValueError(
+                f"photo_loss: the bitmap {key!r} holds coefficients of spectra in {mi.variant()}; "
+                "load the scene in a variant of RGB, such as llvm_ad_rgb"
+            )
+        if min(height, width) < LEAST:
+            raise ValueError(
+                f"photo_loss: the bitmap {key!r} has {width}x{height} texels, and Mitsuba takes no "
+                f"others in their place; give it {LEAST}x{LEAST} or more"
             )
         return name
     bitmaps = [k.removesuffix(".data") for k, _ in known if k.endswith(".data")]
@@ -347,19 +426,24 @@ def _space_of(known: mi.SceneParameters, key: str) -> str:
     return "linear" if known[key].shape[2] == 3 else "data"
 
 
-def _check_photo(number: int, photo: Any, size: Sequence[int]) -> mi.TensorXf:
+def _check_photo(number: int, photo: Any, size: Sequence[int], encoding: str | None) -> mi.TensorXf:
     """Return a photo as a tensor of linear light, of the size of its film."""
-    photo = photo.numpy() if dr.is_array_v(photo) else photo
-    floats = np.issubdtype(getattr(photo, "dtype", np.uint8), np.floating)
-    image = read_floats(photo, encoding="linear" if floats else None)
-    pixels = to_linear(image.pixels) if image.encoding == "srgb" else np.asarray(image.pixels)
-    pixels = pixels[..., :3]
+    is_file = isinstance(photo, (str, os.PathLike))
+    name = f"photo {number} ({os.fspath(photo)})" if is_file else f"photo {number}"
+    try:
+        if not (is_file or is_picture(photo) or isinstance(photo, mi.Bitmap)):
+            photo = np.asanyarray(dr.detach(photo) if dr.is_array_v(photo) else photo)
+            if photo.dtype.kind == "f":
+                encoding = encoding or "linear"
+        image = read_floats(photo, encoding=encoding)
+    except (ValueError, OSError, TypeError, RuntimeError) as error:  # PyTorch: the last two
+        reason = reason_of(error).removeprefix("image: ").removeprefix(f"{photo}: ")
+        raise ImageError(f"photo_loss: {name}: {reason}") from error
+    pixels = to_linear(image.pixels) if image.encoding == "srgb" else image.pixels
     width, height = size
     if pixels.shape != (height, width, 3):
-        raise ValueError(
-            f"photo_loss: photo {number} has shape {pixels.shape}, but its film has "
+        raise ImageError(
+            f"photo_loss: {name} has shape {pixels.shape}, but its film has "
             f"{width}x{height} pixels; give ({height}, {width}, 3)"
         )
-    if not np.isfinite(pixels).all():
-        raise ValueError(f"photo_loss: photo {number} has values that are not finite")
     return mi.TensorXf(pixels)

@@ -122,7 +122,9 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
     for _ in range(2):
         textures = {name: bitmap(mi, grey(name)) for name in names}
         loaded = scene_of(mi, scene.kind, textures, scene.cameras)
-        loss = photo_loss(loaded, names, scene.photos[: scene.cameras], spp=scene.spp)
+        cameras = range(scene.cameras)
+        photos = scene.photos[: scene.cameras]
+        loss = photo_loss(loaded, names, photos, sensors=cameras, spp=scene.spp)
         size = (TEXELS, TEXELS)
         result = eg.fit(loss=loss, size=size, space=spaces, iterations=steps, progress=False)
         dr.sync_thread()
@@ -193,7 +195,9 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
     parameters, values = mi.traverse(loaded), mi.ad.Adam(1.0, unknown.start, beta_1=MOMENTUM)
     photos = [mi.TensorXf(photo) for photo in scene.photos[: scene.cameras]]
     names = NAMES[scene.kind]
-    replayed = photo_loss(loaded, names, photos, spp=scene.spp).function if frozen else None
+    cameras = range(scene.cameras)
+    loss = photo_loss(loaded, names, photos, sensors=cameras, spp=scene.spp) if frozen else None
+    replayed = None if loss is None else loss.function
 
     def error(tensors: Mapping[str, Any], step: int) -> Any:
         if replayed:

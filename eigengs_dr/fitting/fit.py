@@ -246,8 +246,9 @@ def fit(
     Notes
     -----
     On one machine and backend, equal seeds give bit-identical results, unless the derivative of a
-    loss has other bits at each call: Dr.Jit adds those of values that the loss broadcasts, such as
-    alpha in ``color * alpha``, in any order.
+    loss has other bits at each call: with several threads, Dr.Jit adds in any order those of values
+    that the loss broadcasts, as in ``color * alpha`` of one channel, and those of texels that the
+    samples of a rendering share, as in `eigengs_dr.plugins.photo_loss`.
 
     The factors of the errors of maps that the function finds are one over the root mean square
     error after a first colour solve, so that all maps gain alike in decibels; or with goals, one

@@ -170,21 +170,42 @@ def test_photos_that_do_not_fit_are_refused():
             "no bitmap 'wall.bsdf.reflektance'; it has wall.bsdf.ref",
         ),
         (NAME, photos + photos, "6 photos, but the scene has 3 sensors; give sensors="),
+        (NAME, photos[:2], "2 photos, but the scene has 3 sensors; give sensors="),
         (NAME, [], "there are no photos"),
-        (NAME, [GREY], r"photo 0 has shape \(32, 32, 3\), but its film has 24x24"),
-        (NAME, [np.full_like(photos[0], np.nan)], "not finite"),
+        (NAME, [*photos[:2], GREY], r"photo 2 has shape \(32, 32, 3\), but its film has 24x24"),
+        (NAME, [*photos[:2], np.full_like(photos[0], np.nan)], "photo_loss: photo 2: .*finite"),
+        (NAME, [photos[0], [[0.5], [0.5, 1]], photos[0]], "photo_loss: photo 1: "),
+        (NAME, [photos[0], object(), photos[0]], "photo_loss: photo 1: "),
+        (NAME, ["no.png", *photos[1:]], r"photo_loss: photo 0 \(no.png\): "),
     ):
         with pytest.raises(ValueError, match=message):
             photo_loss(scene, name, given)
     light = mi.ad.Adam(lr=0.1, params={"sky.radiance": mi.Float(1)})
     for options, message in (
         ({"sensors": [0, 1]}, "3 photos, but 2 sensors"),
+        ({"sensors": [0, 1, 3]}, "sensors name 3; those of the scene are 0 to 2"),
+        ({"sensors": [0, 1, 2.0]}, "sensors is 2.0; it must be a whole number"),
         ({"held_out": 1}, "held_out is 1"),
+        ({"held_out": 1e-9}, "held_out is 1e-09, 0 of the 576 pixels of photo 0"),
+        ({"held_out": 1 - 1e-9}, "held_out is 0.999999999, 576 of the 576 pixels of photo 0"),
         ({"spp": 0}, "spp is 0"),
+        ({"spp": 2.0}, "spp is 2.0; it must be a whole number"),
+        ({"seed": -1}, "seed is -1"),
+        ({"bounds": (0, np.inf)}, "bounds are"),
+        ({"encoding": "sRGB"}, "encoding 'sRGB' is unknown"),
         ({"parameters": light}, "no parameter 'sky.radiance'; did you mean 'sky.radiance.value'"),
     ):
         with pytest.raises(ValueError, match=message):
             photo_loss(scene, NAME, photos, **options)
+    for options, message in (
+        ({"integrator": "path"}, "integrator is 'path'; give a loaded one"),
+        ({"sensors": 5}, "sensors is 5; give a list"),
+        ({"parameters": {}.items()}, "give an optimiser"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            photo_loss(scene, NAME, photos, **options)
+    with pytest.raises(TypeError, match="pictures name 5"):
+        photo_loss(scene, 5, photos)
     loss = photo_loss(scene, NAME, photos)
     for space, message in (("data", "channels 3, .* fit 1"), ({"a": "linear"}, "fit a 3")):
         with pytest.raises(ValueError, match=message):
@@ -204,19 +225,119 @@ def test_bitmaps_of_bytes_are_refused(tmp_path):
     eg.fit(loss=loss, size=(8, 8), gaussians=5, iterations=4)
 
 
-def test_photos_are_light_or_codes():
-    """Of floats, of 8 bits, or of a file: the derivative of the first step is the same."""
+def test_seeds_of_any_size_differ():
+    """Also those that fill the 32 bits of a renderer's seed, and numbers of NumPy."""
     from eigengs_dr.plugins import photo_loss
 
+    scene, photos = wall(GREY), [GREY[:SIDE, :SIDE]] * 3
+
+    def value(seed, step=0):
+        numbers = {"seed": seed, "spp": np.int64(1), "sensors": np.arange(3)}
+        return float(photo_loss(scene, NAME, photos, **numbers).function(picture, step).array[0])
+
+    picture = mi.TensorXf(true_texture())
+    seeds = (0, 1, 65_535, 65_536, 70_000, 2**31, 2**32 - 1)
+    assert len({value(seed) for seed in seeds}) == len(seeds)
+    assert value(np.int64(70_000)) == value(70_000) == value(70_000 + 2**32)
+    value(2**32 - 1, step=3 * 2**16)  # beyond the largest seed of a rendering
+
+
+def test_a_size_below_two_texels_leaves_the_scene_as_it_is():
+    """Mitsuba takes a bitmap of one row once, and then no other one."""
+    import drjit as dr
+
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), [GREY[:SIDE, :SIDE]] * 3
+    values = mi.traverse(scene)
+    dr.enable_grad(values["sky.radiance.value"])
+    values.update()
+    loss = photo_loss(scene, NAME, photos)
+    for size in ((9, 1), (1, 9)):
+        with pytest.raises(ValueError, match=f"size of the fit is {size[0]}x{size[1]}; .* 2x2"):
+            eg.fit(loss=loss, size=size, gaussians=1, iterations=4)
+    assert mi.traverse(scene)[f"{NAME}.data"].shape == GREY.shape
+    loss.function(mi.TensorXf(GREY[:2, :2]), 0)
+    eg.fit(loss=loss, size=(8, 8), gaussians=1, iterations=2)
+    assert np.isfinite(mi.render(scene, spp=1).numpy()).all()
+    assert dr.grad_enabled(mi.traverse(scene)["sky.radiance.value"])
+    with pytest.raises(ValueError, match="has 32x1 texels"):
+        photo_loss(wall(GREY[:1]), NAME, photos)
+
+
+def test_a_step_that_fails_keeps_the_derivatives_of_the_user(monkeypatch):
+    import drjit as dr
+
+    import eigengs_dr.plugins.photos as module
+
+    def fail(*arguments):
+        raise RuntimeError("no rendering")
+
+    monkeypatch.setattr(module, "_add_slopes", fail)
     scene = wall(GREY)
-    codes = np.full((SIDE, SIDE, 3), 128, np.uint8)
-    light = eg.image.color.to_linear(codes.astype(np.float32) / 255)
+    values = mi.traverse(scene)
+    dr.enable_grad(values["sky.radiance.value"])
+    values.update()
+    loss = module.photo_loss(scene, NAME, [GREY[:SIDE, :SIDE]] * 3)
     picture = mi.TensorXf(GREY)
-    values = [
-        float(np.ravel(photo_loss(scene, NAME, [photo]).function(picture, 0).numpy())[0])
-        for photo in (light, codes, mi.Bitmap(light))
-    ]
-    np.testing.assert_allclose(values, values[0], rtol=1e-4)
+    dr.enable_grad(picture)
+    with pytest.raises(RuntimeError):
+        loss.function(picture, 0)
+    assert dr.grad_enabled(mi.traverse(scene)["sky.radiance.value"])
+
+
+class Foreign:
+    """A tensor of another library, as NumPy sees one of PyTorch."""
+
+    def __init__(self, array):
+        self.array = array
+
+    def __array__(self, dtype=None, copy=None):
+        return np.asarray(self.array, dtype)
+
+
+def test_photos_are_light_or_codes(tmp_path):
+    """Of floats, of 8 bits, or of a file, of any library: the first value is the same."""
+    from PIL import Image
+
+    from eigengs_dr.plugins import photo_loss
+
+    scene, picture = wall(GREY), mi.TensorXf(GREY)
+    codes = np.full((SIDE, SIDE, 3), 128, np.uint8)
+    coded = codes.astype(np.float32) / 255
+    light = eg.image.color.to_linear(coded)
+    Image.fromarray(codes).save(tmp_path / "photo.png")
+
+    def value(photo, encoding=None):
+        loss = photo_loss(scene, NAME, [photo], sensors=[0], encoding=encoding)
+        return float(loss.function(picture, 0).array[0])
+
+    expected = value(light)
+    for photo in (
+        codes,
+        tmp_path / "photo.png",
+        Image.fromarray(codes),
+        mi.Bitmap(light),
+        mi.TensorXf(light),
+        light.tolist(),
+        light.astype(np.float64),
+        Foreign(light),
+        Foreign(codes),
+    ):
+        assert value(photo) == pytest.approx(expected, rel=1e-4)
+    for photo in (coded, coded.tolist(), codes, mi.TensorXf(coded), Foreign(coded)):
+        assert value(photo, "srgb") == pytest.approx(expected, rel=1e-4)
+    assert value(codes, "linear") == pytest.approx(value(coded), rel=1e-4) != expected
+
+
+def test_colours_of_a_spectral_variant_are_refused():
+    """Where texels are coefficients, on which a descent gains nothing."""
+    from eigengs_dr.plugins import photo_loss
+
+    mi.set_variant("llvm_ad_spectral")
+    paint = {"type": "bitmap", "data": mi.TensorXf(GREY)}
+    with pytest.raises(ValueError, match="spectra in llvm_ad_spectral; load the scene in"):
+        photo_loss(wall(paint), NAME, [GREY[:SIDE, :SIDE]] * 3)
 
 
 def test_an_environment_map_is_recovered():
