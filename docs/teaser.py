@@ -33,7 +33,7 @@ def main() -> None:
     scene = scene_of(mi, "poster", {"color": texture_of(many, wrap_mode="clamp")}, CAMERAS)
     photos = [mi.render(scene, sensor=k, spp=64, seed=k).numpy() for k in range(CAMERAS)]
     unknown = scene_of(mi, "poster", {"color": bitmap(mi, grey("color"))}, CAMERAS)
-    loss = photo_loss(unknown, "poster.bsdf.reflectance", photos)
+    loss = photo_loss(unknown, "poster.bsdf.reflectance", photos, sensors=range(CAMERAS))
     recovered = eg.fit(loss=loss, size=(256, 256), iterations=480, space="linear")
     pictures = [
         photo,

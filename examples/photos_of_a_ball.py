@@ -119,7 +119,7 @@ print(f"{3 * TEXELS**2:,} numbers as texels: {eg.psnr(view, by_texels):.1f} dB i
 # ``photo_loss`` says which bitmap of the scene is looked for, and which photos there are. Then
 # ``eg.fit`` does the rest, by one Gaussian for 16 pixels if nothing else is asked for.
 
-loss = photo_loss(room(GREY), "ball.bsdf.reflectance", photos)
+loss = photo_loss(room(GREY), "ball.bsdf.reflectance", photos, sensors=range(CAMERAS))
 result = eg.fit(loss=loss, size=(TEXELS, TEXELS), iterations=STEPS, space="linear")
 result.save(folder / "paint.npz")
 by_gaussians = seen_by_the_judge(result.image)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
+from os import PathLike
 from typing import Any
 
 import drjit as dr
@@ -13,13 +14,16 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.recording import freeze_rendering
 from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
+from eigengs_dr.image.pictures import is_picture
+from eigengs_dr.image.pixels import check_encoding
 
 from .environment import texels_of
-from .follow import check_scene
+from .follow import check_scene, sensor_of
 
 JUDGED = 4
 """Photos with held-out pixels, spread over all."""
@@ -30,6 +34,7 @@ product of the differences of two independent renderings to a photo has the squa
 mean as its mean, without the noise of renderings."""
 
 
+@door
 def photo_loss(
     scene: mi.Scene,
     pictures: str | Mapping[str, str],
@@ -42,6 +47,7 @@ def photo_loss(
     bounds: tuple[float, float] | None = (0.0, 1.0),
     parameters: Any = None,
     seed: int = 0,
+    encoding: str | None = None,
 ) -> Loss:
     """Return the squared error of renderings against photos, for `eigengs_dr.fit`.
 
@@ -62,10 +68,11 @@ def photo_loss(
         of a fit is by default "linear" for three channels, and "data" for one. An ``envmap`` counts
         as a bitmap, of the space "log"; its light has no `bounds`.
     photos : sequence of array_like or tensor, shape (H, W, 3), path-like or mitsuba.Bitmap
-        Of the size of the film of its sensor each. Floats, such as those of `mitsuba.render`, are
-        linear light; codes of 8 bits are sRGB, and files what they say.
+        Of the size of the film of its sensor each. Floats in arrays, lists and tensors, such as
+        those of `mitsuba.render`, are linear light; whole numbers and pictures of Pillow are sRGB,
+        and files and bitmaps what they say. `encoding` changes that.
     sensors : sequence of sensors or numbers, optional
-        One for each photo, by default the first ones of the scene.
+        One for each photo, by default those of the scene.
     integrator : mitsuba.Integrator, optional
         By default that of the scene.
     spp : int, optional
@@ -81,7 +88,9 @@ def photo_loss(
         Of other parameters of the scene, by their names there, see `eigengs_dr.Loss`. A
         `mitsuba.ad.Adam` with the key ``"lamp.emitter.radiance.value"`` looks for a light, say.
     seed : int, optional
-        Seed of the renderings and of the choice of the pixels.
+        Seed of the renderings and of the choice of the pixels, at least 0.
+    encoding : {"srgb", "linear"}, optional
+        What the pixels of all photos are, such as "srgb" for arrays of `eigengs_dr.load_image`.
 
     Returns
     -------
@@ -90,11 +99,16 @@ def photo_loss(
     Raises
     ------
     ValueError
-        If a name is unknown, a bitmap does not hold floats, or photos and sensors do not fit
-        together.
+        If a name is unknown, a bitmap does not hold floats, photos and sensors do not fit
+        together, or the variant is spectral or polarized.
+    TypeError
+        If the scene, a sensor or the integrator is none.
 
     Notes
     -----
+    Fits repeat only about: renderers add the derivatives of a texel in the order in which their
+    threads come to it.
+
     Renderings of few samples are noisy. `mitsuba.render` gives the derivatives other random numbers
     than the picture, so that their product has the right mean.
 
@@ -114,18 +128,28 @@ def photo_loss(
     >>> result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=40)
     """
     check_scene("photo_loss", scene)
+    check_encoding(encoding)
+    _check_variant()
     if not 0 <= held_out < 1:
         raise ValueError(f"photo_loss: held_out is {held_out}; it must be in [0, 1)")
-    if spp < 1:
-        raise ValueError(f"photo_loss: spp is {spp}; it must be at least 1")
+    for name, value, least in (("spp", spp, 1), ("seed", seed, 0)):
+        if value < least:
+            raise ValueError(f"photo_loss: {name} is {value}; it must be at least {least}")
+    if bounds is not None and not np.isfinite(bounds).all():
+        raise ValueError(f"photo_loss: bounds are {bounds}; give finite ones, or None")
     known = mi.traverse(scene)
     keys = dict(pictures) if isinstance(pictures, Mapping) else {"": pictures}
     keys = {name: _data_of(known, key) for name, key in keys.items()}
     for key in parameters.keys() if parameters is not None else ():
         _check_known(known, key)
     chosen = _sensors_of(scene, sensors, len(photos))
+    integrator = scene.integrator() if integrator is None else integrator
+    if not isinstance(integrator, mi.Integrator):
+        raise TypeError(
+            f"photo_loss: integrator is {integrator!r}; give one by mi.load_dict({{'type': 'prb'}})"
+        )
     targets = [
-        _check_photo(number, photo, sensor.film().crop_size())
+        _check_photo(number, photo, sensor.film().crop_size(), encoding)
         for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
     ]
     judged = sorted({k * len(targets) // JUDGED for k in range(JUDGED)})
@@ -135,9 +159,15 @@ def photo_loss(
         mi.TensorXf(np.float32(generator.random((*target.shape[:2], 1)) < share))
         for target, share in zip(targets, shares, strict=True)
     ]
-    integrator = scene.integrator() if integrator is None else integrator
+    for number, mask in enumerate(hidden):
+        if shares[number] and not 0 < mask.numpy().mean() < 1:
+            raise ValueError(
+                f"photo_loss: held_out is {held_out:g}, which keeps no pixel of photo {number} for "
+                "the judge or for the steps; a share near 0.2 does"
+            )
     drawn = scene, known, keys, chosen, integrator, spp
-    taken = _Photos(*drawn, targets, hidden, judged, parameters, seed * STEPS_OF_A_SEED)
+    first = seed * STEPS_OF_A_SEED + seed // STEPS_OF_A_SEED  # 32 bits count
+    taken = _Photos(*drawn, targets, hidden, judged, parameters, first)
     spaces = {name: _space_of(known, key) for name, key in keys.items()}
     space = spaces if isinstance(pictures, Mapping) else spaces[""]
     judge = taken.judge if held_out else None
@@ -185,7 +215,8 @@ class _Photos:
 
     def loss(self, picture: Any, step: int) -> Any:
         """Return the squared error of the rendering of one photo."""
-        number, seed, texels = step % len(self.photos), self.first + step, self.texels(picture)
+        number, texels = step % len(self.photos), self.texels(picture)
+        seed = (self.first + step) % SEEDS
         if self.parameters is None and dr.grad_enabled(picture):
             return dr.custom(_Frozen, partial(self.slopes, number, seed), texels)
         self.known.update(texels)
@@ -201,16 +232,18 @@ class _Photos:
             # What the user differentiates gets nothing: Mitsuba would add to all derivatives.
             known = ((k, v) for k, v in self.known if k not in texels and dr.grad_enabled(v))
             others = {key: type(value)(value) for key, value in known}
-            self.known.update(leaves | {key: dr.detach(value) for key, value in others.items()})
             drawn = self.scene, self.sensors[number], self.integrator, self.spp
             seen = dr.opaque(mi.UInt32, seed), self.photos[number], 1 - self.hidden[number]
             try:
-                value = self.add_slopes(*drawn, *seen)
-            except RuntimeError:  # Dr.Jit cannot record projective integrators, say
-                self.add_slopes = _add_slopes
-                dr.clear_grad(leaves)
-                value = self.add_slopes(*drawn, *seen)
-            self.known.update(texels | others)
+                self.known.update(leaves | {key: dr.detach(value) for key, value in others.items()})
+                try:
+                    value = self.add_slopes(*drawn, *seen)
+                except RuntimeError:  # Dr.Jit cannot record projective integrators, say
+                    self.add_slopes = _add_slopes
+                    dr.clear_grad(leaves)
+                    value = self.add_slopes(*drawn, *seen)
+            finally:
+                self.known.update(texels | others)
             return value, dr.grad(leaves)
 
     def judge(self, picture: Any) -> Any:
@@ -219,8 +252,8 @@ class _Photos:
         samples = JUDGE_SAMPLES * self.spp
         means = [
             _mean(
-                self.difference(number, self.first, samples)
-                * self.difference(number, self.first + 1, samples),
+                self.difference(number, self.first % SEEDS, samples)
+                * self.difference(number, (self.first + 1) % SEEDS, samples),
                 self.hidden[number],
             )
             for number in self.judged
@@ -235,6 +268,11 @@ class _Photos:
             raise ValueError(
                 f"photo_loss: the bitmaps have the channels {_listed(self.channels)}, the pictures "
                 f"of the fit {_listed(given)}; the names and spaces of eigengs_dr.fit say them"
+            )
+        height, width = next(iter(named.values())).shape[:2]
+        if min(height, width) < 2:  # Mitsuba takes such a bitmap once, and then no other one
+            raise ValueError(
+                f"photo_loss: size is {width}x{height}; Mitsuba's bitmaps have at least 2x2 texels"
             )
         return {key: texels_of(self.known, key, named[name]) for name, key in self.keys.items()}
 
@@ -291,23 +329,35 @@ def _mean(values: Any, weight: Any) -> Any:
 STEPS_OF_A_SEED = 1 << 16
 """Random numbers of two seeds differ if steps are fewer."""
 
+SEEDS = 1 << 32
+"""Number of seeds of Mitsuba."""
+
+
+def _check_variant() -> None:
+    """Raise ValueError if texels of the current variant are no light, or have no derivatives."""
+    if mi.is_spectral or mi.is_polarized or not dr.is_diff_v(mi.Float):
+        raise ValueError(
+            f"photo_loss: the variant {mi.variant()} has spectra, polarized light or no "
+            "derivatives; load the scene in llvm_ad_rgb, cuda_ad_rgb, or one of mono"
+        )
+
 
 def _sensors_of(
     scene: mi.Scene, sensors: Sequence[mi.Sensor | int] | None, count: int
 ) -> list[mi.Sensor]:
-    """Return one sensor for each photo: those that were given, or the first ones of the scene."""
+    """Return one sensor for each photo: those that were given, or those of the scene."""
     if not count:
         raise ValueError("photo_loss: there are no photos; give one for each sensor")
     known = scene.sensors()
     if sensors is not None and len(sensors) != count:
         raise ValueError(f"photo_loss: {count} photos, but {len(sensors)} sensors")
-    if sensors is None and count > len(known):
+    if sensors is None and count != len(known):
         raise ValueError(
             f"photo_loss: {count} photos, but the scene has {len(known)} sensors; give sensors=, "
             "one for each photo"
         )
     named = range(count) if sensors is None else sensors
-    return [known[sensor] if isinstance(sensor, int) else sensor for sensor in named]
+    return [sensor_of(scene, sensor) for sensor in named]
 
 
 def _listed(channels: Mapping[str, int]) -> str:
@@ -347,11 +397,16 @@ def _space_of(known: mi.SceneParameters, key: str) -> str:
     return "linear" if known[key].shape[2] == 3 else "data"
 
 
-def _check_photo(number: int, photo: Any, size: Sequence[int]) -> mi.TensorXf:
+def _check_photo(number: int, photo: Any, size: Sequence[int], encoding: str | None) -> mi.TensorXf:
     """Return a photo as a tensor of linear light, of the size of its film."""
-    photo = photo.numpy() if dr.is_array_v(photo) else photo
-    floats = np.issubdtype(getattr(photo, "dtype", np.uint8), np.floating)
-    image = read_floats(photo, encoding="linear" if floats else None)
+    try:
+        if not isinstance(photo, str | PathLike | mi.Bitmap) and not is_picture(photo):
+            photo = np.asarray(photo)  # also of Dr.Jit, of torch, or a list
+            is_light = np.issubdtype(photo.dtype, np.floating)
+            encoding = encoding or ("linear" if is_light else None)
+        image = read_floats(photo, encoding=encoding)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"photo_loss: photo {number}: {error}") from None
     pixels = to_linear(image.pixels) if image.encoding == "srgb" else np.asarray(image.pixels)
     pixels = pixels[..., :3]
     width, height = size

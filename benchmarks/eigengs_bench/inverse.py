@@ -143,7 +143,9 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
     for _ in range(2):
         textures = {name: bitmap(mi, grey(name)) for name in names}
         loaded = scene_of(mi, scene.kind, textures, scene.cameras)
-        loss = photo_loss(loaded, names, scene.photos[: scene.cameras], spp=scene.spp)
+        cameras = range(scene.cameras)  # those of the judges follow
+        photos = [scene.photos[number] for number in cameras]
+        loss = photo_loss(loaded, names, photos, sensors=cameras, spp=scene.spp)
         size = (TEXELS, TEXELS)
         result = eg.fit(loss=loss, size=size, space=spaces, iterations=steps, progress=False)
         dr.sync_thread()
@@ -214,7 +216,9 @@ def descend(mi: Any, scene: Scene, unknown: Unknown, steps: int, frozen: bool = 
     parameters, values = mi.traverse(loaded), mi.ad.Adam(1.0, unknown.start, beta_1=MOMENTUM)
     photos = [mi.TensorXf(photo) for photo in scene.photos[: scene.cameras]]
     names = NAMES[scene.kind]
-    replayed = photo_loss(loaded, names, photos, spp=scene.spp).function if frozen else None
+    cameras = range(scene.cameras)  # those of the judges follow
+    loss = photo_loss(loaded, names, photos, sensors=cameras, spp=scene.spp)
+    replayed = loss.function if frozen else None
 
     def error(tensors: Mapping[str, Any], step: int) -> Any:
         if replayed:

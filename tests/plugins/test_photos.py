@@ -96,12 +96,14 @@ def test_the_derivative_is_a_forward_difference():
 
 
 @pytest.mark.parametrize("integrator", ["prb", "path", "direct_projective"])
-def test_frozen_steps_have_the_derivatives_of_plain_ones(integrator):
+def test_frozen_steps_have_the_derivatives_of_plain_ones(integrator, monkeypatch):
     """Though other programs run between them, and the memory of the recording is gone."""
     import drjit as dr
 
+    from eigengs_dr.backend import recording
     from eigengs_dr.plugins import photo_loss
 
+    monkeypatch.setattr(recording, "_users", set())  # no thread of another test
     scene, photos = wall(GREY), photos_of(wall(true_texture()), spp=4)
     tool = mi.load_dict({"type": integrator})
     loss = photo_loss(scene, NAME, photos, integrator=tool, spp=16)
@@ -168,17 +170,27 @@ def test_photos_that_do_not_fit_are_refused():
             "no bitmap 'wall.bsdf.reflektance'; it has wall.bsdf.ref",
         ),
         (NAME, photos + photos, "6 photos, but the scene has 3 sensors; give sensors="),
+        (NAME, photos[:2], "2 photos, but the scene has 3 sensors; give sensors="),
         (NAME, [], "there are no photos"),
-        (NAME, [GREY], r"photo 0 has shape \(32, 32, 3\), but its film has 24x24"),
-        (NAME, [np.full_like(photos[0], np.nan)], "not finite"),
+        (NAME, [GREY] * 3, r"photo 0 has shape \(32, 32, 3\), but its film has 24x24"),
+        (NAME, [*photos[:2], np.full_like(photos[0], np.nan)], "photo 2: .*not finite|photo 2 has"),
+        (NAME, [*photos[:2], "none.png"], "photo 2: none.png"),
+        (NAME, [*photos[:2], [[1], [2, 3]]], "photo 2: "),
     ):
         with pytest.raises(ValueError, match=message):
             photo_loss(scene, name, given)
     light = mi.ad.Adam(lr=0.1, params={"sky.radiance": mi.Float(1)})
     for options, message in (
         ({"sensors": [0, 1]}, "3 photos, but 2 sensors"),
+        ({"sensors": [0, 1, 5]}, "there is no sensor 5; the scene has 3"),
         ({"held_out": 1}, "held_out is 1"),
+        ({"held_out": 1e-9}, "held_out is 1e-09, which keeps no pixel of photo 0"),
+        ({"held_out": 0.9999}, "held_out is 0.9999, which keeps no pixel of photo 0"),
         ({"spp": 0}, "spp is 0"),
+        ({"spp": 2.0}, "spp is 2.0; it must be a whole number"),
+        ({"seed": -1}, "seed is -1; it must be at least 0"),
+        ({"bounds": (0, np.inf)}, "bounds are .*; give finite ones"),
+        ({"encoding": "x"}, "encoding 'x' is unknown"),
         ({"parameters": light}, "no parameter 'sky.radiance'; did you mean 'sky.radiance.value'"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -187,6 +199,74 @@ def test_photos_that_do_not_fit_are_refused():
     for space, message in (("data", "channels 3, .* fit 1"), ({"a": "linear"}, "fit a 3")):
         with pytest.raises(ValueError, match=message):
             eg.fit(loss=loss, size=(8, 8), gaussians=5, iterations=4, space=space)
+    for options, message in (
+        ({"integrator": "path"}, "integrator is 'path'; give one by mi.load_dict"),
+        ({"sensors": [0, 1, "front"]}, "'front' is no sensor"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            photo_loss(scene, NAME, photos, **options)
+
+
+@pytest.mark.parametrize("name", ["llvm_ad_spectral", "llvm_ad_mono_polarized", "llvm_rgb"])
+def test_variants_whose_texels_are_no_light_are_refused(name):
+    from eigengs_dr.plugins import photo_loss
+
+    if name not in mi.variants():
+        pytest.skip(f"Mitsuba has no {name}")
+    mi.set_variant(name)
+    scene = mi.load_dict({"type": "scene"})
+    with pytest.raises(ValueError, match=f"the variant {name} has"):
+        photo_loss(scene, NAME, [GREY])
+
+
+@pytest.mark.parametrize("size", [(9, 1), (1, 9)])
+def test_a_picture_of_one_row_leaves_the_scene_as_it_is(size):
+    """Mitsuba would take it once, and then refuse all others."""
+    import drjit as dr
+
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), [GREY[:SIDE, :SIDE]] * 3
+    values = mi.traverse(scene)
+    dr.enable_grad(values["sky.radiance.value"])
+    values.update()
+    loss = photo_loss(scene, NAME, photos)
+    with pytest.raises(ValueError, match=f"size is {size[0]}x{size[1]}; .* at least 2x2"):
+        eg.fit(loss=loss, size=size, gaussians=1, iterations=4)
+    assert dr.grad_enabled(mi.traverse(scene)["sky.radiance.value"])
+    eg.fit(loss=loss, size=(8, 8), gaussians=1, iterations=4)
+    assert dr.grad_enabled(mi.traverse(scene)["sky.radiance.value"])
+
+
+def test_the_derivatives_of_the_user_survive_an_error(monkeypatch):
+    import drjit as dr
+
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), [GREY[:SIDE, :SIDE]] * 3
+    values = mi.traverse(scene)
+    dr.enable_grad(values["sky.radiance.value"])
+    values.update()
+    loss = photo_loss(scene, NAME, photos)
+
+    def fail(*arguments):
+        raise MemoryError("full")
+
+    monkeypatch.setattr(loss.function.__self__, "add_slopes", fail)
+    with pytest.raises(MemoryError, match="full"):
+        eg.fit(loss=loss, size=(8, 8), gaussians=1, iterations=4)
+    assert dr.grad_enabled(mi.traverse(scene)["sky.radiance.value"])
+
+
+def test_seeds_and_sensors_are_any_whole_numbers():
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photo, values = wall(GREY), GREY[:SIDE, :SIDE] + 0.1, set()
+    for seed in (0, 3, 65535, 65536, 2**31, np.int64(70000)):
+        loss = photo_loss(scene, NAME, [photo], sensors=[np.int64(1)], seed=seed, spp=np.int32(1))
+        value = loss.function(mi.TensorXf(GREY), 2**16 - 1)
+        values.add(float(np.ravel(value.numpy())[0]))
+    assert len(values) == 6
 
 
 def test_bitmaps_of_bytes_are_refused(tmp_path):
@@ -203,18 +283,28 @@ def test_bitmaps_of_bytes_are_refused(tmp_path):
 
 
 def test_photos_are_light_or_codes():
-    """Of floats, of 8 bits, or of a file: the derivative of the first step is the same."""
+    """Of floats in any container, of 8 bits, or of a bitmap: the same value in the first step."""
     from eigengs_dr.plugins import photo_loss
 
     scene = wall(GREY)
     codes = np.full((SIDE, SIDE, 3), 128, np.uint8)
     light = eg.image.color.to_linear(codes.astype(np.float32) / 255)
     picture = mi.TensorXf(GREY)
-    values = [
-        float(np.ravel(photo_loss(scene, NAME, [photo]).function(picture, 0).numpy())[0])
-        for photo in (light, codes, mi.Bitmap(light))
-    ]
+
+    class OfTorch:
+        """A tensor of another package."""
+
+        def __array__(self, dtype=None, copy=None):
+            return light
+
+    def value(photo, encoding=None):
+        loss = photo_loss(scene, NAME, [photo], sensors=[0], encoding=encoding)
+        return float(np.ravel(loss.function(picture, 0).numpy())[0])
+
+    alike = (light, codes, mi.Bitmap(light), light.tolist(), OfTorch(), mi.TensorXf(light))
+    values = [*map(value, alike), value(np.float32(codes / 255), "srgb"), value(codes, "srgb")]
     np.testing.assert_allclose(values, values[0], rtol=1e-4)
+    assert value(codes, "linear") > 1.5 * values[0] or value(codes, "linear") < values[0] / 1.5
 
 
 def test_an_environment_map_is_recovered():
