@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import rcp
+from eigengs_dr.backend.doors import door
+from eigengs_dr.backend.messages import warn
 from eigengs_dr.backend.types import Bool, Float
 
 from .versions import Interaction, footprint_of, has_footprints
@@ -20,6 +22,7 @@ PIXEL = 0.4
 blur by 0.29 (a box); at 0.4, one sample of a receding plane came closest to the mean of 1,024."""
 
 
+@door
 def pixel_angle(sensor: mi.Sensor) -> float:
     """Return the angle of a pixel in the centre of a perspective image, for ``prefilter``.
 
@@ -62,13 +65,17 @@ def footprint_inputs() -> tuple[str, ...]:
     return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *carried)
 
 
-def seen_metric(si: Interaction, inverse: tuple, angle: Float | None) -> tuple[list, Bool]:
+def seen_metric(
+    si: Interaction, inverse: tuple, angle: Float | None, plugin: str
+) -> tuple[list, Bool]:
     """Return the metric of the renderer's footprint, or of the cone's where there is none.
 
     Parameters
     ----------
     si, inverse, angle
         As for `metric`. Without an angle, surfaces without a footprint have no metric.
+    plugin : str
+        Name of the plugin, for messages.
 
     Returns
     -------
@@ -78,22 +85,43 @@ def seen_metric(si: Interaction, inverse: tuple, angle: Float | None) -> tuple[l
     Raises
     ------
     ValueError
-        If there is no angle, and rays carry no footprints.
+        As for `no_metric`, if there is no angle, and rays carry no footprints.
     """
     footprint = footprint_of(si)
     if footprint is None:
-        if angle is None:
-            raise ValueError(
-                "gaussian_texture: prefilter = true needs a sensor, since rays of Mitsuba "
-                f"{mi.__version__} carry no footprints; call eigengs_dr.plugins.follow(scene, "
-                "sensor), or render by 'eigengs-dr scene'"
-            )
-        return metric(si, inverse, angle)
+        return metric(si, inverse, angle) if angle is not None else no_metric(plugin)
     entries, present = footprint_metric(footprint, inverse)
     if angle is None:
         return entries, present
     others, valid = metric(si, inverse, angle)
     return [dr.select(present, e, o) for e, o in zip(entries, others, strict=True)], present | valid
+
+
+def no_metric(plugin: str) -> tuple[list, Bool]:
+    """Return the metric of lookups at points, for a plugin that is to follow a sensor and has none.
+
+    Dr.Jit records the lookups of all scenes that are alive: an error in a scene that only waits to
+    be rendered would end the renderings of all others.
+
+    Raises
+    ------
+    ValueError
+        Outside of recordings.
+
+    Warns
+    -----
+    UserWarning
+        In a recording.
+    """
+    text = (
+        f"{plugin}: prefilter = true needs a sensor, since rays of Mitsuba {mi.__version__} carry "
+        "no footprints; call eigengs_dr.plugins.follow(scene, sensor), or render by 'eigengs-dr "
+        "scene'"
+    )
+    if not dr.flag(dr.JitFlag.SymbolicScope):
+        raise ValueError(text)
+    warn(f"{text}. Until then it looks at points")
+    return [mi.Float(0)] * 3, mi.Bool(False)
 
 
 def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Bool]:

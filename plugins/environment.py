@@ -9,15 +9,17 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.arrays import types_of, upload
+from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.gaussian.gaussians import Fitted, Gaussians
 from eigengs_dr.image.color import rendered_as, to_linear
 from eigengs_dr.raster.render import render
 
-from .parameters import plugin_of
+from .parameters import given, plugin_of
 from .versions import columns_beyond
 
 
+@door
 def environment_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     """Return a set as the dictionary of a ``gaussian_environment``, for `mitsuba.load_dict`.
 
@@ -26,7 +28,8 @@ def environment_of(gaussians: Gaussians | Fitted, **properties: object) -> Recor
     gaussians : Gaussians or Fit
         A set of light in equirectangular projection: twice as wide as high.
     **properties
-        Other properties of the emitter: ``scale``, ``to_world``, ``prefilter``, ``cutoff``.
+        Other properties of the emitter: ``scale``, ``to_world``, ``prefilter``, ``cutoff``. None
+        stands for the default.
 
     Returns
     -------
@@ -75,6 +78,7 @@ def texels_of(parameters: mi.SceneParameters, key: str, picture: Tensor) -> Tens
     return mi.TensorXf(light, (height, width + left + right, channels))
 
 
+@door
 def bake_environment(
     gaussians: Gaussians, width: int | None = None, height: int | None = None, **properties: object
 ) -> Record:
@@ -122,7 +126,7 @@ def bake_environment(
     picture = render(_from_pole_to_pole(gaussians, height), width, height).numpy()
     light = to_linear(picture) if encoding == "srgb" else picture
     bitmap = mi.Bitmap(np.maximum(light, 0).astype(np.float32))
-    return {"type": "envmap", "bitmap": bitmap, **properties}
+    return {"type": "envmap", "bitmap": bitmap, **given(properties)}
 
 
 def _from_pole_to_pole(gaussians: Gaussians, rows: int) -> Gaussians:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from numbers import Integral
+
 import mitsuba as mi
 
+from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.messages import warn
 
 from .cone import pixel_angle
@@ -13,6 +16,7 @@ CLOSE = 1.25
 """Ratio of a prefilter to the angle of a pixel up to which nobody sees the difference."""
 
 
+@door
 def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
     """Set the prefilter of all Gaussian textures and environments of a scene to a sensor's pixels.
 
@@ -30,9 +34,9 @@ def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
     Raises
     ------
     ValueError
-        If the sensor has no field of view.
+        If the sensor has no field of view, or the scene no sensor of this number.
     TypeError
-        If the scene is none.
+        If the scene or the sensor is none.
 
     Examples
     --------
@@ -45,8 +49,9 @@ def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
     >>> follow(scene)
     """
     check_scene("follow", scene)
+    sensor = sensor_of(scene, sensor)
     for plugin in plugins_of(scene):
-        plugin.follow(sensor_of(scene, sensor))
+        plugin.follow(sensor)
 
 
 def follow_where_asked(scene: mi.Scene, sensor: mi.Sensor | int) -> None:
@@ -72,8 +77,23 @@ def follow_where_asked(scene: mi.Scene, sensor: mi.Sensor | int) -> None:
 
 
 def sensor_of(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
-    """Return a sensor, or that of a number in the scene."""
-    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+    """Return a sensor, or that of a number in the scene.
+
+    Raises
+    ------
+    ValueError
+        If the scene has no sensor of this number.
+    TypeError
+        If it is neither.
+    """
+    if isinstance(sensor, mi.Sensor):
+        return sensor
+    if isinstance(sensor, bool) or not isinstance(sensor, Integral):
+        raise TypeError(f"{sensor!r} is no sensor; give one, or its number in the scene")
+    known, number = scene.sensors(), int(sensor)
+    if not -len(known) <= number < len(known):
+        raise ValueError(f"there is no sensor {number}; the scene has {len(known)}")
+    return known[number]
 
 
 def check_scene(function: str, scene: object) -> None:

@@ -21,7 +21,7 @@ from eigengs_dr.raster.lookup.points import axes_of, fold
 
 from . import properties
 from .color import luminance, upsample
-from .cone import PIXEL
+from .cone import PIXEL, no_metric
 from .emission import Spacing, light_at, make_survey
 from .importance import SIDE, importance_of
 from .memory import resident_bytes
@@ -182,10 +182,7 @@ def gaussian_environment() -> type:
                 return None
             angle = self.pixel()
             if angle is None:
-                raise ValueError(
-                    f"{self.label()}: prefilter = true needs a sensor; call "
-                    "eigengs_dr.plugins.follow(scene, sensor), or render by 'eigengs-dr scene'"
-                )
+                return no_metric(self.label())
             sharp = rcp(PIXEL * angle)
             along = 2 * dr.pi * dr.sin(dr.detach(uv.y) * dr.pi) * sharp
             down = (dr.pi * self.height / (self.height - 1)) * sharp

@@ -165,7 +165,7 @@ def gaussian_texture() -> type:
             # B of a transform with the rows of B^-1
             turned = self.transform.inverse_transpose
             inverse = tuple(turned[j, i] for i in range(2) for j in range(2))
-            seen = seen_metric(si, inverse, self.pixel())
+            seen = seen_metric(si, inverse, self.pixel(), self.label())
             if self.wrap == "clamp":  # a footprint beyond the border may see what lies inside
                 u, v = self.transform @ si.uv
                 x, y = (

@@ -10,12 +10,14 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.detail import indices_of
+from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.types import DrJitArray
 
 from .emission import Emission
 from .versions import Texture
 
 
+@door
 def resident_bytes(texture: Texture) -> int:
     """Return the bytes of the arrays that a texture or an environment holds between renderings.
 

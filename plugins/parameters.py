@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eigengs_dr.backend.arrays import types_of, upload
+from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.channels import slices
@@ -33,6 +34,7 @@ from eigengs_dr.raster.render import decode_parameters
 Arrays = Record
 
 
+@door
 def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     """Return a set as the dictionary of a ``gaussian_texture``, for `mitsuba.load_dict`.
 
@@ -41,7 +43,7 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     gaussians : Gaussians or Fit
     **properties
         Other properties of the texture: ``wrap_mode``, ``to_uv``, ``raw``, ``prefilter``,
-        ``cutoff``.
+        ``cutoff``. None stands for the default.
 
     Returns
     -------
@@ -71,10 +73,16 @@ def plugin_of(plugin: str, gaussians: Gaussians | Fitted, **properties: object) 
         "height": gaussians.height,
         "space": gaussians.space,
         "cutoff": gaussians.cutoff,
-        **properties,
+        **given(properties),
     }
 
 
+def given(properties: Record) -> Record:
+    """Return the properties that are not None, which would end the process in Mitsuba 3.9."""
+    return {name: value for name, value in properties.items() if value is not None}
+
+
+@door
 def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians) -> Gaussians:
     """Read a set back from the parameters of a texture, differentiably.
 
@@ -83,7 +91,8 @@ def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians
     parameters : dict-like
         A `mitsuba.SceneParameters`, or an optimiser.
     texture : str
-        Name of the texture in `parameters`, such as ``"poster.bsdf.reflectance"``.
+        Name of the texture in `parameters`, such as ``"poster.bsdf.reflectance"``; "" for those of
+        a texture alone.
     like : Gaussians
         The set that the texture was made from. It gives the size, the space and the tensors that
         `parameters` lacks.
@@ -100,6 +109,7 @@ def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians
     return from_tensors(_tensors_in(parameters, texture), like)
 
 
+@door
 def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians) -> None:
     """Project the parameters of a texture into their bounds, after a step of an optimiser.
 
@@ -114,11 +124,15 @@ def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians
     tensors = _tensors_in(parameters, texture)
     bounded = to_tensors(dr.detach(from_tensors(tensors, like)).bounded())
     for name in tensors:
-        parameters[f"{texture}.{name}"] = bounded[name]
+        parameters[_key(texture, name)] = bounded[name]
+
+
+def _key(texture: str, name: str) -> str:
+    return f"{texture}.{name}" if texture else name
 
 
 def _tensors_in(parameters: Mapping[str, object], texture: str) -> Arrays:
-    keys = {name: f"{texture}.{name}" for name in FIELDS}
+    keys = {name: _key(texture, name) for name in FIELDS}
     found = {name: parameters[key] for name, key in keys.items() if key in parameters}
     if not found:
         raise ValueError(

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from eigengs_dr.backend.arguments import plain_numbers, takes_numbers
+from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.recording import freeze_rendering
 from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.image.color import to_linear
@@ -23,7 +23,7 @@ from eigengs_dr.image.pictures import is_picture
 from eigengs_dr.image.pixels import ImageError, check_encoding, reason_of
 
 from .environment import texels_of
-from .follow import check_scene
+from .follow import check_scene, sensor_of
 
 JUDGED = 4
 """Photos with held-out pixels, spread over all."""
@@ -34,7 +34,7 @@ product of the differences of two independent renderings to a photo has the squa
 mean as its mean, without the noise of renderings."""
 
 
-@takes_numbers
+@door
 def photo_loss(
     scene: mi.Scene,
     pictures: str | Mapping[str, str],
@@ -361,19 +361,7 @@ def _sensors_of(
         raise TypeError(f"photo_loss: sensors is {named!r}; give a list, one for each photo")
     if len(named) != count:
         raise ValueError(f"photo_loss: {count} photos, but {len(named)} sensors")
-    return [_sensor_of(known, sensor) for sensor in named]
-
-
-def _sensor_of(known: Sequence[mi.Sensor], sensor: Any) -> mi.Sensor:
-    """Return a sensor, or that of a number in the scene."""
-    if isinstance(sensor, mi.Sensor):
-        return sensor
-    number = plain_numbers({"sensors": sensor}, {"sensors": "int"})["sensors"]
-    if not 0 <= number < len(known):
-        raise ValueError(
-            f"photo_loss: sensors name {number}; those of the scene are 0 to {len(known) - 1}"
-        )
-    return known[number]
+    return [sensor_of(scene, sensor) for sensor in named]
 
 
 def _listed(channels: Mapping[str, int]) -> str:

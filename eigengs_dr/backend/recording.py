@@ -60,7 +60,7 @@ _calls = 0
 
 _flushes = 0
 """Number of times that `drjit.flush_kernel_cache` was noticed, see `_count_flushes`."""
-_misses = 0, 0
+_misses: tuple[int, ...] = ()
 """`kernel_misses` when `_count_flushes` last looked."""
 OUR_KERNEL = 0x2D6A55
 """A constant that makes a kernel unlike all others."""
@@ -234,7 +234,7 @@ def record(function: Program) -> Program:
     return call
 
 
-def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Program], Program]:
+def _freeze(function: Program, limit: int | None = None) -> tuple[dict, Program]:
     """Freeze a function by `drjit.freeze`, once for each shape of its arguments.
 
     Parameters
@@ -250,7 +250,7 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Pr
     call : callable
         Takes the arguments of `function`; `exclusive`, with the collector off.
     """
-    programs: dict[Shape, tuple[Program, list[Shape]]] = {}
+    programs: dict[Shape, tuple[Program, list[Shape]]] = {}  # the last one used comes last
     flushes = 0
 
     def freeze(shape: Shape) -> tuple[Program, list[Shape]]:
@@ -273,7 +273,7 @@ def _freeze(function: Program, limit: int | None = None) -> tuple[dict[Shape, Pr
             if flushes != _flushes:
                 programs.clear()
                 flushes = _flushes
-            programs[shape] = programs.pop(shape, None) or freeze(shape)  # the last one used
+            programs[shape] = programs.pop(shape) if shape in programs else freeze(shape)
             if limit is not None and len(programs) > limit:
                 _retire([programs.pop(next(iter(programs)))].clear)
             program, result = programs[shape]

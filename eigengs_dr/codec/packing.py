@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -134,13 +135,12 @@ def pack(
     maps, display, compared = compare(source, image, encoding)
     weighted = scale_channels(source, channel_weights(maps)) if maps else source
     attempt, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
-    figure: float | dict[str, float] = psnr_from_mse(attempt.error)
-    packed = attempt.packed._replace(maps=maps)
-    if image is not None and not maps:
-        packed = packed._replace(psnr=figure)
-    size = write(output, packed)
+    seen = psnr_from_mse(attempt.error)
+    stored = seen if image is not None and not maps else math.nan
+    size = write(output, attempt.packed._replace(maps=maps, psnr=stored))
     rounded = Gaussians.load(output, types_of(source.mean).backend)
     after = psnr_from_mse(max(attempt.error + compared.extra_error, MIN_MSE))
+    figure: float | dict[str, float] = seen
     if maps:
         pictures = picture_of(rounded)
         pairs = zip(maps, display, strict=True)

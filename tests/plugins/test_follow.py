@@ -6,7 +6,7 @@ import pytest
 
 from _helpers.errors import refused
 from _helpers.texture import at, gaussians, in_front, mi, small_scene, texture
-from eigengs_dr.plugins import follow, pixel_angle, texture_of
+from eigengs_dr.plugins import environment_of, follow, pixel_angle, texture_of
 from eigengs_dr.plugins.follow import follow_where_asked
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -72,6 +72,43 @@ def test_true_waits_for_a_sensor():
     tex = texture(gaussians("linear"), prefilter=True)
     with refused(ValueError, "prefilter = true needs a sensor"):
         tex.eval(in_front(at(0.5, 0.5)))
+
+
+@pytest.mark.parametrize("kind", ["texture", "environment"])
+def test_a_scene_that_waits_for_a_sensor_leaves_others_alone(kind):
+    """Dr.Jit records the lookups of all scenes that are alive."""
+    plain = scene_with(0.0)
+    alone = picture(plain)
+    if kind == "texture":
+        waits = scene_with(True)
+    else:
+        light = environment_of(gaussians("linear"), prefilter=True)
+        waits = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "light": light})
+    with pytest.warns(UserWarning, match=f"{kind}.*: prefilter = true needs a sensor.*at points"):
+        seen = picture(plain)
+    np.testing.assert_array_equal(seen, alone)
+    follow(waits)
+    np.testing.assert_array_equal(picture(plain), alone)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "error", "message"),
+    [("x", TypeError, "'x' is no sensor"), (3, ValueError, "there is no sensor 3; the scene has")],
+)
+def test_what_is_no_sensor_is_refused(sensor, error, message):
+    """Though nothing of the scene would follow it."""
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
+    with refused(error, message):
+        follow(scene, sensor)
+
+
+def test_none_stands_for_the_default():
+    """It ends the process in Mitsuba."""
+    g = gaussians("linear")
+    for make in (texture_of, environment_of):
+        given = make(g, prefilter=None, cutoff=None)
+        assert "prefilter" not in given and given["cutoff"] == g.cutoff
+        mi.load_dict(given)
 
 
 def test_all_textures_of_the_scene():

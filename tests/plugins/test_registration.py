@@ -1,5 +1,7 @@
 """Where plugins are found, and scenes that Mitsuba loads in threads of its own."""
 
+import threading
+
 import pytest
 
 import eigengs_dr as eg
@@ -84,3 +86,28 @@ def test_textures_of_files_load_while_the_caller_holds_the_lock(tmp_path):
     """
     done = run_python(LOAD.replace("FOLDER", str(tmp_path)))
     assert done.stdout.startswith("12 "), done.stderr
+
+
+def test_a_block_keeps_the_scenes_that_another_thread_drops():
+    """Mitsuba renders without Python's lock: what the thread frees would end the process."""
+    from eigengs_dr.backend.recording import exclusive
+    from eigengs_dr.plugins.living import living_objects
+
+    mi.set_variant("llvm_ad_rgb")
+    eg.register_plugins()
+    before, others = len(living_objects()), []
+
+    def load():
+        with exclusive():
+            others.append(mi.load_dict({"type": "scene", "ball": {"type": "sphere"}}))
+
+    def in_thread(function):
+        thread = threading.Thread(target=function)
+        thread.start()
+        thread.join()
+
+    in_thread(load)
+    with exclusive():
+        in_thread(others.clear)
+        assert len(living_objects()) > before
+    assert len(living_objects()) == before
