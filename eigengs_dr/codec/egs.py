@@ -4,8 +4,8 @@ All numbers are little endian. The file starts with a header (`_HEADER`), the ba
 checksum; the header of a set with maps is followed by their table.
 
 The sections follow, each coded separately. A section starts with its number of Gaussians, its
-length and its checksum (`HEAD`). Its body holds a byte, 1 if it has all weights and not just the
-first ones, the weights (`eigengs_dr.codec.weights`), and the words of a range coder: the cells
+length and its checksum (`HEAD`). Its body holds a byte (`RICH` and an index into `EVENNESS`), the
+weights of a model (`eigengs_dr.codec.weights`), and the words of a range coder: the cells
 (`eigengs_dr.codec.cells`), then all other integers (`eigengs_dr.codec.gaussian_model`).
 """
 
@@ -31,7 +31,7 @@ from ..storage.atomic import atomic_write
 from ..storage.memory import check_content
 from ..storage.npz import BadValue
 from . import weights
-from .cells import MAX_LEVELS, code_cells, hilbert_encode
+from .cells import EVENNESS, MAX_LEVELS, code_cells, hilbert_encode
 from .gaussian_model import GaussianCoder
 from .quantization import Steps, Symbols, dequantize
 from .range_coder import Decoder, Encoder
@@ -56,6 +56,9 @@ HEAD = struct.Struct("<III")
 
 DECODING, DECODING_CHANNEL = 384, 20
 """Memory that decoding takes in bytes, per Gaussian and for each of its channels, as measured."""
+
+RICH = 0x80
+"""Flag of a section that stores all weights, not just the first ones."""
 
 
 class EgsContent(NamedTuple):
@@ -176,19 +179,27 @@ def section_to_bytes(section: Symbols, steps: Steps, corner: Integers, levels: i
     numbers = np.column_stack(section[1:])
     order = np.lexsort([*numbers.T[::-1], hilbert_encode(cells, levels)])
     symbols = section._replace(cell=cells).select(order)
+    evenness = min(range(len(EVENNESS)), key=lambda k: len(_cells(cells, levels, k).to_bytes()))
     choices = [True, False] if count < weights.MIN_RICH_COUNT else [True]
-    body = min((_body(symbols, steps, levels, rich) for rich in choices), key=len)
+    body = min((_body(symbols, steps, levels, evenness, rich) for rich in choices), key=len)
     body = body.ljust(count, b"\0")  # a reader expects at least one byte per Gaussian
     return HEAD.pack(count, len(body), section_check(count, body)) + body
 
 
-def _body(symbols: Symbols, steps: Steps, levels: int, rich: bool) -> bytes:
-    """Return the body of a section, with all weights or only the first ones."""
+def _cells(cells: Integers, levels: int, evenness: int) -> Encoder:
+    """Return an encoder that has coded cells with the given entry of `EVENNESS`."""
     coder = Encoder()
-    code_cells(coder, symbols.cell, levels)
+    code_cells(coder, cells, levels, EVENNESS[evenness])
+    return coder
+
+
+def _body(symbols: Symbols, steps: Steps, levels: int, evenness: int, rich: bool) -> bytes:
+    """Return the body of a section, with all weights or only the first ones."""
+    coder = _cells(symbols.cell, levels, evenness)
     gaussian_coder = GaussianCoder(coder, symbols.cell, rich=rich)
     gaussian_coder.code(symbols, steps)
-    return bytes([rich]) + weights.to_bytes(gaussian_coder.weights, rich) + coder.to_bytes()
+    head = bytes([evenness | RICH * rich]) + weights.to_bytes(gaussian_coder.model, rich)
+    return head + coder.to_bytes()
 
 
 def section_check(count: int, body: bytes) -> int:
@@ -342,13 +353,14 @@ def decode_body(body: bytes, splats: int, channels: int, levels: int, steps: Ste
     BadValue
         If `section_to_bytes` cannot have written the body.
     """
-    if body[0] > 1:
+    rich, evenness = bool(body[0] & RICH), body[0] & ~RICH
+    if evenness >= len(EVENNESS):
         raise BadValue("the first byte is unknown")
-    model, codes = weights.from_bytes(body[1:], channels, rich=bool(body[0]))
+    model, codes = weights.from_bytes(body[1:], channels, rich)
     coder = Decoder(codes[: len(codes) // 4 * 4])  # a short body is padded
     with np.errstate(all="ignore"):  # the weights are not trusted
         scalars, pairs = np.zeros(splats, np.int64), np.zeros((splats, 2), np.int64)
-        cells = code_cells(coder, pairs, levels)
+        cells = code_cells(coder, pairs, levels, EVENNESS[evenness])
         cells = cells[np.argsort(hilbert_encode(cells, levels), kind="stable")]
         colors = np.zeros((splats, channels), np.int64)
         unknown = Symbols(cells, pairs, colors, scalars, scalars, scalars)

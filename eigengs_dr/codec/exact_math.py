@@ -74,6 +74,19 @@ def cos_turns(x: Doubles) -> Doubles:
     return sin_turns(x + 0.25)
 
 
+def angle_in_turns(y: Doubles, x: Doubles) -> Doubles:
+    """Return the angle of (x, y) in turns, in [-0.5, 0.5], with an error of 1e-10."""
+    larger, smaller = np.maximum(np.abs(x), np.abs(y)), np.minimum(np.abs(x), np.abs(y))
+    t = smaller / np.where(larger > 0, larger, 1.0)
+    for _ in range(2):  # tan(a / 2) from tan(a), twice
+        t = t / (1 + np.sqrt(1 + t * t))
+    terms = [(-1) ** k / (2 * k + 1) for k in range(12)]  # for t up to tan(pi / 16)
+    angle = 4 * 0.15915494309189535 * t * _polynomial(terms, t * t)  # 1 / (2 pi)
+    angle = np.where(np.abs(y) > np.abs(x), 0.25 - angle, angle)
+    angle = np.where(x < 0, 0.5 - angle, angle)
+    return np.where(y < 0, -angle, angle)
+
+
 def _polynomial(coefficients: tuple[float, ...] | list[float], x: Doubles) -> Doubles:
     """Return ``sum_k c_k x^k`` by Horner's rule."""
     total = np.full(np.shape(x), coefficients[-1])

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from ..backend.types import Doubles
+from ..backend.types import Doubles, Integers
 from ..storage.npz import BadValue
 from .exact_math import in_order
+from .range_coder import TAILS
 
 MIN_WIDTH = 0.1
 """Smallest width of a distribution, in steps."""
+
+WIDTH_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2)
+"""Factors of the mean absolute error that are tried as the width."""
+
+CLASSES = 15
+"""Number of classes of directions, see `Directions` in `eigengs_dr.codec.gaussian_model`."""
 
 MIN_RICH_COUNT = 1500
 """Number of Gaussians below which all weights may take more bytes than they save."""
@@ -24,19 +32,35 @@ class Weights(NamedTuple):
     ----------
     center, width : ndarray of float64
         Weights of the features, see `eigengs_dr.codec.gaussian_model`.
+    tails : int
+        One of `eigengs_dr.codec.range_coder.TAILS`.
     """
 
     center: Doubles
     width: Doubles
+    tails: int
+
+
+@dataclass
+class Model:
+    """All parameters that a section stores besides the integers.
+
+    Attributes
+    ----------
+    weights : list of Weights
+        For each channel, for the scale, and for the stretch.
+    sharpness : ndarray of int64, shape (CLASSES,)
+        Concentration of directions around those of the neighbours, from 0 to 255.
+    """
+
+    weights: list[Weights] = field(default_factory=list)
+    sharpness: Integers = field(default_factory=lambda: np.zeros(CLASSES, np.int64))
 
 
 def feature_counts(channels: int) -> list[tuple[int, int]]:
-    """Return the number of features of the centre and of the width, for each `Weights`.
-
-    These are of the channels, the scale and the stretch.
-    """
-    colors = [(1 + 2 * min(k, 2), 2 + 2 * min(k, 2)) for k in range(channels)]
-    return [*colors, (4, 2), (4, 2)]
+    """Return the number of features of the centre and of the width, for each `Weights`."""
+    colors = [(1 + 2 * min(k, 2), 4 + 2 * min(k, 2)) for k in range(channels)]
+    return [*colors, (7, 2), (5, 2)]
 
 
 def fit_weights(
@@ -65,7 +89,9 @@ def fit_weights(
         error = values - in_order(center_weights[:, None] * center.T)
         width_weights[used] = _fit_width(width[:, used], np.abs(error) + 0.1 * step, deviation)
         deviation = np.maximum(in_order(width_weights[:, None] * width.T), MIN_WIDTH * step)
-    return Weights(center_weights, stored_width(width_weights))
+    trials = [(w, tails) for tails in TAILS for w in WIDTH_FACTORS]
+    best = min(trials, key=lambda trial: _bits(error / step, trial[0] * deviation / step, trial[1]))
+    return Weights(center_weights, stored_width(width_weights * best[0]), best[1])
 
 
 def _fit_width(features: Doubles, error: Doubles, deviation: Doubles) -> Doubles:
@@ -73,6 +99,13 @@ def _fit_width(features: Doubles, error: Doubles, deviation: Doubles) -> Doubles
     from scipy.optimize import nnls  # imported here, because decoders do not need it
 
     return np.asarray(nnls(features / deviation[:, None], error / deviation)[0])
+
+
+def _bits(error: Doubles, width: Doubles, tails: int) -> float:
+    """Estimate the bits that errors, in steps, take with a distribution."""
+    t = error / width
+    density = np.log2(width) + 0.5 * (tails + 1) * np.log2(1 + t * t / tails)
+    return float(density.sum()) + len(t) * {2: 1.5, 4: 1.415, 8: 1.369}[tails]
 
 
 def stored_center(weights: Doubles) -> Doubles:
@@ -86,26 +119,39 @@ def stored_width(weights: Doubles) -> Doubles:
     return ((half + 0x80) & 0xFF00).astype("<u2").view("<f2").astype(np.float64)
 
 
-def to_bytes(weights: list[Weights], rich: bool) -> bytes:
-    """Return the bytes of the weights; if they are not rich, only of the first ones."""
+def to_bytes(model: Model, rich: bool) -> bytes:
+    """Return the bytes of a model; if it is not rich, only of the first weights."""
     used, parts = slice(None) if rich else slice(0, 1), list[bytes]()
-    for center, width in weights:
-        high = width[used].astype("<f2").view("<u2") >> 8
-        parts += [center[used].astype("<f2").tobytes(), high.astype(np.uint8).tobytes()]
+    for weights in model.weights:
+        high = weights.width[used].astype("<f2").view("<u2") >> 8
+        parts.append(bytes([TAILS.index(weights.tails)]))
+        parts += [weights.center[used].astype("<f2").tobytes(), high.astype(np.uint8).tobytes()]
+    if rich:
+        parts.append(model.sharpness.astype(np.uint8).tobytes())
     return b"".join(parts)
 
 
-def from_bytes(data: bytes, channels: int, rich: bool) -> tuple[list[Weights], bytes]:
-    """Return weights and the bytes after them; the bytes need not be trusted."""
-    found = []
-    for numbers in feature_counts(channels):
-        centers, widths = numbers if rich else (1, 1)
-        if 2 * centers + widths > len(data):
+def from_bytes(data: bytes, channels: int, rich: bool) -> tuple[Model, bytes]:
+    """Return a model and the bytes after it; the bytes need not be trusted."""
+    model = Model()
+
+    def take(count: int) -> bytes:
+        nonlocal data
+        if count > len(data):
             raise BadValue("the weights are truncated")
+        taken, data = data[:count], data[count:]
+        return taken
+
+    for numbers in feature_counts(channels):
+        used = numbers if rich else (1, 1)
+        [tails] = take(1)
+        if tails >= len(TAILS):
+            raise BadValue("the weights name an unknown distribution")
         center, width = np.zeros(numbers[0]), np.zeros(numbers[1])
-        center[:centers] = np.frombuffer(data, "<f2", centers)
-        high = np.frombuffer(data, np.uint8, widths, 2 * centers).astype("<u2") << 8
-        width[:widths] = high.view("<f2")
-        found.append(Weights(center, width))
-        data = data[2 * centers + widths :]
-    return found, data
+        center[: used[0]] = np.frombuffer(take(2 * used[0]), "<f2")
+        high = np.frombuffer(take(used[1]), np.uint8).astype("<u2") << 8
+        width[: used[1]] = high.view("<f2")
+        model.weights.append(Weights(center, width, TAILS[tails]))
+    if rich:
+        model.sharpness = np.frombuffer(take(CLASSES), np.uint8).astype(np.int64)
+    return model, data

@@ -72,10 +72,9 @@ def test_files_do_not_depend_on_the_order_of_splats(spread):
 
 
 def test_equal_splats_take_few_bits():
-    """Beside their places in cells, which are equally probable: a byte or more. They are round."""
+    """Beside their places in cells and directions, which have no model: at least a byte."""
     same = Symbols(*(np.repeat(part[:1], 8000, axis=0) for part in content().sections[0]))
-    zero = {name: 0 * getattr(same, name) for name in ("part", "stretch", "turn")}
-    assert 8000 < len(packed.to_bytes(content()._replace(sections=[same._replace(**zero)]))) < 11000
+    assert 8000 < len(packed.to_bytes(content()._replace(sections=[same]))) < 11000
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
@@ -161,7 +160,7 @@ def hostile(first=0, model=b""):
     return body(data=(bytes([first]) + model).ljust(COUNT, b"\0"))
 
 
-PLAIN = b"\0\0\0" * 5
+PLAIN = b"\0\0\0\0" * 5
 """Weights of 0 for three channels, the scale and the stretch."""
 
 
@@ -195,7 +194,8 @@ HOSTILE = {
     "many splats": (header() + body(0xFFFFFFFF), "claims 4294967295 Gaussians"),
     "no splats": (header() + body(0), "claims 0 Gaussians"),
     "a long section": (header() + body(length=0xFFFFFFFF), "section 1 is truncated"),
-    "an unknown first byte": (header() + hostile(first=2), "first byte is unknown"),
+    "an unknown first byte": (header() + hostile(first=0x7F), "first byte is unknown"),
+    "an unknown distribution": (header() + hostile(model=b"\xff"), "an unknown distribution"),
 }
 
 
@@ -210,7 +210,7 @@ def test_codes_of_any_bytes(tmp_path_factory, data, rich):
     """They give a set or an error, and no warning."""
     path = tmp_path_factory.mktemp("any") / "x.egs"
     for content in (data, PLAIN + data):
-        path.write_bytes(header() + hostile(int(rich), content))
+        path.write_bytes(header() + hostile(packed.RICH * rich, content))
         try:
             found = packed.read(path)
         except ValueError:
