@@ -59,7 +59,7 @@ class EigenGS:
         The first `low` Gaussians only represent the first `low_components` of each channel; both
         are 0 if all Gaussians represent all components.
     variance : ndarray of float64, shape (C,) or (0,)
-        See `eigengs_dr.Eigenbasis`; empty in a file of version 1.
+        See `eigengs_dr.Eigenbasis`; empty if unknown.
     held_out : ndarray of float64, shape (n + 1,) or (0,)
         Mean PSNR in dB of PCA with 0, 1, ..., n components, for images that were held out of the
         training; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. Empty if there were
@@ -152,7 +152,7 @@ class EigenGS:
     def truncation_curve(self) -> TruncationCurve | None:
         """Return the truncation curve of the PCA of the training images.
 
-        It is None for a file of version 1, which does not hold the variance.
+        It is None if the variance is unknown.
         """
         if not len(self.variance):
             return None

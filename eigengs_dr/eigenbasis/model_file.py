@@ -30,7 +30,7 @@ MAX_WEIGHT = 1e6
 MAX_PSNR = 200.0
 """Largest valid absolute PSNR in dB, far above any actual PSNR."""
 
-LAYOUT_V1: dict[str, Field] = {
+LAYOUT: dict[str, Field] = {
     "mean": Field("f4", 2),
     "factor": Field("f4", 2),
     "color": Field("f4", 2),
@@ -42,16 +42,10 @@ LAYOUT_V1: dict[str, Field] = {
     **{f"weights{c}": Field("f2", 2, MAX_ENTRIES) for c in range(3)},
     **{f"scale{c}": Field("f4", 1) for c in range(3)},
     **{f"eigenvalues{c}": Field("f8", 1) for c in range(3)},
-}
-"""Arrays of a file of version 1, with their types and numbers of dimensions."""
-
-LAYOUT: dict[str, Field] = {
-    **LAYOUT_V1,
     "variance": Field("f8", 1),
     "held_out": Field("f8", 1),
 }
-"""Arrays of a file. Version 2 added the last two, for the truncation curve, and a text that version
-3 removed."""
+"""Arrays of a file, with their types and numbers of dimensions."""
 
 
 def write_model(path: str | os.PathLike[str], model: EigenGS) -> None:
@@ -66,8 +60,7 @@ def write_model(path: str | os.PathLike[str], model: EigenGS) -> None:
 
 def read_members(path: str | os.PathLike[str], backend: str | None) -> Record:
     """Read a file, and return the arguments of `eigengs_dr.EigenGS`; see `EigenGS.load`."""
-    version = npz.read_version(path, FORMAT, VERSION)
-    arrays = npz.read(path, FORMAT, VERSION, LAYOUT_V1 if version < 2 else LAYOUT)
+    arrays = npz.read(path, FORMAT, VERSION, LAYOUT)
     try:
         return from_members(arrays, backend)
     except ValueError as error:
@@ -121,8 +114,8 @@ def from_members(arrays: dict[str, NDArray], backend: str | None) -> Record:
         "mean_image": arrays["mean_image"].astype(np.float32),
         "low": low,
         "low_components": low_components,
-        "variance": arrays.get("variance", np.zeros(0)),
-        "held_out": arrays.get("held_out", np.zeros(0)),
+        "variance": arrays["variance"],
+        "held_out": arrays["held_out"],
     }
 
 
@@ -151,7 +144,7 @@ def check_members(arrays: dict[str, NDArray]) -> tuple[NDArray[np.float32], ...]
     for c, k in enumerate(counts):
         columns = {f"weights{c}": (k, number + 1), f"scale{c}": (k,), f"eigenvalues{c}": (k,)}
         shapes |= columns
-    variance, held_out = (arrays.get(key, np.zeros(0)) for key in ("variance", "held_out"))
+    variance, held_out = (arrays[key] for key in ("variance", "held_out"))
     if len(variance):
         shapes["variance"] = (3,)
     if len(held_out):

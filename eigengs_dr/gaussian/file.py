@@ -24,7 +24,7 @@ MATERIAL = "eigengs_dr.material"
 """Formats of a file without maps and with maps."""
 
 VERSIONS = {FORMAT: 2, MATERIAL: 1}
-"""Versions of the formats; version 2 of sets without maps added the cutoff."""
+"""Versions of the formats."""
 
 CUTOFF = 3.0
 """Default cutoff, in standard deviations. At the cutoff a Gaussian has ``exp(-cutoff^2 / 2)`` of
@@ -56,11 +56,12 @@ ARRAYS: dict[str, Field] = {
 }
 """Arrays of a set, with their types and numbers of dimensions."""
 
-LAYOUT: dict[str, Field] = ARRAYS | {"size": Field("i8", 1), "space": Field("U", 0)}
-"""Content of a file of version 1, in which sets have the cutoff `CUTOFF`."""
-
-CUTOFF_FIELD = {"cutoff": Field("f8", 0)}
-"""Content that version 2 added."""
+LAYOUT: dict[str, Field] = ARRAYS | {
+    "size": Field("i8", 1),
+    "space": Field("U", 0),
+    "cutoff": Field("f8", 0),
+}
+"""Arrays of a file without maps."""
 
 MAPS: dict[str, Field] = {
     "names": Field("U", 1, MAX_MAP_CHANNELS),
@@ -180,7 +181,7 @@ def read_head(path: Path) -> SetHead:
     Raises
     ------
     ValueError
-        If the file has another format or a newer version, or its header is damaged.
+        If the file has another format or version, or its header is damaged.
     OSError
         If the file cannot be opened.
     """
@@ -207,17 +208,16 @@ def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
-    """Return the format of an ``.npz`` file, its highest version, and its arrays."""
+    """Return the format of an ``.npz`` file, its version, and its arrays."""
     if npz.format_of(path) == MATERIAL:
         shared = {name: field for name, field in LAYOUT.items() if name != "space"}
-        return MATERIAL, VERSIONS[MATERIAL], shared | CUTOFF_FIELD | MAPS
-    first = npz.read_version(path, FORMAT, VERSIONS[FORMAT]) < 2
-    return FORMAT, VERSIONS[FORMAT], LAYOUT if first else LAYOUT | CUTOFF_FIELD
+        return MATERIAL, VERSIONS[MATERIAL], shared | MAPS
+    return FORMAT, VERSIONS[FORMAT], LAYOUT
 
 
 def _properties(members: Arrays) -> tuple[tuple[int, int], str, float, tuple[TextureMap, ...]]:
     """Return the size, the space, the cutoff and the maps from the arrays of a file."""
-    size, cutoff = tuple(members["size"].tolist()), float(members.get("cutoff", np.array(CUTOFF)))
+    size, cutoff = tuple(members["size"].tolist()), float(members["cutoff"])
     if "names" not in members:
         return size, str(members["space"]), cutoff, ()
     columns = [members[name].tolist() for name in MAPS]

@@ -81,7 +81,7 @@ def read(path: str | os.PathLike[str], name: str, version: int, layout: dict[str
     name : str
         Expected format.
     version : int
-        Newest version that the caller can read.
+        Expected version.
     layout : dict of str to Field
         Arrays to read.
 
@@ -92,8 +92,8 @@ def read(path: str | os.PathLike[str], name: str, version: int, layout: dict[str
     Raises
     ------
     ValueError
-        If the file is not such an archive, is truncated, or has another format or a newer version;
-        if an array is missing, has another type or is too large. One line names the file, the key
+        If the file is not such an archive, is truncated, or has another format or version; if an
+        array is missing, has another type or is too large. One line names the file, the key
         and the expected value.
     OSError
         If the file cannot be opened.
@@ -103,11 +103,6 @@ def read(path: str | os.PathLike[str], name: str, version: int, layout: dict[str
     check_content(path, COPIES * values)
     with _opened(path, name, version) as archive:
         return {key: _read_array(archive, key, field) for key, field in layout.items()}
-
-
-def read_version(path: str | os.PathLike[str], name: str, version: int) -> int:
-    """Return the version of a file that `write` wrote; parameters and errors as for `read`."""
-    return int(read(path, name, version, {"version": Field("i8", 0)})["version"])
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
@@ -141,7 +136,7 @@ COPIES = 2
 def _opened(
     path: str | os.PathLike[str], name: str = "eigengs_dr", version: int | None = None
 ) -> Iterator[zipfile.ZipFile]:
-    """Open a file of a format, up to a version; turn every error in the block into one line."""
+    """Open a file of a format and a version; turn every error in the block into one line."""
     with open(path, "rb") as file:
         try:
             with _archive(file) as archive:
@@ -176,15 +171,14 @@ def _archive(file: BinaryIO) -> zipfile.ZipFile:
 
 
 def _check_format(archive: zipfile.ZipFile, name: str, version: int) -> None:
-    """Raise `BadValue` for another format or a newer version."""
+    """Raise `BadValue` for another format or version."""
     stored = str(_read_array(archive, "format", Field("U", 0)))
     if stored != name:
         raise BadValue(f"format is {stored[:40]!r}, expected {name!r}")
     number = int(_read_array(archive, "version", Field("i8", 0)))
-    if not 1 <= number <= version:
-        raise BadValue(
-            f"version is {number}, this package reads up to {version}; upgrade eigengs-dr"
-        )
+    if number != version:
+        advice = "upgrade eigengs-dr" if number > version else "make the file again"
+        raise BadValue(f"version is {number}, but this package reads {version}; {advice}")
 
 
 def _read_array(archive: zipfile.ZipFile, key: str, field: Field) -> Values:

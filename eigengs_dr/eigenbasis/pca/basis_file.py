@@ -33,8 +33,7 @@ LAYOUT: dict[str, npz.Field] = {
     "space": npz.Field("U", 0),
     **{f"eigenvalues{c}": npz.Field("f8", 1) for c in range(3)},
 }
-"""Arrays of a file, except the components, whose shapes follow from these. Files of version 1 also
-hold training images, which are not read."""
+"""Arrays of a file, except the components, whose shapes follow from these."""
 
 
 def write_basis(path: str | os.PathLike[str], basis: Eigenbasis) -> None:
@@ -88,7 +87,7 @@ def check_arrays(arrays: Mapping[str, NDArray], shapes: Mapping[str, tuple[int, 
             raise npz.BadValue(f"eigenvalues{c} has {len(values)} values, more than pixels")
         if (values < 0).any() or (np.diff(values) > 0).any():
             raise npz.BadValue(f"eigenvalues{c} must descend and not be negative")
-        # A model of version 1 has no variance.
-        total = arrays["variance"][c] if len(arrays.get("variance", ())) else np.inf
+        # A model may have no variance.
+        total = arrays["variance"][c] if len(arrays["variance"]) else np.inf
         if values.sum() > total * (1 + ENERGY_TOLERANCE):
             raise npz.BadValue(f"eigenvalues{c} add up to more than variance {c}")

@@ -23,14 +23,6 @@ def test_saved_and_loaded_is_the_same(tmp_path):
         assert type(loaded.count) is int and type(loaded.space) is str
 
 
-def test_files_of_version_1_are_read(tmp_path):
-    """They have training images too."""
-    basis_of("rgb").save(tmp_path / "a.npz")
-    arrays = members_of(tmp_path / "a.npz") | {"examples": np.zeros((16, HEIGHT, WIDTH, 3), "f4")}
-    archive.write(tmp_path / "a.npz", basisfile.FORMAT, 1, arrays)
-    assert_same(Eigenbasis.load(tmp_path / "a.npz"), basis_of("rgb"))
-
-
 @pytest.mark.parametrize(
     ("changed", "complaint"),
     [
