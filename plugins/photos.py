@@ -106,8 +106,9 @@ def photo_loss(
 
     Notes
     -----
-    Fits repeat only about: renderers add the derivatives of a texel in the order in which their
-    threads come to it.
+    Fits of equal seeds differ: Mitsuba's threads add up the derivatives of a texel in the order in
+    which they come to it. Of 64 x 64 texels, 100 Gaussians and 60 steps on noise, six fits lay up
+    to 0.15 apart. With ``drjit.set_thread_count(1)`` they are equal on ``llvm``.
 
     Renderings of few samples are noisy. `mitsuba.render` gives the derivatives other random numbers
     than the picture, so that their product has the right mean.
