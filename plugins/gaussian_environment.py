@@ -29,7 +29,7 @@ from .sums import plugin_of_sums
 from .versions import Interaction, Properties
 
 FAR = 1e8
-"""Distance that stands for infinity. Mitsuba 3.9 tells Python emitters nothing about the scene."""
+"""Distance that stands for infinity where the bounds of the scene are unknown."""
 
 ROUNDING = 1e-4
 """Relative margin of the bounds of a scene, and smallest radius of the bounds."""
@@ -125,9 +125,10 @@ def gaussian_environment() -> type:
             return light_at(self, uv).numpy().reshape(u.shape)
 
         def set_scene(self, scene: mi.Scene) -> None:
-            """Take the bounds of a scene, without which rays from the light are NaN.
+            """Take the bounds of a scene.
 
-            Mitsuba 3.9 does not call this method of a plugin in Python.
+            Mitsuba 3.9 does not call this method of a plugin in Python. Without it, rays from the
+            light are NaN, and integrators that start at the light do not show it behind the scene.
             """
             box, center, radius = scene.bbox(), [0.0, 0.0, 0.0], 0.0
             if box.valid():
@@ -214,10 +215,13 @@ def gaussian_environment() -> type:
         ) -> tuple:
             uv, density = self.importance.sample(sample, active)
             d, jacobian = self._direction(uv)
-            ds = dr.zeros(mi.DirectionSample3f)
-            ds.p, ds.n, ds.uv, ds.time = dr.fma(d, FAR, it.p), -d, uv, it.time
+            ds, far = dr.zeros(mi.DirectionSample3f), mi.Float(FAR)
+            if self.bounds:  # sensors see nothing beyond their far clip plane
+                center, radius = self.bounds
+                far = 2 * dr.maximum(radius, dr.norm(it.p - center))
+            ds.p, ds.n, ds.uv, ds.time = dr.fma(d, far, it.p), -d, uv, it.time
             ds.pdf = dr.select(active, density * jacobian, 0)
-            ds.delta, ds.emitter, ds.d, ds.dist = False, mi.EmitterPtr(self), d, FAR
+            ds.delta, ds.emitter, ds.d, ds.dist = False, mi.EmitterPtr(self), d, far
             active = active & (ds.pdf > 0)
             light = self._light(uv, it.wavelengths, active)
             return ds, _emitted(light * dr.select(active, 1 / ds.pdf, 0))

@@ -283,8 +283,13 @@ def widen(shape: list, footprint: list) -> tuple[list, Float]:
 def inverted(shape: list) -> list:
     """Return the mean, and p, t, r of the inverse ``[[p, t], [0, r]]`` of the factor."""
     mean_x, mean_y, a, b, c = shape
-    p, r = rcp(a), rcp(c)
-    return [mean_x, mean_y, p, -b * p * r, r]
+    p, r = (rcp(dr.select(dr.abs(k) < FLATTEST, FLATTEST, dr.minimum(k, STEEPEST))) for k in (a, c))
+    return [mean_x, mean_y, p, dr.clip(-b * p * r, -MOST_SHEARED, MOST_SHEARED), r]
+
+
+FLATTEST, STEEPEST, MOST_SHEARED = 1e-8, 1e8, 1e12
+"""Bounds of a factor, and of t of its inverse, in pixels. Beyond, products of four leave the range
+of floats, and a Gaussian is constant over any image, or between all of its points."""
 
 
 def widen_inverted(shape: list, footprint: list) -> tuple[list, Float]:

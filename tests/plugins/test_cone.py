@@ -180,3 +180,31 @@ def test_the_collector_stays_out_of_lookups():
     with pytest.raises(ValueError, match="three channels"):
         texture(gaussians("data", channels=1)).eval_3(facing())
     assert works and not any(works) and gc.isenabled()
+
+
+HUGE = 3.3e38
+
+
+@pytest.mark.parametrize(
+    "factor",
+    [
+        (1e-20, 0, 1e-20),
+        (1e-37, 0, 1),
+        (1, 0, 1e-37),
+        (HUGE, 0, HUGE),
+        (1, HUGE, 1),
+        (1e-30, HUGE, 1e-30),
+        (HUGE, HUGE, HUGE),
+    ],
+)
+@pytest.mark.parametrize("wrap", ["repeat", "clamp"])
+def test_extreme_gaussians_stay_finite(factor, wrap):
+    """Very wide, very narrow and very long ones, near, and from afar in the pyramid."""
+    factors = [factor, (0.3, 0, 0.3)]
+    g = eg.Gaussians.from_arrays(
+        [[8, 4], [3, 3]], factors, [[0.5], [0.2]], size=(16, 8), space="data", backend=backend()
+    )
+    tex = texture(g, prefilter=0.1, wrap_mode=wrap)
+    for distance in (0.01, 0.5, 2.0, 10.0):
+        points = in_front(at(mi.Float(0.1, 0.45, 0.99), mi.Float(0.3, 0.5, 0.02)), distance)
+        assert np.isfinite(np.array(tex.eval_1(points))).all()

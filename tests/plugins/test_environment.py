@@ -288,6 +288,16 @@ class TestSampling:
             images.append(np.array(mi.render(scene, integrator=integrator, spp=spp)).mean())
         assert images[0] == pytest.approx(images[1], rel=0.02)
 
+    def test_rays_from_the_light_show_the_background(self):
+        """A sensor sees nothing beyond its far clip plane."""
+        scene = lit(environment_of(sky()), side=12)
+        scene.environment().set_scene(scene)
+        images = [
+            np.array(mi.render(scene, integrator=mi.load_dict({"type": kind}), spp=spp))[..., :3]
+            for kind, spp in (("ptracer", 1024), ("path", 256))
+        ]
+        assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.02)
+
     @in_variants(["llvm_ad_spectral_polarized"])
     def test_polarized(self, variant):
         g = sky()

@@ -102,7 +102,7 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
     order, counts, table, first = [], [], [], 0
     for k in np.unique(rank[visible]):
         indices = np.flatnonzero(visible & (rank == k))
-        largest = min(float(size[indices].max()), 1e12)  # its square must be finite in float32
+        largest = min(max(float(size[indices].max()), 1e-12), 1e12)  # its square fits in float32
         # Means beyond this margin are farther from the image than the cutoff.
         origin = -cutoff * largest
         area = (width - 2 * origin) * (height - 2 * origin)
