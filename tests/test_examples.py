@@ -62,6 +62,7 @@ def test_fit_an_image(run, tmp_path):
     assert len(eg.Gaussians.load(folder / "cat.npz")) == 3000
 
 
+@pytest.mark.slow
 def test_film(run, tmp_path):
     out = run("film.py", tmp_path)
     film, alone = numbers(out, "still                  NUM (NUM)")

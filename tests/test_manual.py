@@ -300,6 +300,7 @@ def space(tmp_path, monkeypatch):
         "np": np,
         "image": image,
         "images": images,
+        "frames": images[:2],
         "array": np.tile(image, (3, 3, 1)),
     }
     space |= {"a": image, "r": image[..., :1], "n": n, "model": model, "result": result}

@@ -40,7 +40,8 @@ def content(scene=None, space="data", sections=(COUNT,)):
     symbols = quantize(scene._asdict(), STEPS)
     ends = np.cumsum(sections)
     parts = [symbols.select(slice(end - k, end)) for end, k in zip(ends, sections, strict=True)]
-    return packed.EgsContent(parts, STEPS, scene.background.astype(np.float32), scene.size, space)
+    background = scene.background.astype(np.float32)
+    return packed.EgsContent(parts, STEPS, background, scene.size, space, psnr=37.5)
 
 
 def rows_of(symbols):

@@ -37,7 +37,7 @@ def test_trace(backend):
     result = fit(picture(), SPLATS, 30, backend=backend)
     assert [row["iteration"] for row in result.trace] == [0, 10, 20, 30]
     for row in result.trace:
-        assert sorted(row) == ["iteration", "psnr_rgb", "psnr_ycbcr", "seconds"]
+        assert sorted(row) == ["gaussians", "iteration", "psnr_rgb", "psnr_ycbcr", "seconds"]
         assert all(type(row[k]) is float for k in ("seconds", "psnr_rgb", "psnr_ycbcr"))
     seconds = [row["seconds"] for row in result.trace]
     assert seconds == sorted(seconds)

@@ -1,6 +1,5 @@
 """Fits of losses: an image places as in a fit of it; without an image, texels come first."""
 
-import traceback
 from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
@@ -339,10 +338,8 @@ def test_the_step_is_the_number_of_steps_taken():
 
 def test_a_dict_of_maps_is_not_reduced():
     """Dr.Jit alone ends the process."""
-    with pytest.raises(RuntimeError, match=r"dr\.mean") as error:
+    with pytest.raises(TypeError, match=r"take each by its name, such as pictures\['albedo'\]"):
         eg.fit({"albedo": IMAGE}, 10, 4, loss=lambda maps, step: dr.mean(maps, axis=None))
-    text = "".join(traceback.format_exception(error.value))
-    assert "take each by its name, such as pictures['albedo']" in text
 
 
 def test_a_loss_runs_where_the_start_is_the_image():
