@@ -1357,6 +1357,7 @@ def main(words: Sequence[str] | None = None) -> int:
             line = "recorded" if options.write else verdict(expected.get(name), figures)
         failed += line.startswith("DIFFERS")
         tqdm.write(f"{name}: {line}")
+        sys.stdout.flush()
     if options.write:
         kept = {name: (expected | found)[name] for name in ENTRIES if name in expected | found}
         text = json.dumps(
