@@ -612,10 +612,8 @@ def _() -> Figures:
 def _() -> Figures:
     basis = eg.Eigenbasis.from_images(family(), (32, 32), (8, 4, 4), progress=False)
     options = {"iterations": 20, "backend": BACKEND, "progress": False}
-    trained = eg.EigenGS.fit(basis, 100, **options)
     paper = eg.EigenGS.fit(basis, 100, preset="eigengs", frequency_aware=True, **options)
-    sets = [m.encode(photo(32), "projected") for m in (trained, paper)]
-    return of_sets(photo(32), *sets)
+    return of_sets(photo(32), paper.encode(photo(32), "projected"))
 
 
 def of_sets(image: Any, *sets: Any) -> Figures:
@@ -732,13 +730,12 @@ def _() -> Figures:
     return of_pixels(*eg.picture_of(fitted_material().gaussians, 24, 24).values())
 
 
-@entry("render lists, lattices, parts and joined sets")
+@entry("render lists, parts and joined sets")
 def _() -> Figures:
     g = plain_set("rgb")
     joined = eg.concatenate([g[:50], g[80:]]).scaled(64, 64).bounded()
-    lattice = eg.lattices((24, 16), [4, 2], backend=BACKEND)
     listed = eg.render(g, lists=eg.tile_lists(g, margin=2.0))
-    return of_pixels(eg.render(joined), eg.render(lattice), listed)
+    return of_pixels(eg.render(joined), listed)
 
 
 @entry("render a saved set in double precision")
