@@ -131,8 +131,8 @@ def keep_fitting(
     A Gaussian stays if the squared error of what it owns, see `Owners`, is at most that of as many
     Gaussians that the method places by the image. The others make room for those of the placement
     that are better there. If this set is not much better than the placement, see `MAX_ERROR`, the
-    placement is the start. Cost: a placement, three colour solves and a pruning, as long as about 30
-    steps; where all Gaussians stay, a placement and a solve.
+    placement is the start. Cost: a placement, three colour solves and a pruning, about 30
+    steps long; where all Gaussians stay, a placement and a solve.
 
     Parameters
     ----------
