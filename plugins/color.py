@@ -17,7 +17,6 @@ returns the colour.
 
 from __future__ import annotations
 
-import math
 from functools import cache
 
 import drjit as dr
@@ -28,14 +27,6 @@ from scipy.optimize import nnls
 
 from eigengs_dr.backend.arrays import upload
 from eigengs_dr.backend.types import Float
-from eigengs_dr.image.color import (
-    LOG_SLOPE,
-    UNBOUNDED,
-    from_log,
-    rendered_as,
-    to_linear,
-    unit_codes,
-)
 
 from .versions import Texture
 
@@ -167,31 +158,13 @@ def upsample(rgb: mi.Color3f, wavelengths: mi.Spectrum, table: Float) -> mi.Spec
     return type(wavelengths)(result)
 
 
-def show(texture: Texture, value: Float) -> Float:
-    """Clamp and decode a channel, unless raw.
-
-    The clamp conserves energy; light that may exceed 1 has no upper bound. Gradients ignore the
-    clamp: else a colour that a step moved out of the range would never come back.
-    """
-    if texture.raw:
-        return value
-    if texture.space in UNBOUNDED:
-        value = from_log(value) if texture.space == "log" else value
-        return dr.replace_grad(dr.maximum(value, 0), value)
-    value = dr.replace_grad(dr.clip(value, 0, 1), value)
-    return to_linear(value) if texture.space in ("ycbcr", "rgb") else value
-
-
-def show_all(texture: Texture, values: list) -> list:
-    """Apply `show` to all channels; normals get the length 1 instead, unless raw.
+def shown_channels(texture: Texture, values: list) -> list:
+    """Clamp and decode all channels, unless raw, see `eigengs_dr.image.space.Space.to_lights`.
 
     Two channels are the codes of x and y of normals, whose z follows from the length 1.
     """
-    if len(values) == 2:
-        return _with_z([show(texture, value) for value in values])
-    if texture.space == "normal" and not texture.raw:
-        return unit_codes(values)
-    return [show(texture, value) for value in values]
+    channels = values if texture.raw else texture.space.to_lights(values)
+    return _with_z(channels) if len(channels) == 2 else channels
 
 
 def _with_z(codes: list) -> list:
@@ -206,17 +179,11 @@ FLATTEST = 1e-4
 
 
 def slope_of(texture: Texture, value: Float) -> Float:
-    """Return the derivative of `show` for a channel, but 0 where it clamps."""
-    slope = type(value)(1)
+    """Return the derivative of `shown_channels` for a channel, but 0 where it clamps."""
     if texture.raw:
-        return slope
-    if texture.space == "log":
-        slope = (from_log(value) + 1 / LOG_SLOPE) * math.log1p(LOG_SLOPE)
-    elif texture.space in ("ycbcr", "rgb"):
-        curved = 2.4 / 1.055 * dr.power((dr.maximum(value, 0.04045) + 0.055) * (1 / 1.055), 1.4)
-        slope = dr.select(value <= 0.04045, 1 / 12.92, curved)
-    within = (value >= 0) & ((value <= 1) | (texture.space in UNBOUNDED))
-    return dr.select(within, slope, 0)
+        return type(value)(1)
+    within = (value >= 0) & (value <= texture.space.largest)
+    return dr.select(within, type(value)(texture.space.slope(value)), 0)
 
 
 def luminance(color: list) -> Float:
@@ -231,7 +198,7 @@ def brightness(texture: Texture, color: list) -> Float:
     ----------
     texture : mitsuba.Texture
     color : list of Float
-        Channels from `show`.
+        Channels from `shown_channels`.
 
     Returns
     -------
@@ -239,7 +206,7 @@ def brightness(texture: Texture, color: list) -> Float:
         In spectral variants the mean of the spectrum of `upsample`, as of a ``bitmap``; else the
         luminance.
     """
-    if mi.is_spectral and len(color) == 3 and not texture.raw and rendered_as(texture.space):
+    if mi.is_spectral and len(color) == 3 and not texture.raw and texture.space.is_color:
         return sum(w * c for w, c in zip(mean_weights(), color, strict=True))
     return luminance(color)
 

@@ -29,7 +29,7 @@ from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.points import Packed, sum_at_points, value_terms
 from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_covariance
 
-from .color import brightness, keep_finite, show_all
+from .color import brightness, keep_finite, shown_channels
 from .versions import Texture
 
 RESOLVED = 0.65
@@ -96,7 +96,7 @@ def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
         smallest = _smallest_deviation(shape, color)
         columns, lines, width = _grid(texture, smallest, spacing or Spacing())
         cells, packed, deviation = table.lists.cells, table.packed, RESOLVED * width
-        if deviation > 1.001 * smallest and texture.space != "log":
+        if deviation > 1.001 * smallest and texture.space.affine:
             variance, zero = dr.opaque(mi.Float, deviation**2), mi.Float(0)
             shape, amplitude = widen(shape, kernel_covariance([variance, zero, variance]))
             dr.eval(shape)
@@ -124,7 +124,7 @@ def _light_at(texture: Texture, uv: mi.Point2f, cells: CellLists, packed: Packed
     sums = sum_at_points(cells, packed, x, y, mi.Bool(True), value_terms(packed))
     sums = sums[texture.part] if packed.channels > texture.channels else sums
     background = texture.table.background[texture.part]
-    seen = show_all(texture, [s + b for s, b in zip(sums, background, strict=True)])
+    seen = shown_channels(texture, [s + b for s, b in zip(sums, background, strict=True)])
     light = brightness(texture, seen) + dr.zeros(mi.Float, dr.width(uv))
     dr.eval(light)
     return light

@@ -12,7 +12,7 @@ from eigengs_dr.backend.arrays import types_of, upload
 from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.gaussian.gaussians import Fitted, Gaussians
-from eigengs_dr.image.color import rendered_as, to_linear
+from eigengs_dr.image.color import to_linear
 from eigengs_dr.raster.render import render
 
 from .parameters import given, plugin_of
@@ -114,8 +114,7 @@ def bake_environment(
     ... )
     >>> scene = mi.load_dict({"type": "scene", "sky": bake_environment(sky)})
     """
-    encoding = rendered_as(gaussians.space)
-    if gaussians.channels != 3 or encoding is None:
+    if gaussians.channels != 3 or not gaussians.space.is_color:
         raise ValueError(
             f"bake_environment: the set has {gaussians.channels} channels in the space "
             f"{gaussians.space!r}; it needs three of light or colour"
@@ -124,7 +123,7 @@ def bake_environment(
         ratio = 1.0 if width is None else width / gaussians.width
         height = round(ratio * gaussians.height)
     picture = render(_from_pole_to_pole(gaussians, height), width, height).numpy()
-    light = to_linear(picture) if encoding == "srgb" else picture
+    light = to_linear(picture) if gaussians.space.encoding == "srgb" else picture
     bitmap = mi.Bitmap(np.maximum(light, 0).astype(np.float32))
     return {"type": "envmap", "bitmap": bitmap, **given(properties)}
 

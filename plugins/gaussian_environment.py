@@ -115,7 +115,7 @@ def gaussian_environment() -> type:
                 dr.make_opaque(self.to_world)
             if not keys or set(keys) - self.others:
                 # Logarithms are sharper than the Gaussians that sum to them.
-                largest = 1.0 if self.space == "log" else math.inf
+                largest = math.inf if self.space.affine else 1.0
                 survey = make_survey(self, Spacing(1.0, largest, SMOOTH, SIDE))
                 self.importance = importance_of(survey.brightness.numpy()[..., 0], self._brightness)
 

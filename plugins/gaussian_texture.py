@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.backend.types import Float, Mask
-from eigengs_dr.image.color import rendered_as
 from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, sum_at_points
 
 from . import properties
@@ -107,7 +106,7 @@ def gaussian_texture() -> type:
                 return mi.UnpolarizedSpectrum(luminance(color))
             if self.spectra is None:
                 return mi.Color3f(*color)
-            if self.raw or rendered_as(self.space) is None:
+            if self.raw or not self.space.is_color:
                 raise ValueError(
                     f"{self.label()}: a spectral variant needs colours for a reflectance or "
                     "radiance, not raw data; use a set in a colour space, and raw = false"

@@ -169,7 +169,7 @@ def photo_loss(
     hidden = [mi.TensorXf(np.float32(mask)) for mask in masks]
     drawn = scene, known, keys, chosen, integrator, spp
     taken = _Photos(*drawn, targets, hidden, judged, parameters, _first_of(seed))
-    spaces = {name: _space_of(known, key) for name, key in keys.items()}
+    spaces = {name: _space_for(known, key) for name, key in keys.items()}
     space = spaces if isinstance(pictures, Mapping) else spaces[""]
     judge = taken.judge if held_out else None
     loss = Loss(taken.loss, bounds, parameters, judge, space=space)
@@ -407,7 +407,7 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
     )
 
 
-def _space_of(known: mi.SceneParameters, key: str) -> str:
+def _space_for(known: mi.SceneParameters, key: str) -> str:
     """Return the space of the sums of texels: logarithms for an ``envmap``, else light or data."""
     if isinstance(known.properties[key][2], mi.Emitter):
         return "log"

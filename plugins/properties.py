@@ -13,8 +13,8 @@ from eigengs_dr.backend.selection import backend_of
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
-from eigengs_dr.image.color import SPACES, rendered_as
 from eigengs_dr.image.formats import SUFFIXES
+from eigengs_dr.image.space import SPACES
 
 from .parameters import TextureParameters, model_source, shared_file, without_arrays
 from .versions import Properties
@@ -144,7 +144,7 @@ def scale(props: Properties) -> float:
 
 def check_light(gaussians: Gaussians, plugin: str) -> None:
     """Raise `ValueError` if a set is not light from all directions."""
-    if gaussians.channels not in (1, 3) or rendered_as(gaussians.space) is None:
+    if gaussians.channels not in (1, 3) or not gaussians.space.is_color:
         raise ValueError(
             f"{plugin}: the set has {gaussians.channels} channels in the space "
             f"{gaussians.space!r}; it needs one or three of light or colour"

@@ -16,7 +16,7 @@ import mitsuba as mi
 from eigengs_dr.backend.types import Bool, Float
 
 from . import properties
-from .color import show_all, upload_table
+from .color import shown_channels, upload_table
 from .cone import current_angle
 from .lookup import list_gaussians, make_table, sum_here, sum_over_footprint, table_of_file
 from .parameters import SHAPES
@@ -138,7 +138,9 @@ def plugin_of_sums(base: type) -> Any:
         def display(self, sums: list) -> list:
             """Return the channels, decoded and clamped unless `raw`, of sums without background."""
             background = self.table.background[self.part]
-            return show_all(self, [s + b for s, b in zip(sums[self.part], background, strict=True)])
+            return shown_channels(
+                self, [s + b for s, b in zip(sums[self.part], background, strict=True)]
+            )
 
         # --- Description -------------------------------------------------------------------------
 

@@ -16,7 +16,6 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.types import Float, Mask
-from eigengs_dr.image.color import rendered_as
 
 Texture = Any
 """A ``mitsuba.Texture`` of the current variant."""
@@ -118,7 +117,7 @@ def _as_field(texture: Any) -> type:
         def out_type(self) -> object:
             if self.channels == 1:
                 return kinds.Float
-            light = rendered_as(self.space) and not self.raw
+            light = self.space.is_color and not self.raw
             return kinds.Spectrum if mi.is_spectral and light else kinds.Color3
 
         def domain(self) -> object:

@@ -19,6 +19,7 @@ from eigengs_dr.fitting.pixels import read_pixels
 from eigengs_dr.fitting.place import Adaptive
 from eigengs_dr.fitting.start import load_start, set_in, start_from, types_for
 from eigengs_dr.image.metrics import MAX_PSNR
+from eigengs_dr.image.space import YCBCR
 from eigengs_dr.paper.eigengs import EIGENGS
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
@@ -56,7 +57,7 @@ def start(image: Image, options: FitOptions) -> Run:
     method, source = options.method, None
     if options.start is not None:
         source = load_start(options.start, options.backend)
-    space = options.space or (set_in(source).space if source is not None else "ycbcr")
+    space = options.space or (set_in(source).space if source is not None else YCBCR)
     pixels, space = read_pixels(image, space)
     height, width = pixels.shape[:2]
     data = data_of(pixels, space)

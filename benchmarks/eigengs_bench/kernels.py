@@ -21,6 +21,7 @@ from eigengs_dr.fitting.loop import descend, last, refine
 from eigengs_dr.fitting.measure import psnrs
 from eigengs_dr.fitting.objective import Pixels, data_of, picture
 from eigengs_dr.image.resize import center_crop
+from eigengs_dr.image.space import YCBCR
 from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters
 from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize
@@ -161,9 +162,9 @@ def pixels_inside(scene: eg.Gaussians) -> int:
 def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time a refinement, its steps alone, and a round of relocation."""
     photo, method = center_crop(eg.sample("astronaut"), SIDE, SIDE), eg.DEFAULT
-    data = data_of(photo, "ycbcr")
-    display = picture(types, "ycbcr", [photo], [data])
-    objective = replace(Pixels.of(data, "ycbcr", types), pictures=(display,))
+    data = data_of(photo, YCBCR)
+    display = picture(types, YCBCR, [photo], [data])
+    objective = replace(Pixels.of(data, YCBCR, types), pictures=(display,))
     start = method.place_and_solve(objective, COUNT)
     bare = replace(method, controls=())
     moves = [c for c in method.controls if isinstance(c, (Relocate, Perturb))]

@@ -28,6 +28,7 @@ from eigengs_dr.fitting.objective import Pixels, data_of
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solve import solve
 from eigengs_dr.image.resize import center_crop
+from eigengs_dr.image.space import YCBCR
 
 if TYPE_CHECKING:  # the processes that are measured load neither pandas nor matplotlib
     import pandas as pd
@@ -111,9 +112,9 @@ def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
 
 def _place(image: Image, count: int, types: ArrayTypes) -> tuple[Pixels, eg.Gaussians, float]:
     """Upload an image and place Gaussians; also return the seconds of each."""
-    data = data_of(image, "ycbcr")
+    data = data_of(image, YCBCR)
     started = time.perf_counter()
-    objective = Pixels.of(data, "ycbcr", types)
+    objective = Pixels.of(data, YCBCR, types)
     placed = place_adaptive(objective, count)
     dr.sync_thread()
     return objective, placed, time.perf_counter() - started

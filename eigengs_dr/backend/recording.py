@@ -365,7 +365,7 @@ def _flatten(value: Any, arrays: list[DrJitArray]) -> Shape:
         arrays.append(value)
         return None
     kind = type(value)
-    if value is None or kind in CONSTANTS:
+    if value is None or isinstance(value, str) or kind in CONSTANTS:
         return kind, value
     if is_dataclass(kind):
         names: tuple = _field_names(kind)

@@ -32,15 +32,16 @@ from ..fitting.control import Redistribute, Relocate
 from ..fitting.descent import State, begin
 from ..fitting.loop import descend, last
 from ..fitting.method import Method
-from ..fitting.objective import Affine, Extent, Part, Pixels, data_of, values_in
+from ..fitting.objective import Affine, Extent, Part, Pixels, data_of
 from ..fitting.options import FitOptions
-from ..fitting.pixels import BRIGHT, WHITE, check_normals
+from ..fitting.pixels import WHITE
 from ..fitting.placement.adaptive import density_from_hessian, place_by_density, shift_of
 from ..fitting.placement.density import Owners, density_ratio, squared_error
 from ..fitting.placement.filters import Canvas
 from ..fitting.solve import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
+from ..image.space import YCBCR, Space
 from ..raster.render import to_tensor
 from .grid import Block
 from .windows import Window
@@ -72,9 +73,9 @@ class Settings(NamedTuple):
     background: tuple[float, ...] = ()
 
     @property
-    def space(self) -> str:
+    def space(self) -> Space:
         """Space of the colours."""
-        return self.options.space or "ycbcr"
+        return self.options.space or YCBCR
 
 
 class Surveyed(NamedTuple):
@@ -141,12 +142,12 @@ class FitTask(NamedTuple):
 def measure_extent(task: PlaceTask, settings: Settings) -> Extent:
     """Return the extent of the values of a block, and reject invalid pixels."""
     pixels, space = task.window.read()[task.block.core], settings.space
-    bright = BRIGHT.get(space)
-    if bright and task.window.encoding == "linear" and pixels.max() > WHITE:
+    bright = space.above_white
+    if bright is not space and task.window.encoding == "linear" and pixels.max() > WHITE:
         raise ImageError(f"{task.window.name}: light above 1; give the space {bright!r}")
-    if space == "normal":
-        check_normals(pixels)  # no other range makes normals
-    return Extent.of(values_in(pixels, space))
+    if not space.is_color:
+        space.check(pixels)  # no other range makes normals
+    return Extent.of(space.values_of(pixels))
 
 
 def survey(task: PlaceTask, settings: Settings) -> Surveyed:

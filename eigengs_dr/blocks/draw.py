@@ -15,10 +15,9 @@ from ..fitting.objective import Affine
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.region import crop
-from ..image.color import rendered_as
 from ..image.formats import TIFF_SUFFIXES
 from ..image.io import bits_of, dtype_of, to_file, write_pixels
-from ..image.metrics import float_space, squared_error
+from ..image.metrics import squared_error
 from ..raster.render import filter_by_box, picture_of, render
 from ..storage.atomic import atomic_write
 from .grid import Block
@@ -94,7 +93,7 @@ def draw_region(
     for first in range(0, height, rows):
         band = width, min(rows, height - first)
         part = crop(data, (0, first / scale[1]), band, scale)
-        yield to_file(_pixels_of(part, backend), rendered_as(data.space), kind)
+        yield to_file(_pixels_of(part, backend), data.space.encoding, kind)
 
 
 def save_region(
@@ -189,11 +188,11 @@ def compare(
         Whether data is in [0, 1]. Otherwise the peak is the range, and psnr_rgb is NaN.
     """
     pixels, data = task.window.read(), task.data
-    if data.space != "data":
+    if not data.space.by_range:
         scaled = {name: data.arrays[name] * np.float32(affine.scale) for name in COLORS}
         scaled["background"] += np.float32(affine.offset)
         rendered = draw(data._replace(arrays=data.arrays | scaled), task.backend)
-        floats = squared_error(rendered, pixels, float_space(data.space))
+        floats = squared_error(rendered, pixels, data.space.figure)
         return floats, squared_error(rendered, pixels, "rgb")
     # Comparing in the unit of the fit avoids cancellation.
     rendered = draw(data, task.backend)

@@ -19,8 +19,8 @@ from ..fitting.objective import restored
 from ..fitting.options import FitOptions, named_options
 from ..gaussian.file import FitFigures, check_suffix, write
 from ..gaussian.gaussians import Gaussians
-from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
+from ..image.space import space_of
 from ..storage.atomic import require_writable
 from ..storage.checkpoint import open_checkpoint
 from .block import Settings
@@ -155,16 +155,17 @@ def fit_large(
     (4, 614)
     """
     started = time.perf_counter()
+    colors = space_of(space)
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
-        space=space,
+        space=colors,
         method=method,
         seed=seed,
         backend=backend,
         encoding=encoding,
     )
-    source = open_source(image, rendered_as(space) is None, encoding)
+    source = open_source(image, not colors.is_color, encoding)
     blocks, settings = plan(source, options, block)
     select(backend)
     keep: AbstractContextManager = nullcontext()

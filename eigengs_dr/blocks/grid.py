@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..gaussian.file import CUTOFF, SetData
 from ..gaussian.region import crop, reaches
+from ..image.space import DATA
 
 HALO_SPACINGS = 5.0
 """Width of a halo, in mean distances of the Gaussians. The Gaussians near a border overlap those up
@@ -265,4 +266,4 @@ class BlockSets:
         """Return some Gaussians as a set."""
         arrays = {name: values[rows] for name, values in self.arrays.items()}
         arrays["background"] = np.zeros(1, np.float32)
-        return SetData(arrays, (1, 1), "data", self.cutoff)
+        return SetData(arrays, (1, 1), DATA, self.cutoff)

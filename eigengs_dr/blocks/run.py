@@ -105,7 +105,7 @@ class Run:
         tasks = [PlaceTask(self._window(b), b) for b in self.blocks]
         extents = self._in_order(measure_extent, tasks)
         self.extent = reduce(Extent.joined, extents)
-        self.settings = self.settings._replace(affine=self.extent.affine(self.settings.space))
+        self.settings = self.settings._replace(affine=self.settings.space.unit(self.extent))
         surveys = self._in_order(survey, tasks)
         figures = np.array([[value.mass, *value.total] for value in surveys])
         if self.checkpoint is not None:

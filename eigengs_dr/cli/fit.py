@@ -16,8 +16,7 @@ import click
 import eigengs_dr as eg
 
 from ..backend.selection import select
-from ..image.color import SPACES, rendered_as
-from ..image.metrics import float_space, target_key
+from ..image.space import SPACES, YCBCR, space_of
 from . import options
 from .console import FAILED, INTERRUPTED, MISSED, bar, open_cluster, prefix_errors, print_message
 from .options import MapFile
@@ -314,7 +313,7 @@ def load_images(source: Path | str | dict[str, MapFile], space: str, encoding: s
             name: load_images(m.path, m.space or usual_space(name), encoding)
             for name, m in source.items()
         }
-    return read_file(source, rendered_as(space) is None, encoding)
+    return read_file(source, not space_of(space).is_color, encoding)
 
 
 UNREPORTED = ("gaussians", "image", "mean_image", "maps", "source", "resumed")
@@ -333,17 +332,16 @@ def _figures(result: eg.Fit | eg.LargeFit) -> Record:
 
 def _similarity(image: Any, result: eg.Fit) -> Record:
     """Return SSIM and MS-SSIM of a fit of colours; nothing for maps and other data."""
-    from ..fitting.objective import is_codes
     from ..viewer.pictures import displayed
 
     space = result.gaussians.space
     if result.maps:
         return {}
     image = displayed(image, space)
-    if space == "data" and not is_codes(image):
+    if not space.has_codes(image):
         return {}
     pair = image, result.image
-    ms_ssim = eg.ms_ssim(*pair, space="ycbcr" if rendered_as(space) else "data")
+    ms_ssim = eg.ms_ssim(*pair, space="ycbcr" if space.is_color else "data")
     return {"ssim": eg.ssim(*pair), "ms_ssim": ms_ssim}
 
 
@@ -390,16 +388,16 @@ def _summary(
 
 
 def _psnrs(space: str, floats: float, rgb: float) -> str:
-    line = f"  psnr_{float_space(space)} {floats:.2f} dB"
+    line = f"  psnr_{space_of(space).figure} {floats:.2f} dB"
     # Data outside of [0, 1] has no PSNR of 8-bit values.
     return line if math.isnan(rgb) else f"{line}, psnr_rgb {rgb:.2f} dB"
 
 
 def _target_figure(record: Record, settings: FitOptions) -> tuple[str, float]:
     """Return the name and the value of the PSNR to which a target refers."""
-    key = target_key(record["space"], settings.goal.space if settings.goal else "rgb")
-    name = key if key == "psnr_rgb" else f"psnr_{float_space(record['space'])}"
-    return name, record[key]
+    space = space_of(record["space"])
+    key = (settings.goal or eg.Goal(99)).key(space)
+    return key if key == "psnr_rgb" else f"psnr_{space.figure}", record[key]
 
 
 def _exit_code(records: list[Record], expected: int, settings: FitOptions) -> int:
@@ -560,7 +558,7 @@ def _check_memory(
     if size is None:
         return
     height, width, channels = size
-    pixels, data = width * height, rendered_as(settings.space or "ycbcr") is None
+    pixels, data = width * height, not (settings.space or YCBCR).is_color
     channels = channels if data else 3
     first = settings.goal is not None
     count = settings.first_try(pixels, channels) if first else settings.count_for(pixels)

@@ -12,9 +12,9 @@ import click
 from ..backend.messages import printable
 from ..backend.selection import BACKENDS
 from ..backend.types import Record
-from ..image.color import SPACES
 from ..image.pixels import ENCODINGS
 from ..image.remote import is_url
+from ..image.space import SPACES
 from ..storage.atomic import refuse_url
 from .outputs import describe_run, write_json
 

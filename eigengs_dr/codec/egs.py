@@ -26,7 +26,8 @@ from ..backend.types import Integers
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
 from ..gaussian.file import CUTOFF, SetData, check
 from ..gaussian.packed import MAGIC
-from ..image.color import MAX_CHANNELS, SPACES
+from ..image.color import MAX_CHANNELS
+from ..image.space import SPACES, Space
 from ..storage.atomic import atomic_write
 from ..storage.memory import check_content
 from ..storage.npz import BadValue
@@ -73,7 +74,7 @@ class EgsContent(NamedTuple):
     size : (int, int)
         Native width and height.
     space : str
-        One of `eigengs_dr.image.color.SPACES`.
+        One of `eigengs_dr.image.space.SPACES`.
     cutoff : float
         Radius of a Gaussian in standard deviations.
     maps : tuple of TextureMap
@@ -87,7 +88,7 @@ class EgsContent(NamedTuple):
     steps: Steps
     background: NDArray[np.float32]
     size: tuple[int, int]
-    space: str
+    space: Space
     cutoff: float = CUTOFF
     maps: tuple[TextureMap, ...] = ()
     psnr: float = float("nan")
@@ -317,7 +318,7 @@ def _read_maps(file: BinaryIO) -> tuple[bytes, tuple[TextureMap, ...]]:
         entry = exactly(file, _MAP.size)
         length, number, channels, weight = _MAP.unpack(entry)
         name = exactly(file, length)
-        space = SPACES[number] if number < len(SPACES) else f"number {number}"
+        space = SPACES[number] if number < len(SPACES) else Space(f"number {number}")  # unknown
         maps.append(TextureMap(name.decode("ascii", "replace"), space, channels, weight))
         table += entry + name
     return table, tuple(maps)

@@ -17,10 +17,8 @@ from ..backend.arrays import types_of
 from ..backend.doors import door
 from ..fitting.fit import Fit
 from ..fitting.maps import Map, read_maps
-from ..fitting.objective import values_in
-from ..gaussian.channels import TextureMap, channel_weights, display_values, slices
+from ..gaussian.channels import TextureMap, channel_weights, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
-from ..image.color import LIGHT, rendered_as, to_coded, to_linear, to_pu21
 from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
 from ..image.pixels import check_encoding
@@ -182,7 +180,7 @@ def _compare(g: Gaussians, image: Images, encoding: str | None) -> Compared:
     target = _display(g) if image is None else _image_of(g, image, encoding)
     # The best fit in linear light is not the best sRGB picture. So the compensation of a set in
     # linear light aims at its own rendering, not at the image.
-    keeps_rendering = image is None or g.space in LIGHT
+    keeps_rendering = image is None or g.space.is_light
 
     def error(rounded: Gaussians) -> float:
         return float(np.mean(np.square(_display(rounded) - target, dtype=np.float64)))
@@ -197,22 +195,19 @@ def _image_of(g: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
     This is the space of the set, except for linear light (sRGB) and light above 1 (PU21, which is
     bounded).
     """
-    data = rendered_as(g.space) is None
-    pixels = check_data(image) if data else check_image(image, g.channels == 1, encoding=encoding)
+    if g.space.is_color:
+        pixels = check_image(image, g.channels == 1, encoding=encoding)
+    else:
+        pixels = check_data(image)
     expected = (g.height, g.width, g.channels)
     if pixels.shape != expected:
         raise ValueError(f"pack: image has shape {pixels.shape}, the set needs {expected}")
-    if g.space == "radiance":
-        return to_pu21(to_linear(pixels))
-    return pixels if g.space == "linear" else values_in(pixels, g.space)
+    return g.space.comparable(g.space.values_of(pixels))
 
 
 def _display(g: Gaussians) -> Array:
     """Render a set in the space of the comparison, see `_image_of`."""
-    planes = planes_of(g)
-    if g.space == "radiance":
-        return to_pu21(planes)
-    return to_coded(np.maximum(planes, 0)) if g.space == "linear" else planes
+    return g.space.comparable(planes_of(g))
 
 
 # --- A set with maps -----------------------------------------------------------------------------
@@ -227,7 +222,7 @@ def _compare_maps(g: Gaussians, images: Images, encoding: str | None) -> Compare
     maps, parts = g.maps, slices(g.maps)
 
     def display(sums: Array) -> list[Array]:
-        return [display_values(m.space, sums[..., c]) for m, c in zip(g.maps, parts, strict=True)]
+        return [m.space.display_sums(sums[..., c]) for m, c in zip(g.maps, parts, strict=True)]
 
     values = sums = planes_of(g)
     targets = rendered = display(sums)
@@ -242,7 +237,7 @@ def _compare_maps(g: Gaussians, images: Images, encoding: str | None) -> Compare
         weights = np.exp(logs - logs.mean()).tolist()
         maps = tuple(m._replace(weight=w) for m, w in zip(maps, weights, strict=True))
         for m, c in zip(maps, parts, strict=True):
-            if m.space in LIGHT:  # as in `_compare`
+            if m.space.is_light:  # as in `_compare`
                 values[..., c] = sums[..., c]
     scale = np.array(channel_weights(maps), np.float32)
 
@@ -271,7 +266,7 @@ def _images_of(g: Gaussians, images: Images, encoding: str | None) -> tuple[list
             raise ValueError(
                 f"pack: map {m.name!r} has shape {image.pixels.shape}, the set needs {expected}"
             )
-    values = [values_in(image.pixels, image.space) for image in targets]
+    values = [image.space.values_of(image.pixels) for image in targets]
     return [image.pixels for image in targets], np.concatenate(values, axis=2)
 
 

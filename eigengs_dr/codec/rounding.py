@@ -27,6 +27,7 @@ from ..fitting.method import DEFAULT
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
 from ..gaussian.gaussians import Gaussians, like
+from ..image.space import DATA
 from ..raster.render import render
 from .cells import hilbert_encode
 from .egs import EgsContent
@@ -297,7 +298,7 @@ def quantize_sections(gaussians: Gaussians, steps: Steps, rows: list[slice]) -> 
 
 def planes_of(gaussians: Gaussians) -> NDArray[np.float32]:
     """Render a set in its own space, without decoding."""
-    return np.asarray(render(replace(gaussians, space="data")).numpy(), np.float32)
+    return np.asarray(render(replace(gaussians, space=DATA)).numpy(), np.float32)
 
 
 def _content(

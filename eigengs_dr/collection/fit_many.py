@@ -11,11 +11,10 @@ from ..backend.progress import shows_progress
 from ..backend.selection import name_of, select
 from ..fitting.control import Diverged
 from ..fitting.fit import Fit, fit_images
-from ..fitting.objective import is_codes
 from ..fitting.options import FitOptions, refuse_unknown
 from ..fitting.start import load_start, set_in
-from ..image.color import rendered_as
 from ..image.pixels import EncodedImage
+from ..image.space import YCBCR
 from .manifest import ImageRow, fingerprint
 from .run import Job, run_images
 from .sources import Images
@@ -137,7 +136,7 @@ def fit_many(
     job = Job(
         partial(_fit_group, options=settings),
         partial(_may_join, options=settings),
-        rendered_as(settings.space or "ycbcr") is None,
+        not (settings.space or YCBCR).is_color,
         settings.encoding,
         settings.iterations,
         _settings_of(settings),
@@ -175,7 +174,7 @@ def _is_groupable(image: EncodedImage, options: FitOptions) -> bool:
     pixels, method = image.pixels, options.method
     return (
         image.encoding == "srgb"
-        and (options.space != "data" or is_codes(pixels))
+        and (options.space or YCBCR).has_codes(pixels)
         and options.start is None
         and not method.place.has_colors
         and options.goal is None

@@ -19,8 +19,9 @@ from scipy.linalg import cholesky, solve_triangular
 
 from ..backend.doors import class_of_doors
 from ..gaussian.gaussians import Gaussians, with_colors
-from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET, to_planes
+from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET
 from ..image.resize import resample
+from ..image.space import to_planes
 from .normal_equations import NormalEquations, squared_norms
 from .pca.truncation import min_ranks_per_channel, residual_energy
 
@@ -95,7 +96,7 @@ class Encoder:
         rounding error of the colours of "coffee".
         """
         correlations = self.equations.correlate(np.moveaxis(pixels, 2, 0))
-        if self.gaussians.space == "rgb":
+        if self.gaussians.space.identical:
             return correlations
         area = self.gaussians.width * self.gaussians.height
         black = np.outer(np.append(self.equations.coverage, area), YCBCR_OFFSET)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..backend.types import Record
 from ..gaussian.file import CUTOFF, SetData, check
 from ..gaussian.gaussians import Gaussians
+from ..image.space import space_of
 from ..storage import npz
 from ..storage.npz import Field
 from .pca.basis_file import check_arrays
@@ -122,7 +123,7 @@ def from_members(arrays: dict[str, NDArray], backend: str | None) -> Record:
 def _set_of(arrays: dict[str, NDArray]) -> SetData:
     """Return the set that the arrays of a file hold."""
     parts = {key: arrays[key] for key in ("mean", "factor", "color", "background")}
-    return SetData(parts, tuple(arrays["size"].tolist()), str(arrays["space"]))
+    return SetData(parts, tuple(arrays["size"].tolist()), space_of(str(arrays["space"])))
 
 
 def check_members(arrays: dict[str, NDArray]) -> tuple[NDArray[np.float32], ...]:

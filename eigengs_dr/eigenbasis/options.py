@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..backend.arguments import plain_numbers
-from ..image.color import BASIS_SPACES
 from ..image.pixels import check_size
+from ..image.space import FAMILY_SPACES, space_of
 from .pca.basis import check_components
 from .pca.truncation import check_target
 
@@ -61,10 +61,7 @@ class TrainOptions:
                 raise ValueError(
                     "energy and target_psnr both choose the components; give one of them"
                 )
-        if self.space not in BASIS_SPACES:
-            raise ValueError(
-                f"space {self.space!r} is unknown; use one of {', '.join(BASIS_SPACES)}"
-            )
+        object.__setattr__(self, "space", space_of(self.space, FAMILY_SPACES))
         if self.preset not in STEPS:
             raise ValueError(f"preset {self.preset!r} is unknown; use one of {', '.join(STEPS)}")
         counts = {

@@ -19,8 +19,8 @@ from ..backend.progress import shows_progress
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians, one_image, scale_channels
-from ..image.metrics import float_space, target_key
 from ..image.pixels import check_weight
+from ..image.space import DATA, YCBCR, space_of
 from ..raster.render import picture_of
 from .coarse import COARSE_TO_FINE
 from .control import Redistribute, Surplus
@@ -104,7 +104,7 @@ class Fit:
     maps: dict[str, dict[str, float]] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
-        g, space = self.gaussians, "ycbcr" if self.maps else float_space(self.gaussians.space)
+        g, space = self.gaussians, "ycbcr" if self.maps else self.gaussians.space.figure
         maps = f"maps {', '.join(m.name for m in g.maps)}, " if g.maps else ""
         figures = f"psnr_{space}={self.psnr_ycbcr:.2f}, psnr_rgb={self.psnr_rgb:.2f}, "
         if math.isnan(self.psnr_ycbcr):
@@ -266,7 +266,7 @@ def fit(
     Gaussians(100, 32x32 pixels, maps albedo, roughness, cutoff=3)
     """
     started = time.perf_counter()
-    spaces, space = space, space if isinstance(space, str) else None
+    spaces, space = space, None if isinstance(space, Mapping) else space
     if image is None:
         _check_loss(loss, size, target_psnr, gaussians)
     options = FitOptions(
@@ -274,7 +274,7 @@ def fit(
         iterations=iterations,
         target_psnr=target_psnr,
         start=start,
-        space=space,
+        space=None if space is None else space_of(space),
         method=method or (COARSE_TO_FINE if image is None else DEFAULT),
         seed=seed,
         backend=backend,
@@ -322,7 +322,7 @@ def fit_images(
     start = None if source is None else load_start(source, options.backend)
     if isinstance(start, Gaussians):
         one_image(start)
-    requested = options.space or (set_in(start).space if start is not None else "ycbcr")
+    requested = options.space or (set_in(start).space if start is not None else YCBCR)
     read = [read_pixels(image, requested, weight, options.encoding) for image in images]
     pixels, space = [p for p, _ in read], read[0][1]
     height, width, channels = pixels[0].shape
@@ -362,7 +362,7 @@ def fit_images(
                 for ycbcr, rgb in figures.tolist()
             ]
 
-        figure = target_key(space, options.goal.space) if options.goal else "margin"
+        figure = options.goal.key(space) if options.goal else "margin"
         refinements, seconds_init = _refined(
             objective, options, begun, chosen, score, figure, started, progress, interrupted
         )
@@ -409,7 +409,7 @@ def fit_loss(
         raise ValueError(f"weight is for {shape} pixels, but size is {width}x{height}")
     check_channels(weight, 1 if maps else channels)
     if start is not None:
-        space = "data" if maps else views[0].space
+        space = DATA if maps else views[0].space
         check_start(start, size, channels, space, options)
         cutoff = float(options.method.cutoff)
         start = replace(start.scaled(width, height), cutoff=cutoff, maps=()).bounded()
@@ -447,7 +447,7 @@ def fit_maps(
             objective = LossObjective.of_loss(options.loss, views, objective)
 
         def score(gaussians: Gaussians) -> list[Row]:
-            row = score_maps(gaussians, objective, images, goal.space if goal else "rgb")
+            row = score_maps(gaussians, objective, images, goal)
             seconds = time.perf_counter() - started
             return [{"seconds": seconds, **objective.judged(gaussians), **row}]
 

@@ -16,7 +16,7 @@ from ..backend.arrays import ArrayTypes
 from ..backend.types import Float
 from ..gaussian.channels import TextureMap, check_maps, slices
 from ..gaussian.gaussians import Gaussians
-from ..image.color import LIGHT, SPACES, to_coded, to_log
+from ..image.space import DATA, YCBCR, space_of
 from ..storage.npz import BadValue
 from .coarse import Coarse, texel_sums
 from .descent import begin
@@ -24,7 +24,7 @@ from .loop import FitProgress, Refinement, descend, last, refine
 from .loss import Loss, LossObjective, View
 from .measure import Row
 from .method import DEFAULT
-from .objective import GREY, Data, Pixels
+from .objective import Data, Pixels
 from .options import FitOptions, max_gaussians_for
 
 Spaces: TypeAlias = "str | Mapping[str, str] | None"
@@ -36,11 +36,6 @@ MayEnd: TypeAlias = Callable[[], AbstractContextManager[None]]
 PIXELS_PER_GAUSSIAN = 16
 """Pixels of the picture per Gaussian, if nothing indicates how many the scene needs. On the scenes
 of ``bench inverse`` with the photo "coffee", it ends within 0.4 dB of the best number."""
-
-BRIGHT = 2.0
-"""Logarithm of light that a pyramid of texels is to reach, that of light 100. Of three made-up
-lights with a sun or windows, by six photos of a metal ball, 240 steps with twice the rate of light
-to 1 found 0.6 dB more in PU21."""
 
 FIRST_PIXELS = 128
 """Pixels of the picture per Gaussian, for the smallest number that a judge tries."""
@@ -54,13 +49,9 @@ def views_of_spaces(spaces: Spaces) -> tuple[list[View], tuple[TextureMap, ...]]
     ValueError
         If a space or a name is invalid.
     """
-    named = spaces if isinstance(spaces, Mapping) else {"": spaces or "ycbcr"}
-    for space in named.values():
-        if space not in SPACES:
-            raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(SPACES)}")
-    maps = tuple(
-        TextureMap(name, space, 1 if space == "data" else 3) for name, space in named.items()
-    )
+    named = spaces if isinstance(spaces, Mapping) else {"": spaces or YCBCR}
+    known = {name: space_of(space) for name, space in named.items()}
+    maps = tuple(TextureMap(name, s, 1 if s.by_range else 3) for name, s in known.items())
     if isinstance(spaces, Mapping):
         try:
             check_maps(maps, sum(m.channels for m in maps))
@@ -102,24 +93,18 @@ class Problem:
 
     def near(self, values: NDArray[np.floating]) -> LossObjective:
         """Return the objective of a loss whose best picture is near these sums, (H * W * C,)."""
-        space = "data" if self.views[0].name else self.views[0].space
+        space = DATA if self.views[0].name else self.views[0].space
         width, height = self.size
         values = np.asarray(values, np.float32).reshape(height, width, self.channels)
-        values = np.maximum(values, 0) if space in LIGHT else values
-        display = to_coded(values) if space in LIGHT else values
-        pixels = Pixels.of(Data(values, display, self.weight), space, self.types)
+        values = np.maximum(values, 0) if space.is_light else values
+        image = space.placement_image(values)
+        pixels = Pixels.of(Data(values, image, self.weight), space, self.types)
         return LossObjective.of_loss(self.loss, self.views, pixels)
 
     def grey(self) -> NDArray[np.floating]:
         """Return the sums of a pixel that is still unknown, shape (C,)."""
         low, high = self.loss.bounds or (0.0, 1.0)
-        parts = []
-        for view in self.views:
-            value = GREY if view.space in LIGHT else (low + high) / 2
-            value = float(to_log(np.float32(GREY))) if view.space == "log" else value
-            part = np.full(len(view.channels), value)
-            parts.append(np.array([0.5, 0.5, 1.0]) if view.space == "normal" else part)
-        return np.concatenate(parts)
+        return np.concatenate([v.space.grey(low, high, len(v.channels)) for v in self.views])
 
 
 def refine_loss(
@@ -204,8 +189,8 @@ def _descend_texels(
     problem: Problem, coarse: Coarse, steps: int, ended: Callable[[int], bool], may_end: MayEnd
 ) -> LossObjective:
     """Return the objective of a loss near the picture of a pyramid of texels."""
-    no_end = all(view.space == "log" for view in problem.views)
-    grey, (low, high) = problem.grey(), problem.loss.bounds or (0.0, BRIGHT if no_end else 1.0)
+    reach = min(view.space.reach for view in problem.views)
+    grey, (low, high) = problem.grey(), problem.loss.bounds or (0.0, reach)
     objective = problem.near(np.tile(grey, problem.size[0] * problem.size[1]))
     states = texel_sums(objective, coarse, steps, grey.tolist(), high - low)
     with closing(states), may_end():

@@ -22,7 +22,7 @@ from ..backend.arrays import types_of
 from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
-from ..image.color import decode, from_log, unit_codes
+from ..image.space import Space
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import forward
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
@@ -156,8 +156,7 @@ class View(NamedTuple):
     ----------
     name : str
         Name of the map, "" without maps.
-    space : str
-        Space of the channels, one of `eigengs_dr.image.color.SPACES`.
+    space : Space
     channels : range
         The channels of the set.
     scale, offset : float
@@ -165,7 +164,7 @@ class View(NamedTuple):
     """
 
     name: str
-    space: str
+    space: Space
     channels: range
     scale: float = 1.0
     offset: float = 0.0
@@ -179,23 +178,15 @@ def show(views: Sequence[View], sums: Float, channels: int) -> list[Float]:
     types, pictures = types_of(sums), []
     first = dr.arange(types.UInt, dr.width(sums) // channels) * channels
     for view in views:
-        if view[1:] in [(space, range(channels), 1.0, 0.0) for space in AS_THEY_ARE]:
+        if view.space.identical and view[2:] == (range(channels), 1.0, 0.0):
             return [sums]
         planes = [
             dr.gather(types.Float, sums, first + k, mode=dr.ReduceMode.NoConflicts)
             for k in view.channels
         ]
         planes = [dr.fma(plane, view.scale, view.offset) for plane in planes]
-        if view.space == "log":
-            planes = [from_log(plane) for plane in planes]
-        elif view.space == "normal":
-            planes = unit_codes(planes)
-        pictures.append(dr.ravel(types.FloatX(decode(view.space, planes))))
+        pictures.append(dr.ravel(types.FloatX(view.space.decode(planes))))
     return pictures
-
-
-AS_THEY_ARE = ("rgb", "linear", "radiance", "data")
-"""Spaces whose sums are the picture."""
 
 
 @dataclass

@@ -17,13 +17,12 @@ from ..backend.arguments import plain_numbers
 from ..backend.arrays import ArrayTypes
 from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space
 from ..gaussian.gaussians import Gaussians
-from ..image.color import rendered_as
-from ..image.metrics import target_key
 from ..image.pixels import ImageError
+from ..image.space import DATA, Space, space_of
 from ..storage.npz import BadValue
 from .loss import View
 from .measure import Row, psnrs
-from .objective import Data, Pixels, data_of, is_codes, picture
+from .objective import Data, Pixels, data_of, picture
 from .options import FitOptions, Goal
 from .pixels import read_pixels
 from .placement.density import squares_by_channel
@@ -68,8 +67,7 @@ class MapImage(NamedTuple):
     Attributes
     ----------
     name : str
-    space : str
-        Space of the Gaussians, one of `eigengs_dr.image.color.SPACES`.
+    space : Space
     pixels : ndarray of float32, shape (H, W, C)
         sRGB, normals or data.
     data : Data
@@ -81,7 +79,7 @@ class MapImage(NamedTuple):
     """
 
     name: str
-    space: str
+    space: Space
     pixels: Image
     data: Data
     factor: float = 1.0
@@ -133,13 +131,14 @@ def _read_map(
         weights = plain_numbers(vars(given), Map.__annotations__)
         if not MIN_WEIGHT <= weights["weight"] <= 1 / MIN_WEIGHT:
             raise ValueError(f"weight is {given.weight}; it must be from 1e-6 to 1e6")
-        pixels, space = read_pixels(given.image, given.space or usual_space(name), weight, encoding)
+        space = usual_space(name) if given.space is None else space_of(given.space)
+        pixels, space = read_pixels(given.image, space, weight, encoding)
         reached = goal.psnr if goal else None
         reached = Goal(weights["goal"]).psnr if "goal" in weights else reached
     except ValueError as error:
         text = str(error).removeprefix("image: ")
         raise type(error)(f"map {name!r}: {text}") from None
-    if rendered_as(space) is None and space != "normal":
+    if space.by_range:
         pixels = _without_copies(pixels)
     return MapImage(name, space, pixels, data_of(pixels, space), weights["weight"], reached)
 
@@ -171,7 +170,7 @@ def combine(
         curvature = np.concatenate(layers, axis=2)
         if weight is not None:
             curvature *= np.atleast_3d(weight)
-    objective = Pixels.of(Data(values, placement_images, curvature), "data", types)
+    objective = Pixels.of(Data(values, placement_images, curvature), DATA, types)
     firsts = [channels.start for channels in slices([image.map(1) for image in images])]
     pictures = [
         picture(types, image.space, [image.pixels], [image.data], weight, first, factor)
@@ -211,7 +210,7 @@ def balance(
     """
     goals = [image.goal for image in images if image.goal is not None]
     if goals:
-        peaks = [1.0 if _peak_is_one(i) else 1 / i.data.affine.scale for i in images]
+        peaks = [1.0 if i.space.has_codes(i.pixels) else 1 / i.data.affine.scale for i in images]
         logs = np.array(goals) / 20 * np.log(10)
         logs += np.log([i.data.affine.scale * p for i, p in zip(images, peaks, strict=True)])
     else:
@@ -219,11 +218,6 @@ def balance(
         logs = -0.5 * np.log(np.maximum(errors, MIN_MSE))
     factors = np.exp(logs - logs.mean()).tolist()
     return [image.factor * factor for image, factor in zip(images, factors, strict=True)]
-
-
-def _peak_is_one(image: MapImage) -> bool:
-    """Return whether the errors of a map are measured in its own units."""
-    return image.space != "data" or is_codes(image.pixels)
 
 
 def _first_errors(
@@ -245,7 +239,7 @@ def _first_errors(
 
 
 def score_maps(
-    gaussians: Gaussians, objective: Pixels, images: Sequence[MapImage], space: str = "rgb"
+    gaussians: Gaussians, objective: Pixels, images: Sequence[MapImage], goal: Goal | None = None
 ) -> Row:
     """Measure a set of all channels, each multiplied by the factor of its map.
 
@@ -266,8 +260,8 @@ def score_maps(
     ]
     row: Row = {**dict(zip(_FIGURES, means, strict=True)), "maps": by_name}
     goals = [image.goal for image in images if image.goal is not None]
-    if goals:
-        reached = [by_name[image.name][target_key(image.space, space)] for image in images]
+    if goals and goal:
+        reached = [by_name[image.name][goal.key(image.space)] for image in images]
         row["margin"] = min(psnr - goal for psnr, goal in zip(reached, goals, strict=True))
     return row
 

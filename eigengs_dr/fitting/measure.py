@@ -6,7 +6,7 @@ image. Only a few bytes go to the host.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import drjit as dr
@@ -17,18 +17,9 @@ from ..backend.arrays import types_of
 from ..backend.recording import record
 from ..backend.types import Float, Record
 from ..gaussian.gaussians import Gaussians, whole
-from ..image.color import (
-    RGB_TO_YCBCR,
-    UNBOUNDED,
-    decode,
-    from_log,
-    rendered_as,
-    to_coded,
-    to_linear,
-    to_pu21,
-    unit_codes,
-)
-from ..image.metrics import float_space, psnr_from_mse
+from ..image.color import RGB_TO_YCBCR, to_linear, to_pu21
+from ..image.metrics import psnr_from_mse
+from ..image.space import Space
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import forward, sum_by_image
 from ..raster.parameters import (
@@ -59,7 +50,7 @@ def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float
     Returns
     -------
     ndarray of float64, shape (pictures, 2, images)
-        In dB, in `eigengs_dr.image.metrics.float_space` and in "rgb", which is NaN for data that
+        In dB, in the `figure` of the space and in "rgb", which is NaN for data that
         have no codes. The sums of the squared errors of 4 pixels are in the precision of the set,
         those of the image in double.
     """
@@ -113,7 +104,7 @@ def _squared_errors(
         bases = None if base is None else read(base)
         for k, seen in enumerate(read(image)):
             sums = pixels[k][first : first + len(seen)]
-            if rendered_as(space) is None and space != "normal":
+            if space.by_range:
                 # Differences of the fitted values keep their digits.
                 error = sum(dr.square((s - v) * a) for s, v in zip(sums, seen, strict=True))
                 rendering, seen = ([dr.fma(v, a, b) for v in pixel] for pixel in (sums, seen))
@@ -121,7 +112,7 @@ def _squared_errors(
                 rendering = show(space, [dr.fma(s, a, b) for s in sums], light)
                 if bases is not None:
                     rendering = [s + v for s, v in zip(rendering, bases[k], strict=True)]
-                error = squared_difference(rendering, seen, float_space(space))
+                error = squared_difference(rendering, seen, space.figure)
             errors = error, squared_difference(rendering, seen, "rgb"), types.Float(len(seen))
             f = factors[k][0]
             totals = [t + dr.select(f > 0, e * f, 0) for t, e in zip(totals, errors, strict=True)]
@@ -132,29 +123,37 @@ def _squared_errors(
     return [*floats, *codes, *areas]
 
 
-def show(space: str, sums: list, exposure: Float | float = 1.0) -> list:
+def show(space: Space, sums: list, exposure: Float | float = 1.0) -> list:
     """Convert the channels of a pixel as `eigengs_dr.picture_of` does, light to sRGB."""
-    if space == "log":
-        sums = [from_log(channel) for channel in sums]
-    elif space == "normal":
-        sums = unit_codes(sums)
-    if space in UNBOUNDED:
-        sums = [channel * exposure for channel in sums]
-    if rendered_as(space) == "linear":
-        return [to_coded(dr.maximum(channel, 0)) for channel in sums]
-    return decode(space, sums)
+    return [space.display(channel * exposure) for channel in space.decode(sums)]
 
 
-def squared_difference(a: list, b: list, space: str) -> Float:
+def squared_difference(a: list, b: list, figure: str) -> Float:
     """Return the squared difference of two pixels, lists of channels, as `eigengs_dr.psnr` does."""
-    if space == "rgb":
-        a, b = ([dr.round(dr.clip(v, 0, 1) * 255) * (1 / 255) for v in pixel] for pixel in (a, b))
-    if space == "pu21":
-        a, b = ([to_pu21(to_linear(v)) for v in pixel] for pixel in (a, b))
-    difference = [u - v for u, v in zip(a, b, strict=True)]
-    if space == "ycbcr":
-        difference = [
-            sum(m * d for m, d in zip(row, difference, strict=True))
-            for row in RGB_TO_YCBCR.tolist()
-        ]
-    return sum(dr.square(d) for d in difference)
+    return sum(dr.square(d) for d in DIFFERENCES[figure](a, b))
+
+
+def _minus(a: list, b: list) -> list:
+    return [u - v for u, v in zip(a, b, strict=True)]
+
+
+def _in_8bit(pixel: list) -> list:
+    return [dr.round(dr.clip(v, 0, 1) * 255) * (1 / 255) for v in pixel]
+
+
+def _to_pu21(pixel: list) -> list:
+    return [to_pu21(to_linear(v)) for v in pixel]
+
+
+def _times_ycbcr(pixel: list) -> list:
+    rows = RGB_TO_YCBCR.tolist()
+    return [sum(m * v for m, v in zip(row, pixel, strict=True)) for row in rows]
+
+
+DIFFERENCES: dict[str, Callable[[list, list], list]] = {
+    "rgb": lambda a, b: _minus(_in_8bit(a), _in_8bit(b)),
+    "pu21": lambda a, b: _minus(_to_pu21(a), _to_pu21(b)),
+    "ycbcr": lambda a, b: _times_ycbcr(_minus(a, b)),
+    "data": _minus,
+}
+"""Differences of the channels of two pixels, by the space of `eigengs_dr.psnr`."""

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of, upload
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
-from ..image.color import LIGHT, UNBOUNDED, rgb_to_ycbcr, to_coded, to_linear, to_log
-from ..image.pixels import MAX_PIXEL
-from ..image.strips import by_strips
+from ..image.color import to_coded, to_linear
+from ..image.space import Affine, Extent, Space
 from ..raster.binning.lists import TileLists
 from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums, forward, residual
@@ -122,8 +121,8 @@ class Picture(NamedTuple):
 
     Attributes
     ----------
-    space : str
-        Space of the channels, one of `eigengs_dr.image.color.SPACES`.
+    space : Space
+        Space of the channels.
     image : Float
         In tile layout: sRGB; or the data as they are fitted.
     channels : slice
@@ -140,7 +139,7 @@ class Picture(NamedTuple):
         Whether the values are displayed in 8 bits: colours, normals, and data between 0 and 1.
     """
 
-    space: str
+    space: Space
     image: Float
     channels: slice
     scale: Float
@@ -164,13 +163,6 @@ class Part(NamedTuple):
 
     movable: slice
     core: tuple[slice, slice]
-
-
-class Affine(NamedTuple):
-    """The map from fitted values to those of the image: ``image = scale fitted + offset``."""
-
-    scale: float = 1.0
-    offset: float = 0.0
 
 
 class Data(NamedTuple):
@@ -202,7 +194,7 @@ class Pixels:
     ----------
     grid : Grid
     channels : int
-    space : str
+    space : Space
         Space of the sets; "data" for maps, whose pictures hold their spaces.
     model : Quadratic
         ``h (p - t)^2`` with the image t and the weight h.
@@ -218,7 +210,7 @@ class Pixels:
 
     grid: Grid
     channels: int
-    space: str
+    space: Space
     model: Quadratic
     placement_image: Float
     pictures: tuple[Picture, ...] = ()
@@ -226,13 +218,13 @@ class Pixels:
     part: Part | None = None
 
     @classmethod
-    def of(cls, data: Data | Sequence[Data], space: str, types: ArrayTypes) -> Pixels:
+    def of(cls, data: Data | Sequence[Data], space: Space, types: ArrayTypes) -> Pixels:
         """Upload an image, or a batch of images of one size.
 
         Parameters
         ----------
         data : Data, or sequence of Data
-        space : str
+        space : Space
         types : ArrayTypes
             Backend and precision of the sets.
         """
@@ -306,40 +298,8 @@ class Pixels:
         return to_tensor(values, self.grid, self.channels)
 
 
-# ---------------------------------------------------------------------------------------------
-#  From pixels to values: the space of the colours, units and weights
-# ---------------------------------------------------------------------------------------------
-
-DARKNESS, BLACK = 0.3, 0.003
-"""Exponent and smallest light I, with 1 for white, of the weight ``max(I, BLACK)^-(2 DARKNESS)`` of
-squared errors in linear light: a compromise between errors of light, which neglect the dark, and
-errors of sRGB codes, whose weight is about the square of it. With 5,000 Gaussians and
-300 steps it gains 0.7 dB of psnr_rgb over no weight, on 12 training images of ImageNet classes. It
-suits light above 1 too. Three made-up environments of 512x256 pixels, with a sun of 5,000, end at
-31.2 dB in PU21, at 29.6 without weights, at 31.5 with ``(I + 0.01)^-1``, at 29.9 and 25.5 dB
-with relative errors (0.1 and 0.01 added to I), and at 27.0 dB with the slope of PU21. Steep weights
-let bright spots vanish, which costs at most 1 per pixel, rather than spill on dark pixels."""
-
-GREY = 0.18
-"""Mean of fitted light that may exceed 1: photographic mid-grey."""
-
-
-def values_in(pixels: Image, space: str) -> Image:
-    """Convert pixels (H, W, C), sRGB or data, to the space of the colours, without copies of data.
-
-    Cost: a pass in strips over the image.
-    """
-    if space == "ycbcr":
-        return by_strips(rgb_to_ycbcr, pixels)
-    if space in LIGHT:
-        return by_strips(to_linear, pixels)
-    if space == "log":
-        return by_strips(lambda part: to_log(to_linear(part)), pixels)
-    return pixels
-
-
 def data_of(
-    pixels: Image, space: str, weight: Image | None = None, affine: Affine | None = None
+    pixels: Image, space: Space, weight: Image | None = None, affine: Affine | None = None
 ) -> Data:
     """Convert pixels (H, W, C) to the space of the colours, in units common to all images.
 
@@ -349,75 +309,23 @@ def data_of(
     ----------
     pixels : ndarray of float32, shape (H, W, C)
         sRGB, above 1 for light above 1; or data.
-    space : str
+    space : Space
     weight : ndarray of float32, shape (H, W) or (H, W, C), optional
         Factor of the squared errors. Pixels without any weight may have any value.
     affine : Affine, optional
         The unit, if these are pixels of a larger image; by default that of the pixels.
     """
-    values = values_in(pixels, space)
-    affine = affine or Extent.of(values).affine(space)
+    values = space.values_of(pixels)
+    affine = affine or space.unit(Extent.of(values))
     if affine != Affine():
         values = (values - np.float32(affine.offset)) / np.float32(affine.scale)
-    if space in LIGHT:
-        placement_image = pixels if affine == Affine() else by_strips(to_coded, values)
-        return Data(
-            values, placement_image, _product(by_strips(dark_weight, values), weight), affine
-        )
-    return Data(values, values, weight, affine)
-
-
-class Extent(NamedTuple):
-    """The smallest and the largest of some values, their sum and their number."""
-
-    low: float
-    high: float
-    total: float
-    number: int
-
-    @classmethod
-    def of(cls, values: Image) -> Extent:
-        """Return the extent of an array."""
-        total = float(values.sum(dtype=np.float64))
-        return cls(float(values.min()), float(values.max()), total, values.size)
-
-    def joined(self, other: Extent) -> Extent:
-        """Return the extent of both."""
-        low, high = min(self.low, other.low), max(self.high, other.high)
-        return Extent(low, high, self.total + other.total, self.number + other.number)
-
-    def affine(self, space: str) -> Affine:
-        """Return the unit in which values are fitted.
-
-        Data are shifted by their mean and divided by their range, since steps of colours have an
-        absolute length; so are logarithms of light. Light that may exceed 1 is divided by its mean.
-        """
-        mean, width = self.total / self.number, self.high - self.low
-        if space == "radiance":
-            return Affine(mean / GREY) if mean > 0 else Affine()
-        if space not in ("data", "log"):
-            return Affine()
-        # A constant image has no range, and rounding of its mean does not make one.
-        flat = width <= 1e-6 * max(abs(self.low), abs(self.high))
-        return Affine(1.0 if flat else width, mean)
-
-    @property
-    def is_of_codes(self) -> bool:
-        """Whether data are codes between 0 and 1, as those of textures."""
-        return self.low >= 0 and MIN_CODE < self.high <= MAX_PIXEL
-
-
-VISIBLE = 100.0
-"""Light that may exceed 1 is displayed unchanged if its mean is at most so much brighter or darker
-than `GREY`: other light is out of the range of a display, and would all look alike."""
-
-MIN_CODE = 0.1
-"""Smallest maximum of data that count as codes between 0 and 1, as in textures."""
+    placement_image = space.placement_image(values, pixels if affine == Affine() else None)
+    return Data(values, placement_image, _product(space.weight(values), weight), affine)
 
 
 def picture(
     types: ArrayTypes,
-    space: str,
+    space: Space,
     pixels: Sequence[Image],
     data: Sequence[Data],
     weight: Image | None = None,
@@ -426,13 +334,13 @@ def picture(
 ) -> Picture:
     """Return the display values of an image, or of a batch of images, for the PSNRs.
 
-    Data are measured with their range as the peak, or 1 if they are codes, see `is_codes`. Light
-    that may exceed 1 is exposed if its mean is far from `GREY`, see `VISIBLE`.
+    Data are measured with their range as the peak, or 1 if they are codes. Light that may exceed 1
+    is exposed, see `Space.exposure`.
 
     Parameters
     ----------
     types : ArrayTypes
-    space : str
+    space : Space
     pixels : sequence of ndarray of float32, shape (H, W, C)
         sRGB, normals or data.
     data : sequence of Data
@@ -445,16 +353,14 @@ def picture(
         Factor of the channels in the set.
     """
     affines, images, codes = [d.affine for d in data], list(pixels), True
-    if space == "data":
+    if space.by_range:
         images = [d.values * np.float32(factor) for d in data]
-        codes = all(map(is_codes, pixels))
+        codes = all(map(space.has_codes, pixels))
         if not codes:
             affines = [Affine(1.0, a.offset / a.scale) for a in affines]
-    exposures = [1.0] * len(images)
-    if space in UNBOUNDED:
-        exposures = [exposure_of(p) for p in images]
-        lit = zip(images, exposures, strict=True)
-        images = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
+    exposures = [space.exposure(p) for p in images]
+    lit = zip(images, exposures, strict=True)
+    images = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
     batch = np.stack(images) if len(images) > 1 else images[0]
     weights = None
     if weight is not None:
@@ -471,28 +377,9 @@ def picture(
     )
 
 
-def exposure_of(pixels: Image) -> float:
-    """Return the factor that brings light (H, W, C), in sRGB, into the range of a display."""
-    mean = float(to_linear(pixels).mean(dtype=np.float64))
-    return 1.0 if mean <= 0 or 1 / VISIBLE <= mean / GREY <= VISIBLE else GREY / mean
-
-
-def is_codes(data: Image) -> bool:
-    """Return whether data are codes between 0 and 1, as in textures."""
-    return Extent.of(data).is_of_codes
-
-
-def dark_weight(light: Image) -> Image:
-    """Return the factors of squared errors in linear light, an array of any shape.
-
-    The factors are ``max(light, BLACK)^-(2 DARKNESS)``, with 1 for white.
-    """
-    return np.asarray(np.maximum(light, BLACK) ** (-2 * DARKNESS), np.float32)
-
-
-def _product(curvature: Image, weight: Image | None) -> Image:
-    if weight is None:
-        return curvature
+def _product(curvature: Image | None, weight: Image | None) -> Image | None:
+    if curvature is None or weight is None:
+        return curvature if weight is None else weight
     return curvature * (weight if weight.ndim == 3 else weight[..., None])
 
 

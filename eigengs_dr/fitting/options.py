@@ -16,9 +16,9 @@ import numpy as np
 from ..backend.arguments import plain_numbers, takes_numbers
 from ..gaussian.file import check_index_range, check_sides
 from ..gaussian.gaussians import Gaussians
-from ..image.color import SPACES
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
+from ..image.space import Space, space_of
 from .coarse import Coarse
 from .control import Redistribute
 from .loss import Loss
@@ -80,7 +80,7 @@ class Goal:
         In dB, above 0 and at most 100.
     space : {"rgb", "ycbcr"}
         Whether it is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light above 1 have
-        only one PSNR, see `eigengs_dr.image.metrics.float_space`.
+        only one PSNR, see `key`.
     max_gaussians : int or None
         Largest number of Gaussians. By default they have at most as many parameters as the image
         has numbers: 3 Gaussians for 8 pixels in colour.
@@ -102,10 +102,22 @@ class Goal:
             raise ValueError(
                 f"target_psnr is {self.psnr}; it must be above 0 and at most {MAX_PSNR:g}"
             )
-        if self.space not in ("rgb", "ycbcr"):
+        if self.space not in GOAL_SPACES:
             raise ValueError(f"Goal: space {self.space!r} is unknown; use one of rgb, ycbcr")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1")
+
+    def key(self, space: Space) -> str:
+        """Return the key of the rows of a trace that must reach the goal.
+
+        Data, normals and light above 1 may exceed the range to which psnr_rgb clamps; for these it
+        is psnr_ycbcr, in the `figure` of the space.
+        """
+        return f"psnr_{self.space}" if space.has_rgb else "psnr_ycbcr"
+
+
+GOAL_SPACES = ("rgb", "ycbcr")
+"""Spaces of a `Goal`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +134,7 @@ class FitOptions:
     iterations: int = 1000
     target_psnr: float | Goal | None = None
     start: Start | None = None
-    space: str | None = None
+    space: Space | None = None
     method: Method = field(default=DEFAULT, repr=False)
     seed: int = 0
     backend: str | None = None
@@ -147,8 +159,8 @@ class FitOptions:
             if isinstance(count, int) and count < least:
                 raise ValueError(f"{name} is {count!r}; it must be at least {least}")
         check_encoding(self.encoding)
-        if self.space is not None and self.space not in SPACES:
-            raise ValueError(f"space {self.space!r} is unknown; use one of {', '.join(SPACES)}")
+        if self.space is not None:
+            object.__setattr__(self, "space", space_of(self.space))
         if not isinstance(self.method, Method):
             raise TypeError(f"method is {self.method!r}; pass a Method, such as eigengs_dr.DEFAULT")
         if self.method.needs_model and not isinstance(self.start, Model):

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
 from ..backend.types import PathLike, Values
-from ..image.color import rendered_as
 from ..image.io import check_data, check_image, read_image
-from ..image.pixels import MAX_PIXEL, MIN_PIXEL, EncodedImage, ImageError
+from ..image.pixels import EncodedImage
+from ..image.space import Space
 
 PixelsOrPath: TypeAlias = ArrayLike | PathLike | EncodedImage
 """An image: array_like pixels, such as a ``mitsuba.Bitmap``; pixels that know their encoding; or
@@ -22,20 +22,17 @@ Image = NDArray[np.float32]
 WHITE = 1.001
 """Largest sRGB code of light that counts as bounded by white; renderings exceed 1 by rounding."""
 
-BRIGHT = {"ycbcr": "log", "rgb": "log", "linear": "radiance"}
-"""Space of a fit of light above 1, by the requested space: textures clamp sums in the others."""
-
 
 def read_pixels(
-    image: PixelsOrPath, space: str, weight: Image | None = None, encoding: str | None = None
-) -> tuple[Image, str]:
+    image: PixelsOrPath, space: Space, weight: Image | None = None, encoding: str | None = None
+) -> tuple[Image, Space]:
     """Check an image, and convert it to display values (sRGB).
 
     Parameters
     ----------
     image : array_like
         See `eigengs_dr.fit`.
-    space : str
+    space : Space
     weight : ndarray, shape (H, W) or (H, W, C), optional
         From `check_weight`. Pixels without any weight get the value of the nearest pixel with
         weight.
@@ -45,45 +42,24 @@ def read_pixels(
     -------
     pixels : ndarray of float32, shape (H, W, 3) or (H, W, 1)
         sRGB, above 1 for light above 1; or the data. They may be the image itself.
-    space : str
-        The given space, or another if the image is light above 1, see `BRIGHT`.
+    space : Space
+        The given space, or another if the image is light above 1, see `Space.above_white`.
 
     Raises
     ------
     ImageError
         If the image is unusable.
     """
-    data = rendered_as(space) is None
-    encoded = read_image(image, data, encoding)
+    encoded = read_image(image, not space.is_color, encoding)
     if weight is not None:
         encoded = encoded._replace(pixels=_filled(encoded, weight))
-    if data:
-        return _read_data(encoded, space), space
+    if not space.is_color:
+        pixels = check_data(encoded, copy=False)
+        space.check(pixels)
+        return pixels, space
     pixels = check_image(encoded, copy=False)
-    if encoded.encoding == "linear" and pixels.max() > WHITE:
-        space = BRIGHT.get(space, space)
-    return pixels, space
-
-
-def _read_data(image: EncodedImage, space: str) -> Image:
-    """Check an image of data, one to three channels, or of normals, shape (H, W, 3)."""
-    pixels = check_data(image, copy=False)
-    if space == "normal":
-        check_normals(pixels)
-    return pixels
-
-
-def check_normals(pixels: Image) -> None:
-    """Raise ImageError unless pixels (H, W, C) are codes of normals."""
-    if pixels.shape[2] != 3:
-        raise ImageError(
-            f"image: shape {pixels.shape}; a normal map has three channels; use space 'data'"
-        )
-    if pixels.min() < MIN_PIXEL or pixels.max() > MAX_PIXEL:
-        raise ImageError(
-            f"image: normals run from {pixels.min():g} to {pixels.max():g}, not 0 to 1; pass "
-            "(n + 1) / 2"
-        )
+    bright = encoded.encoding == "linear" and pixels.max() > WHITE
+    return pixels, space.above_white if bright else space
 
 
 def check_channels(weight: Image | None, channels: int) -> None:

@@ -13,6 +13,7 @@ from ..backend.arrays import ArrayTypes, types_in, types_of
 from ..backend.selection import select
 from ..backend.types import Float
 from ..gaussian.gaussians import Fitted, Gaussians, concatenate, set_of
+from ..image.space import Space
 from .exchange import densify, in_order, prune
 from .method import Method, Model
 from .objective import Pixels
@@ -60,7 +61,7 @@ def types_for(start: Gaussians | Model | None, backend: str | None) -> ArrayType
 
 
 def check_start(
-    start: Gaussians, size: tuple[int, int], channels: int, space: str, options: FitOptions
+    start: Gaussians, size: tuple[int, int], channels: int, space: Space, options: FitOptions
 ) -> None:
     """Raise ValueError unless a start fits the image and the options."""
     count, (width, height) = len(start), size

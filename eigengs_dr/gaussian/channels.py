@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..image.color import SPACES, decode, from_sum, to_picture
+from ..image.space import DATA, LINEAR, NORMAL, SPACES, Space, space_of
 from ..storage.npz import BadValue
 
 MAX_MAP_CHANNELS = 16
@@ -34,8 +33,7 @@ class TextureMap(NamedTuple):
     ----------
     name : str
         Letters, digits, "_" and "-"; at most 32.
-    space : str
-        Colour space of the channels, one of `eigengs_dr.image.color.SPACES`.
+    space : Space
     channels : int
         Number of channels.
     weight : float
@@ -43,12 +41,12 @@ class TextureMap(NamedTuple):
     """
 
     name: str
-    space: str
+    space: Space
     channels: int
     weight: float = 1.0
 
 
-def usual_space(name: str) -> str:
+def usual_space(name: str) -> Space:
     """Return the default space of a map by its name: linear light, normals or data.
 
     Examples
@@ -58,8 +56,8 @@ def usual_space(name: str) -> str:
     """
     lower = name.lower()
     if lower in COLORS:
-        return "linear"
-    return "normal" if lower in NORMALS else "data"
+        return LINEAR
+    return NORMAL if lower in NORMALS else DATA
 
 
 def check_name(name: str) -> None:
@@ -71,14 +69,20 @@ def check_name(name: str) -> None:
         )
 
 
-def check_maps(maps: Sequence[TextureMap], channels: int) -> None:
-    """Raise `BadValue` if maps are invalid, or their total number of channels differs."""
+def check_maps(maps: Sequence[TextureMap], channels: int) -> tuple[TextureMap, ...]:
+    """Return maps whose spaces may still be names.
+
+    Raises
+    ------
+    BadValue
+        If maps are invalid, or their total number of channels differs.
+    """
     names = [m.name for m in maps]
     for m in maps:
         check_name(m.name)
         if m.space not in SPACES:
             raise BadValue(f"map {m.name!r}: space {m.space[:20]!r} is not in {', '.join(SPACES)}")
-        allowed = {"ycbcr": (3,), "normal": (3,)}.get(m.space, (1, 3))
+        allowed = space_of(m.space).map_numbers
         if m.channels not in allowed:
             numbers = " or ".join(map(str, allowed))
             raise BadValue(
@@ -96,6 +100,7 @@ def check_maps(maps: Sequence[TextureMap], channels: int) -> None:
         )
     if total != channels:
         raise BadValue(f"the maps have {total} channels, but the Gaussians have {channels}")
+    return tuple(m._replace(space=space_of(m.space)) for m in maps)
 
 
 def slices(maps: Sequence[TextureMap]) -> list[slice]:
@@ -117,24 +122,6 @@ def find_map(maps: Sequence[TextureMap], name: str) -> tuple[TextureMap, slice]:
             return texture_map, part
     names = ", ".join(m.name for m in maps)
     raise BadValue(f"no map is named {name!r}; it has {names or 'no maps'}")
-
-
-def display_values(space: str, sums: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Convert sums of Gaussians to display values: sRGB for colours.
-
-    Parameters
-    ----------
-    space : str
-    sums : ndarray of float, shape (..., C)
-
-    Returns
-    -------
-    ndarray, same shape
-        As from `eigengs_dr.picture_of`: RGB for colours; data and normals are not converted.
-    """
-    if space == "ycbcr":
-        sums = np.stack(decode(space, list(np.moveaxis(sums, -1, 0))), axis=-1)
-    return to_picture(space, from_sum(space, sums))
 
 
 def channel_weights(maps: Sequence[TextureMap]) -> list[float]:

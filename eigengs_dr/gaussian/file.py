@@ -12,8 +12,9 @@ import numpy as np
 
 from ..backend.messages import printable
 from ..backend.types import Arrays
-from ..image.color import MAX_CHANNELS, SPACES
+from ..image.color import MAX_CHANNELS
 from ..image.formats import SUFFIXES
+from ..image.space import DATA, SPACES, Space, space_of
 from ..storage import npz
 from ..storage.npz import BadValue, Field
 from . import packed
@@ -87,8 +88,8 @@ class SetData(NamedTuple):
         Mean (N, 2), factor (N, 3), color (N, C) and background (C,); see `eigengs_dr.Gaussians`.
     size : (int, int)
         Native width and height in pixels.
-    space : str
-        One of `eigengs_dr.image.color.SPACES`.
+    space : Space
+        A name too, before `check`.
     cutoff : float
         Standard deviations.
     maps : tuple of TextureMap
@@ -97,7 +98,7 @@ class SetData(NamedTuple):
 
     arrays: Arrays
     size: tuple[int, int]
-    space: str
+    space: Space
     cutoff: float = CUTOFF
     maps: tuple[TextureMap, ...] = ()
 
@@ -170,7 +171,7 @@ class SetHead(NamedTuple):
     gaussians: int
     channels: int
     size: tuple[int, int]
-    space: str
+    space: Space
     cutoff: float
     maps: tuple[TextureMap, ...]
 
@@ -190,7 +191,7 @@ def read_head(path: Path) -> SetHead:
     shape = npz.read_shapes(path, kind, version, {"color": LAYOUT["color"]})["color"]
     with file_errors(path):
         size, space, cutoff, maps = _properties(npz.read(path, kind, version, small))
-        _check_properties(shape[1], size, space, cutoff, maps)
+        space, maps = _check_properties(shape[1], size, space, cutoff, maps)
     return SetHead(shape[0], shape[1], size, space, cutoff, maps)
 
 
@@ -215,18 +216,18 @@ def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
     return FORMAT, VERSIONS[FORMAT], LAYOUT
 
 
-def _properties(members: Arrays) -> tuple[tuple[int, int], str, float, tuple[TextureMap, ...]]:
+def _properties(members: Arrays) -> tuple[tuple[int, int], Space, float, tuple[TextureMap, ...]]:
     """Return the size, the space, the cutoff and the maps from the arrays of a file."""
     size, cutoff = tuple(members["size"].tolist()), float(members["cutoff"])
     if "names" not in members:
-        return size, str(members["space"]), cutoff, ()
+        return size, _known(str(members["space"])), cutoff, ()
     columns = [members[name].tolist() for name in MAPS]
     if len({len(column) for column in columns}) > 1:
         raise BadValue("names, spaces, channels and weights differ in length")
     maps = tuple(TextureMap(*row) for row in zip(*columns, strict=True))
     if not maps:
         raise BadValue("maps are none; give each name once")
-    return size, "data", cutoff, maps
+    return size, DATA, cutoff, maps
 
 
 def maps_of(path: Path) -> tuple[TextureMap, ...]:
@@ -285,12 +286,11 @@ def read(path: Path, sections: int | None = None) -> SetData:
         else:
             members = npz.read(path, *_layout_of(path))
             data = SetData({name: members[name] for name in ARRAYS}, *_properties(members))
-        check(data)
-    return data
+        return check(data)
 
 
-def check(data: SetData) -> None:
-    """Raise `BadValue` if a part of a set is invalid.
+def check(data: SetData) -> SetData:
+    """Return a set whose spaces may still be names, or raise `BadValue` if a part is invalid.
 
     This function is used for reading and writing files, and for arrays. Shapes must match each
     other, the space and the maps. Values must be finite, a and c positive, colours within
@@ -321,7 +321,8 @@ def check(data: SetData) -> None:
             f"color and background of a channel add up to {sums.max():.3g}, the limit is "
             f"{MAX_SUM:g}; scale them"
         )
-    _check_properties(channels, size, space, cutoff, maps)
+    space, maps = _check_properties(channels, size, space, cutoff, maps)
+    return data._replace(space=space, maps=maps)
 
 
 def check_sides(size: tuple[int, ...]) -> None:
@@ -336,21 +337,26 @@ def _check_properties(
     space: str,
     cutoff: float,
     maps: tuple[TextureMap, ...],
-) -> None:
-    """Raise `BadValue` if a property of a set, apart from its arrays, is invalid."""
+) -> tuple[Space, tuple[TextureMap, ...]]:
+    """Return the spaces of a set, or raise `BadValue` if a property is invalid."""
     check_sides(size)
     if not 0 < cutoff <= MAX_CUTOFF:
         raise BadValue(f"cutoff is {cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}")
+    known = _known(space)
     if maps:
-        check_maps(maps, channels)
-        if space != "data":
+        maps = check_maps(maps, channels)
+        if known is not DATA:
             raise BadValue(f"space is {space!r}, expected 'data' for a set with maps")
-    if space not in SPACES:
-        raise BadValue(f"space is {space!r}, expected one of {', '.join(SPACES)}")
-    if space != "data" and channels not in (1, 3, 4):
-        raise BadValue(f"color has {channels} channels; space {space!r} has 1, 3 or 4")
-    if space in ("ycbcr", "normal") and channels != 3:
-        raise BadValue(f"color has {channels} channels; space {space!r} has 3")
+    known.check_channels(channels)
+    return known, maps
+
+
+def _known(name: str) -> Space:
+    """Return the space of a name in a file, or raise `BadValue`."""
+    try:
+        return space_of(name)
+    except ValueError:
+        raise BadValue(f"space is {name!r}, expected one of {', '.join(SPACES)}") from None
 
 
 MAX_VALUES = (1 << 32) - 1

@@ -22,6 +22,7 @@ from ..backend.notebook import to_html
 from ..backend.selection import BackendError, select
 from ..backend.types import Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size
+from ..image.space import YCBCR, Space, space_of
 from ..storage.npz import BadValue
 from .channels import TextureMap, find_map
 from .file import CUTOFF, Arrays, SetData, check, read, write
@@ -53,8 +54,8 @@ class Gaussians:
         Value of every pixel before the Gaussians are added.
     width, height : int
         Native size in pixels.
-    space : str
-        Colour space of the channels, one of `eigengs_dr.image.color.SPACES`.
+    space : Space
+        What the channels mean, one of `eigengs_dr.image.space.SPACES`: a string, its name.
     cutoff : float
         Standard deviations at which a Gaussian ends, in (0, 12]. The error at a point is at most
         ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the Gaussians that end
@@ -79,9 +80,13 @@ class Gaussians:
     background: Rows
     width: int
     height: int
-    space: str = "ycbcr"
+    space: Space = YCBCR
     cutoff: float = CUTOFF
     maps: tuple[TextureMap, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.space, Space) and self.width:  # `drjit.grad` makes 0 of it
+            self.space = space_of(self.space)
 
     @classmethod
     def from_arrays(
@@ -92,7 +97,7 @@ class Gaussians:
         background: ArrayLike | None = None,
         *,
         size: tuple[int, int],
-        space: str = "ycbcr",
+        space: str = YCBCR,
         backend: str | None = None,
         cutoff: float = CUTOFF,
         dtype: DTypeLike = np.float32,
@@ -124,7 +129,8 @@ class Gaussians:
             If shapes do not match, or a value is out of range or not finite.
         """
         arrays = _arrays(mean, factor, color, background)
-        return cls.from_data(SetData(arrays, size, space, cutoff, tuple(maps)), backend, dtype)
+        content = SetData(arrays, size, space, cutoff, tuple(maps))  # type: ignore[arg-type]
+        return cls.from_data(content, backend, dtype)
 
     @classmethod
     def from_data(
@@ -140,7 +146,7 @@ class Gaussians:
         arrays.setdefault("background", np.zeros(arrays["color"].shape[1:], kind))
         width, height = check_size(data.size)
         try:
-            check(data._replace(arrays=arrays, size=(width, height)))
+            data = check(data._replace(arrays=arrays, size=(width, height)))
         except BadValue as error:
             raise ValueError(f"Gaussians: {error}") from None
         types = types_in(select(backend), 8 * kind.itemsize)
@@ -595,7 +601,7 @@ def one_image(gaussians: Gaussians) -> Gaussians:
     return gaussians
 
 
-def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: str) -> Gaussians:
+def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: Space) -> Gaussians:
     """Return Gaussians of the same shapes with new colours.
 
     Parameters
@@ -603,8 +609,7 @@ def with_colors(gaussians: Gaussians, coefficients: NDArray[np.float64], space: 
     gaussians : Gaussians
     coefficients : ndarray, shape (N + 1, C)
         Colours of the Gaussians; the last row is the background.
-    space : str
-        Colour space of the channels.
+    space : Space
     """
     types = types_of(gaussians.mean)
     rows = coefficients.astype(np.float32).T

@@ -1,8 +1,7 @@
-"""Colour spaces: gamma-encoded RGB, studio-range YCbCr of ITU-R BT.601, linear light, and codes.
+"""Conversions of colour: sRGB, studio-range YCbCr of ITU-R BT.601, linear light, and its codes.
 
 Light that may exceed 1 is encoded by logarithms for fitting, and by PU21 for comparisons. A unit
-vector n is stored as ``(n + 1) / 2``, as in files of normal maps. The images of a family have one
-size and one colour space, and are stored with one row per channel.
+vector n is stored as ``(n + 1) / 2``, as in files of normal maps.
 """
 
 from __future__ import annotations
@@ -22,21 +21,6 @@ Function = Callable[..., Samples]
 
 FloatImage = NDArray[np.floating]
 """A NumPy array of floats."""
-
-SPACES = ("ycbcr", "rgb", "linear", "data", "radiance", "log", "normal")
-"""Names of the colour spaces of the channels of a set of Gaussians.
-
-``"ycbcr"`` is studio-range YCbCr / 255, ``"rgb"`` is gamma-encoded RGB, ``"linear"`` is linear RGB,
-``"radiance"`` is linear RGB that may exceed 1, ``"log"`` is its logarithm (see `to_log`),
-``"normal"`` is a normal map (see `renormalize`), and ``"data"`` is anything else (roughness,
-heights, ...), with any number of channels.
-"""
-
-LIGHT = ("linear", "radiance")
-"""Spaces in which Gaussians sum to linear light."""
-
-UNBOUNDED = ("radiance", "log")
-"""Spaces of light that may exceed 1."""
 
 MAX_CHANNELS = 64
 """Largest number of channels: a program keeps the sums of all channels of a tile in registers."""
@@ -177,84 +161,28 @@ def to_coded(linear: Samples) -> Samples:
     return select(linear <= 0.0031308, linear * 12.92, curved)
 
 
-def to_picture(space: str, rendered: FloatImage) -> FloatImage:
-    """Convert a rendering of a set to display values: linear light is encoded as sRGB.
+def slope_to_linear(coded: Samples) -> Samples:
+    """Return the derivative of `to_linear`, elementwise."""
+    select, maximum, power = _functions(coded)
+    curved = 2.4 / 1.055 * power((maximum(coded, 0.04045) + 0.055) * (1 / 1.055), 1.4)
+    return select(coded <= 0.04045, 1 / 12.92, curved)
+
+
+def clamp(values: Samples, largest: float = 1.0) -> Samples:
+    """Clamp values to [0, largest]; derivatives of Dr.Jit arrays ignore it.
 
     Parameters
     ----------
-    space : str
-        Space of the set.
-    rendered : ndarray of float, shape (..., C)
-        The result of `eigengs_dr.render`, or rows of it.
-
-    Returns
-    -------
-    ndarray, same shape and dtype
-        Negative light becomes 0; other values are not clamped.
+    values : NumPy or Dr.Jit array of floats, any shape
+    largest : float, optional
+        It may be infinite.
     """
-    if rendered_as(space) == "linear":
-        return np.asarray(to_coded(np.maximum(rendered, 0)))
-    return rendered
+    if isinstance(values, np.ndarray):
+        return np.clip(values, 0, largest)
+    import drjit as dr  # loads libLLVM
 
-
-def from_sum(space: str, summed: Samples) -> Samples:
-    """Convert sums of Gaussians to rendered values, for spaces whose decoding is not affine.
-
-    Parameters
-    ----------
-    space : str
-        Space of the set.
-    summed : ndarray of float, shape (..., C), or Dr.Jit tensor, shape (H, W, C)
-
-    Returns
-    -------
-    array, same shape and type
-        Light for ``"log"``, unit vectors for ``"normal"``; otherwise `summed`. Differentiable for
-        Dr.Jit tensors.
-    """
-    if space == "log":
-        return from_log(summed)
-    return renormalize(summed) if space == "normal" else summed
-
-
-def rendered_as(space: str) -> str | None:
-    """Return the encoding of renderings of a set of a space: "srgb", "linear", or None for data."""
-    if space in ("data", "normal"):
-        return None
-    return "srgb" if space in ("ycbcr", "rgb") else "linear"
-
-
-def decode(space: str, channels: Sequence[Samples]) -> list[Samples]:
-    """Convert YCbCr channels to RGB, and return the channels of other spaces unchanged.
-
-    Parameters
-    ----------
-    space : str
-        Colour space of the channels, one of `SPACES`.
-    channels : sequence of NumPy or Dr.Jit arrays
-        One array for each channel, all of one shape; exactly three for ``"ycbcr"``.
-
-    Returns
-    -------
-    list of arrays
-        R, G, B for ``"ycbcr"``, not clamped, in the precision of the arrays; otherwise `channels`.
-
-    Raises
-    ------
-    ValueError
-        If the space is unknown, or if it is ``"ycbcr"`` and there are not three channels.
-    """
-    if space not in SPACES:
-        raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(SPACES)}")
-    if space != "ycbcr":
-        return list(channels)
-    if len(channels) != 3:
-        raise ValueError(f"space 'ycbcr' needs 3 channels, not {len(channels)}; use space 'data'")
-    y, cb, cr = channels
-    # Python floats: a NumPy float64 scalar would promote a Dr.Jit float32 array to float64.
-    matrix = YCBCR_TO_RGB.tolist()
-    black = (-YCBCR_TO_RGB @ YCBCR_OFFSET).tolist()
-    return [a * y + b * cb + c * cr + d for (a, b, c), d in zip(matrix, black, strict=True)]
+    clamped = dr.maximum(values, 0) if math.isinf(largest) else dr.clip(values, 0, largest)
+    return dr.replace_grad(clamped, values)
 
 
 def _functions(array: Samples) -> tuple[Function, Function, Function]:
@@ -381,36 +309,32 @@ MIN_SQUARED_LENGTH = 1e-6
 """Squared length below which a vector counts as having no direction, and stays nearly zero."""
 
 
-def renormalize(codes: Samples) -> Samples:
-    """Scale the vectors of a normal map to unit length.
-
-    Parameters
-    ----------
-    codes : ndarray of float, shape (..., 3), or Dr.Jit tensor, shape (H, W, 3)
-        Codes; 0.5 encodes the component 0.
-
-    Returns
-    -------
-    array, same shape and type
-        Codes of unit vectors. Differentiable for Dr.Jit tensors.
-    """
-    if isinstance(codes, np.ndarray):
-        unit = unit_codes(list(np.moveaxis(codes, -1, 0)))
-        return np.stack(unit, axis=-1).astype(codes.dtype, copy=False)
+def by_channel(convert: Callable[[list], list], pixels: Samples) -> Samples:
+    """Convert the three channels of a Dr.Jit tensor (H, W, 3) by a function of them."""
     import drjit as dr  # loads libLLVM
 
-    flat = codes.array
+    flat = pixels.array
     Float, UInt = type(flat), dr.uint32_array_t(type(flat))
     # Gathers, because slices of tensors compile a program for every size.
     index = dr.arange(UInt, dr.width(flat))
     axis = index % 3
-    rows = [dr.gather(Float, flat, index - axis + k) for k in range(3)]
-    x, y, z = unit_codes(rows)
-    return type(codes)(dr.select(axis == 0, x, dr.select(axis == 1, y, z)), codes.shape)
+    x, y, z = convert([dr.gather(Float, flat, index - axis + k) for k in range(3)])
+    return type(pixels)(dr.select(axis == 0, x, dr.select(axis == 1, y, z)), pixels.shape)
 
 
 def unit_codes(channels: Sequence[Samples]) -> list[Samples]:
-    """Return the codes of unit vectors from three channels of codes; see `renormalize`."""
+    """Scale the vectors of a normal map to unit length.
+
+    Parameters
+    ----------
+    channels : sequence of 3 NumPy or Dr.Jit arrays
+        Codes of x, y and z; 0.5 encodes the component 0.
+
+    Returns
+    -------
+    list of arrays
+        Codes of unit vectors.
+    """
     vector = [2 * channel - 1 for channel in channels]
     square = sum((v * v for v in vector[1:]), vector[0] * vector[0])
     if isinstance(square, np.ndarray):
@@ -422,29 +346,3 @@ def unit_codes(channels: Sequence[Samples]) -> list[Samples]:
 
         scale = 0.5 * rsqrt(dr.maximum(square, MIN_SQUARED_LENGTH))
     return [v * scale + 0.5 for v in vector]
-
-
-BASIS_SPACES = ("ycbcr", "rgb")
-"""Colour spaces of an image family."""
-
-
-def to_planes(image: NDArray[np.float32], space: str) -> NDArray[np.float32]:
-    """Convert an RGB image to a colour space and separate its channels.
-
-    Parameters
-    ----------
-    image : ndarray of float32, shape (H, W, 3)
-    space : {"ycbcr", "rgb"}
-
-    Returns
-    -------
-    ndarray of float32, shape (3, H * W)
-        Each channel row by row; ``"ycbcr"`` is `eigengs_dr.image.color.rgb_to_ycbcr` in float32.
-    """
-    planes = np.ascontiguousarray(image.reshape(-1, 3).T)
-    if space == "rgb":
-        return planes
-    # Not a matrix product, because BLAS threads would compete with the decoding threads.
-    result = np.einsum("ij,jn->in", RGB_TO_YCBCR.astype(np.float32), planes)
-    result += YCBCR_OFFSET.astype(np.float32)[:, None]
-    return result

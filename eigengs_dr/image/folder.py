@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from ..backend.messages import warn
 from ..backend.types import PathLike, Record, Values
-from .color import BASIS_SPACES, to_planes
 from .formats import READ_SUFFIXES, UNREAD_SUFFIXES
 from .io import check_image, load_image
 from .pixels import ImageError, check_size
 from .remote import is_url, list_urls
 from .resize import center_crop
+from .space import FAMILY_SPACES, space_of, to_planes
 from .strips import available_cores
 
 THREADS = min(8, available_cores())
@@ -207,8 +207,7 @@ def read_blocks(
         images.
     """
     size = check_size(size)
-    if space not in BASIS_SPACES:
-        raise ValueError(f"colour space {space!r} is unknown; use one of {', '.join(BASIS_SPACES)}")
+    space = space_of(space, FAMILY_SPACES)
     if isinstance(source, str | os.PathLike):
         source = list_images(source)
     elif isinstance(source, np.ndarray):

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeGuard, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.types import Doubles, Float, Singles, Tensor
-from .color import RGB_TO_YCBCR, UNBOUNDED, rendered_as, rgb_to_ycbcr, to_linear, to_pu21
+from .color import RGB_TO_YCBCR, rgb_to_ycbcr, to_linear, to_pu21
 from .io import pixels_of, to_8bit
 from .pixels import check_weight, peak_of
 from .strips import Pixels, map_threads, strips
@@ -28,9 +28,6 @@ MAX_PSNR = 100.0
 
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the finest scale to the coarsest, Wang et al. 2003, section 3.2."""
-
-PSNR_SPACES = ("rgb", "ycbcr", "data", "pu21")
-"""Spaces in which `psnr` compares images."""
 
 
 def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb", weight: ArrayLike | None = None) -> float:
@@ -85,8 +82,8 @@ def squared_error(a: ArrayLike, b: ArrayLike, space: str, weight: ArrayLike | No
     Sums of the parts of an image add up to the sum of the image. Grey images count as three
     channels. Weights are divided by their mean. For parameters and errors see `psnr`.
     """
-    if space not in PSNR_SPACES:
-        raise ValueError(f"space {space!r} is unknown; use one of {', '.join(PSNR_SPACES)}")
+    if space not in COMPARED:
+        raise ValueError(f"space {space!r} is unknown; use one of {', '.join(COMPARED)}")
     x, y = _pair(a, b)
     factors = _weight_of(np.shape(a), weight)
 
@@ -100,45 +97,41 @@ def squared_error(a: ArrayLike, b: ArrayLike, space: str, weight: ArrayLike | No
 def _sum_squares(
     a: NDArray[np.floating], b: NDArray[np.floating], space: str, weight: Singles | None
 ) -> float:
-    """Return the sum of the squared differences of two images in a space; overwrite both."""
-    if space == "rgb":
-        for image in (a, b):
-            to_8bit(image, out=image)
-    if space == "pu21":
-        a, b = to_pu21(to_linear(a)), to_pu21(to_linear(b))
-    np.subtract(a, b, out=a)
+    """Return the sum of the squared differences of two images in a space; may overwrite both."""
+    compared = COMPARED[space]
+    difference, matrix = compared.difference(a, b), compared.matrix
     if weight is not None:
         with np.errstate(invalid="ignore"):  # pixels of weight 0 may have any value
-            squares = weight * np.square(a @ RGB_TO_YCBCR.T if space == "ycbcr" else a)
-        return float(squares.sum(where=weight > 0)) / (255**2 if space == "rgb" else 1)
-    if space == "ycbcr":
+            squares = weight * np.square(difference if matrix is None else difference @ matrix.T)
+        return float(squares.sum(where=weight > 0)) / compared.peak**2
+    if matrix is not None:
         # |M d|^2 = trace(M d d^T M^T): the sums of the products of R, G and B suffice.
-        difference = a.reshape(-1, 3)
-        products = difference.T @ difference
+        rows = difference.reshape(-1, 3)
+        products = rows.T @ rows
         with np.errstate(invalid="ignore"):  # an image that is not finite has the PSNR NaN
-            return float(np.trace(RGB_TO_YCBCR @ products @ RGB_TO_YCBCR.T))
-    np.square(a, out=a)
-    return float(a.sum()) / (255**2 if space == "rgb" else 1)
+            return float(np.trace(matrix @ products @ matrix.T))
+    return float(np.square(difference, out=difference).sum()) / compared.peak**2
 
 
-def float_space(space: str) -> str:
-    """Return the space in which psnr_ycbcr compares sets of a `space`.
-
-    Data and normals have no YCbCr, so their channels are compared directly. Light above 1 is
-    compared in PU21, which is bounded.
-    """
-    if space in UNBOUNDED:
-        return "pu21"
-    return "ycbcr" if rendered_as(space) else "data"
+def _minus(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
+    return np.subtract(a, b, out=a)
 
 
-def target_key(space: str, target_space: str) -> str:
-    """Return the key of the trace to which a target PSNR refers, for sets of a `space`.
+class _Compared(NamedTuple):
+    """How `psnr` compares two images: their difference, perhaps times a matrix, and the peak."""
 
-    It is "psnr_rgb" or "psnr_ycbcr" for images. Data, normals and light above 1 may exceed the
-    range to which psnr_rgb clamps; for these it is psnr_ycbcr, computed in `float_space`.
-    """
-    return "psnr_rgb" if target_space == "rgb" and float_space(space) == "ycbcr" else "psnr_ycbcr"
+    difference: Callable[..., NDArray[np.floating]] = _minus
+    matrix: NDArray[np.float64] | None = None
+    peak: int = 1
+
+
+COMPARED = {
+    "rgb": _Compared(lambda a, b: _minus(to_8bit(a, out=a), to_8bit(b, out=b)), peak=255),
+    "ycbcr": _Compared(matrix=RGB_TO_YCBCR),
+    "data": _Compared(),
+    "pu21": _Compared(lambda a, b: _minus(to_pu21(to_linear(a)), to_pu21(to_linear(b)))),
+}
+"""The spaces in which `psnr` compares images."""
 
 
 def psnr_from_mse(mse: float) -> float:
@@ -271,10 +264,11 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     Asilomar Conference on Signals, Systems and Computers, 2003. The variant is that of
     https://github.com/VainF/pytorch-msssim.
     """
-    if space not in ("ycbcr", "data"):
+    conversions: dict[str, Convert] = {"ycbcr": rgb_to_ycbcr, "data": np.asarray}
+    if space not in conversions:
         raise ValueError(f"space {space!r} is unknown; use 'ycbcr' or 'data'")
     x, y = _pair(a, b)
-    convert: Convert = rgb_to_ycbcr if space == "ycbcr" else np.asarray
+    convert = conversions[space]
     side = min(x.shape[:2])
     scales = max(1, sum(side >> j >= WINDOW_SIDE for j in range(len(SCALE_WEIGHTS))))
     weights = np.array(SCALE_WEIGHTS[:scales]) * (sum(SCALE_WEIGHTS) / sum(SCALE_WEIGHTS[:scales]))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..fitting.method import Method, Model
 from ..fitting.objective import Pixels
 from ..gaussian.gaussians import Gaussians
-from ..image.color import decode
+from ..image.space import Space
 from ..raster.render import batch_to_tiles
 from .gaussianimage import GAUSSIANIMAGE
 
@@ -44,10 +44,10 @@ class EigenGSMethod(Method):
         return objective, replace(gaussians, cutoff=float(self.cutoff))
 
 
-def mean_picture(mean: NDArray[np.float32], space: str) -> NDArray[np.float32]:
+def mean_picture(mean: NDArray[np.float32], space: Space) -> NDArray[np.float32]:
     """Return a mean image (H, W, C) as RGB minus the RGB of zeros, which a rendering includes."""
-    rgb = np.stack(decode(space, list(np.moveaxis(mean, 2, 0))), axis=2)
-    return np.asarray(rgb - np.array(decode(space, [0.0] * mean.shape[2]), np.float32))
+    rgb = space.decode_image(mean)
+    return np.asarray(rgb - np.array(space.decode([0.0] * mean.shape[2]), np.float32))
 
 
 EIGENGS = EigenGSMethod(**{f.name: getattr(GAUSSIANIMAGE, f.name) for f in fields(Method)})

@@ -21,6 +21,7 @@ from ..backend.types import Float, Rows
 from ..fitting.place import random_shapes
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
+from ..image.space import DATA
 from ..raster.adjoint import adjoint
 from ..raster.binning.lists import TileLists
 from ..raster.binning.tiles import Grid
@@ -99,7 +100,7 @@ def decode_shapes(rows: Sequence[Float], size: tuple[int, int]) -> Gaussians:
     types = types_of(rows[0])
     x, y, *factor = rows
     color, background = (dr.zeros(types.FloatX, (1, n)) for n in (dr.width(x), 1))
-    blank = Gaussians(types.Float2(0), types.Float3(1), color, background, *size, "data")
+    blank = Gaussians(types.Float2(0), types.Float3(1), color, background, *size, DATA)
     return CHOLESKY.decode(blank, {"mean": types.Float2(x, y), "cholesky": types.Float3(*factor)})
 
 

@@ -16,12 +16,11 @@ import numpy as np
 from ..backend.arrays import ArrayTypes, make_divisor, settle, types_of
 from ..backend.doors import door
 from ..backend.types import Float, FloatLike, Tensor, UInt, Values
-from ..gaussian.channels import display_values, slices
+from ..gaussian.channels import slices
 from ..gaussian.covariance import add_variances
 from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
 from ..gaussian.region import Region, check_region
-from ..image.color import decode, from_sum, to_picture
 from .adjoint import adjoint
 from .binning.lists import TileLists, build_lists, update_exact_exp
 from .binning.tiles import TILE, Grid
@@ -124,7 +123,7 @@ def render(
         lists = bin_gaussians(scaled, adjoint=dr.grad_enabled(parameters))
     image = rasterize(parameters, lists, scaled.cutoff)
     tensor = to_tensor(image, lists.grid, len(parameters.background))
-    return from_sum(gaussians.space, tensor)
+    return tensor if gaussians.space.affine else gaussians.space.decode_image(tensor)
 
 
 @door
@@ -213,8 +212,8 @@ def picture_of(
     image = shown.numpy()
     if gaussians.maps:
         pairs = zip(gaussians.maps, slices(gaussians.maps), strict=True)
-        return {m.name: display_values(m.space, image[..., part]) for m, part in pairs}
-    return to_picture(gaussians.space, image)
+        return {m.name: m.space.display_sums(image[..., part]) for m, part in pairs}
+    return gaussians.space.display(image)
 
 
 def _check_rows(gaussians: Gaussians) -> None:
@@ -329,11 +328,10 @@ def decode_parameters(gaussians: Gaussians) -> KernelParameters:
     Decoding is affine, so it suffices to convert N colours and the background instead of all
     pixels.
     """
-    black = decode(gaussians.space, [0.0] * gaussians.channels)
-    color = [
-        c - k for c, k in zip(decode(gaussians.space, list(gaussians.color)), black, strict=True)
-    ]
-    background = decode(gaussians.space, list(gaussians.background))
+    decode = gaussians.space.decode if gaussians.space.affine else list
+    black = decode([0.0] * gaussians.channels)
+    color = [c - k for c, k in zip(decode(list(gaussians.color)), black, strict=True)]
+    background = decode(list(gaussians.background))
     return KernelParameters(kernel_shape(gaussians), color, background)
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..backend.types import PathLike, Record
 from ..image.color import to_coded
+from ..image.space import DATA, LINEAR, RADIANCE, Space
 from ..plugins import register_plugins  # first: its error says what to install
 from ..plugins.versions import Properties, texture_kind
 
@@ -260,7 +261,7 @@ class Unsuitable(ValueError):
     """Pixels that must stay a bitmap; the message says why."""
 
 
-def space_of(pixels: NDArray[np.float32], data: bool) -> str:
+def texture_space(pixels: NDArray[np.float32], data: bool) -> Space:
     """Return the space of the Gaussians for pixels.
 
     Raises
@@ -272,9 +273,9 @@ def space_of(pixels: NDArray[np.float32], data: bool) -> str:
     if low < -0.001 or (data and high > 1.001):
         raise Unsuitable(f"values from {low:g} to {high:g}, beyond 0 and 1")
     if high > 1.001:
-        return "radiance"
+        return RADIANCE
     display = pixels if data else to_coded(pixels)
     extreme = float(((display <= 0.02) | (display >= 0.98)).all(axis=2).mean())
     if extreme >= TWO_VALUES and np.ptp(display) > 0.5:
         raise Unsuitable("a mask of two values: Gaussians would soften its edges")
-    return "data" if data else "linear"
+    return DATA if data else LINEAR

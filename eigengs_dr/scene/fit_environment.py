@@ -19,8 +19,9 @@ from skimage.transform import resize_local_mean
 from ..fitting.fit import fit
 from ..fitting.options import Goal
 from ..gaussian.gaussians import Gaussians, with_colors
-from ..image.color import LOG_SLOPE, from_log, to_coded, to_log
+from ..image.color import to_coded
 from ..image.metrics import psnr
+from ..image.space import LINEAR, LOG, RADIANCE
 from ..plugins.cone import pixel_angle
 from ..raster.render import render
 from .bitmaps import Unsuitable
@@ -90,7 +91,7 @@ def fit_environment(
         raise Unsuitable("an environment map with light below 0, or that is not finite")
     target = np.repeat(pixels.clip(0), 3 // pixels.shape[2], axis=2)
     target = _as_seen(target, scene)
-    spaces = ("log", "radiance") if target.max() > 1 + 1e-3 else ("linear",)
+    spaces = (LOG, RADIANCE) if target.max() > 1 + 1e-3 else (LINEAR,)
     max_count, reached = max(1, max_bytes // BYTES), list[str]()
     for space, more in product(spaces, CLOSER):
         goal = Goal(
@@ -131,20 +132,18 @@ def with_mean_of(target: NDArray[np.float32], gaussians: Gaussians) -> Gaussians
     Gaussians
         With other colours and another background.
     """
-    in_logarithms = gaussians.space == "log"
-    codes = np.float64(_means(gaussians))
-    codes = to_log(codes) if in_logarithms else codes
+    space = gaussians.space
+    codes = np.float64(space.from_light(_means(gaussians)))
     area = _areas(target) / _areas(target).sum()
     arrays = gaussians.to_arrays()
     rows = np.float64(np.vstack([arrays["color"], arrays["background"].reshape(1, -1)]))
     for channel, wanted in enumerate(np.einsum("hwc,hw->c", target, area)):
-        code, change = codes[..., channel], np.zeros(1 + in_logarithms)
+        code, change = codes[..., channel], np.zeros(1 if space.affine else 2)
         moves = np.stack([code, np.ones_like(code)][: len(change)])
         metric = np.linalg.pinv(np.einsum("ihw,jhw,hw->ij", moves, moves, area))
         for _ in range(NEWTON):
             light = code + np.tensordot(change, moves, 1)
-            light = from_log(light) if in_logarithms else light
-            slope = math.log1p(LOG_SLOPE) * (light + 1 / LOG_SLOPE) if in_logarithms else 1.0
+            slope, light = space.slope(light), space.to_light(light)
             rate = np.einsum("ihw,hw->i", moves, slope * area)
             step = metric @ rate
             change += step * (wanted - (light * area).sum()) / max(rate @ step, TINY)

@@ -31,9 +31,9 @@ from ..fitting.objective import Affine, Data, Pixels, restored
 from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.color import to_coded, to_linear
 from ..image.io import check_data, check_image
 from ..image.metrics import psnr as psnr_of
+from ..image.space import DATA, LINEAR, Space, space_of
 from ..plugins.cone import PIXEL
 from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
@@ -175,8 +175,8 @@ def fit_for_scene(
             "least 0 and at least 1"
         )
     return fit_seen(
-        scene, texture, image, target_psnr, space, max_gaussians, iterations, wrap_mode, encoding,
-        progress or silent,
+        scene, texture, image, target_psnr, space_of(space), max_gaussians, iterations,
+        wrap_mode, encoding, progress or silent,
     )  # fmt: skip
 
 
@@ -185,7 +185,7 @@ def fit_seen(
     texture: str | Texture | Sequence[str | Texture],
     image: ArrayLike,
     target_psnr: float,
-    space: str,
+    space: Space,
     max_gaussians: int | None,
     iterations: int,
     wrap_mode: str | Sequence[str],
@@ -199,17 +199,17 @@ def fit_seen(
     a PSNR; at most `eigengs_dr.scene.target.MARGIN` above `target_psnr`.
     """
     show("rays", 0, 1)
-    checked = check_data(image) if space == "data" else check_image(image, encoding=encoding)
+    checked = check_image(image, encoding=encoding) if space.is_color else check_data(image)
     low, high = float(checked.min()), float(checked.max())
-    if space == "data" and (low < -ROUNDING or high > 1 + ROUNDING):
+    if not space.is_color and (low < -ROUNDING or high > 1 + ROUNDING):
         raise ValueError(
             f"image: data from {low:g} to {high:g}; cameras compare data from 0 to 1: scale it"
         )
-    pixels = checked.clip(0, None if space == "radiance" else 1)
+    pixels = checked.clip(0, space.largest)
     height, width = pixels.shape[:2]
-    values = pixels if space == "data" else to_linear(pixels)
-    peak = max(1.0, float(values.max())) if space == "radiance" else 1.0
-    values, kind = values / np.float32(peak), "data" if space == "data" else "linear"
+    values = space.values_of(pixels)
+    peak = 1.0 if space.bounded else max(1.0, float(values.max()))
+    values, kind = values / np.float32(peak), LINEAR if space.is_light else DATA
     native = visibility(scene, texture, width, height, wrap_mode)
     texels, box = float(native.footprint.min() / PIXEL), Box(0, 0, width, height)
     if texels < ENOUGH:  # enlarged where it is seen: 8k texels would become 7 GB
@@ -228,7 +228,7 @@ def fit_seen(
     goal = [seen_by(values, rows, kind, peak) for rows in fine.pixel_to_texel]
 
     def seen(candidate: Image) -> tuple[float, ...]:
-        compared = "data" if kind == "data" else "rgb"
+        compared = "rgb" if kind.is_color else "data"
         pictures = (seen_by(candidate, rows, kind, peak) for rows in fine.pixel_to_texel)
         return tuple(psnr_of(a, b, compared) for a, b in zip(pictures, goal, strict=True))
 
@@ -281,12 +281,12 @@ def fit_seen(
 
 
 def _objective(
-    target: Image, weight: Image, seen: NDArray[np.bool_], count: int, space: str
+    target: Image, weight: Image, seen: NDArray[np.bool_], count: int, space: Space
 ) -> Pixels:
     """Return the objective of a fit, at `DETAIL` texels per Gaussian; cameras judge all texels."""
     times = 2 ** max(0, int(math.log2(max(1.0, seen.sum() / (DETAIL * count))) / 2))
     target, weight = shrunk(target, times), shrunk(weight, times)
-    placement_image = to_coded(target) if space == "linear" else target
+    placement_image = space.placement_image(target)
     types = types_in(select(backend_of(mi.variant())))
     return Pixels.of(Data(target, placement_image, weight), space, types)
 

@@ -23,8 +23,9 @@ from ..fitting.fit import fit
 from ..fitting.options import Goal
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import psnr
+from ..image.space import DATA
 from ..plugins.versions import Properties
-from .bitmaps import GAUSSIANS, KEPT, RELIEF, SKY, SKY_KEPT, Parsed, Unsuitable, Use, space_of
+from .bitmaps import GAUSSIANS, KEPT, RELIEF, SKY, SKY_KEPT, Parsed, Unsuitable, Use, texture_space
 from .fit_scene import FINER, fit_seen, halved
 from .rendering import Progress, pictures
 from .target import MARGIN
@@ -160,7 +161,7 @@ def fit_picture(
         pixels,
         target_psnr,
         # Raw colours are still colours; pixels in memory are usually raw.
-        space_of(pixels, use.raw and pixels.shape[2] == 1),
+        texture_space(pixels, use.raw and pixels.shape[2] == 1),
         None,
         iterations,
         [use.wrap for use in group],
@@ -200,7 +201,7 @@ def fit_relief(
         raise Unsuitable(f"{use.relief}: renderings decide, and none was asked for")
     is_height = use.relief == RELIEF["bumpmap"]
     values = (pixels @ LUMINANCE)[..., None] if is_height and pixels.shape[2] == 3 else pixels
-    space_of(values, True)  # it raises where Gaussians cannot hold them
+    texture_space(values, True)  # it raises where Gaussians cannot hold them
     height, width, _ = values.shape
     wraps = [use.wrap for use in group]
     show("rays", 0, 1)
@@ -221,7 +222,7 @@ def fit_relief(
             fitted,
             target_psnr=replace(goal, psnr=min(goal.psnr + more, 99.0)),
             iterations=iterations,
-            space="data",
+            space=DATA,
             weight=weight[..., 0],
             progress=lambda step, steps, row: show("search", step, steps),
         )

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 from scipy.sparse import csr_array
 
-from ..fitting.objective import dark_weight
-from ..image.color import to_coded
+from ..image.space import Space
 from ..plugins.cone import PIXEL
 from .visibility import Visibility
 
@@ -169,7 +168,9 @@ EVEN = 2.0
 """Standard deviation in texels of the blur of the weights, because rays hit texels unevenly."""
 
 
-def seen_by(texels: Image, rows: csr_array, space: str, peak: float = 1.0) -> NDArray[np.floating]:
+def seen_by(
+    texels: Image, rows: csr_array, space: Space, peak: float = 1.0
+) -> NDArray[np.floating]:
     """Return what the pixels of a camera see of a texture.
 
     Parameters
@@ -190,7 +191,7 @@ def seen_by(texels: Image, rows: csr_array, space: str, peak: float = 1.0) -> ND
     looks = (rows @ texels.clip(0, 1).reshape(-1, texels.shape[2]))[:, None]
     if peak > 1:
         looks = np.concatenate([looks, peak * looks], axis=1)
-    return to_coded(looks) if space == "linear" else looks
+    return np.asarray(space.display(looks))
 
 
 def smoothest_target(
@@ -222,7 +223,7 @@ def smoothest_target(
     return whole
 
 
-def error_weights(visibility: Visibility, target: Image, space: str) -> Image:
+def error_weights(visibility: Visibility, target: Image, space: Space) -> Image:
     """Return factors of the squared errors: each texel's share of the pixels.
 
     Parameters
@@ -230,7 +231,7 @@ def error_weights(visibility: Visibility, target: Image, space: str) -> Image:
     visibility : Visibility
     target : ndarray of float32, shape (H, W, C)
     space : {"linear", "data"}
-        In linear light dark texels weigh more, see `eigengs_dr.fitting.objective.dark_weight`.
+        In linear light dark texels weigh more, see `eigengs_dr.image.space.DARKNESS`.
 
     Returns
     -------
@@ -238,5 +239,5 @@ def error_weights(visibility: Visibility, target: Image, space: str) -> Image:
     """
     share = gaussian_filter(visibility.pixels, EVEN) * visibility.seen
     weight = (share / share.max())[..., None]
-    light = dark_weight(target) if space == "linear" else np.ones_like(target)
-    return (weight * light).astype(np.float32)
+    darkness = space.weight(target)
+    return (weight * (np.ones_like(target) if darkness is None else darkness)).astype(np.float32)

@@ -13,10 +13,10 @@ from ..eigenbasis.pca.basis import Eigenbasis
 from ..eigenbasis.pca.truncation import CHANNELS
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians, with_colors
-from ..image.color import decode, rendered_as
 from ..image.io import check_data, check_image, to_8bit
 from ..image.resize import resample
 from ..image.sheet import join_pictures, text_line
+from ..image.space import DATA, Space, space_of
 from ..raster.render import render
 
 ELLIPSES_SIDE = 800
@@ -86,11 +86,11 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     return _outlined(light, subset, [HIGH_COLOR] * len(subset))
 
 
-def displayed(image: ArrayLike, space: str, encoding: str | None = None) -> NDArray[np.float32]:
+def displayed(image: ArrayLike, space: Space, encoding: str | None = None) -> NDArray[np.float32]:
     """Return an image as display values, for sets of a space: sRGB, or data."""
-    if rendered_as(space) is None:
-        return check_data(image, copy=False)
-    return check_image(image, copy=False, encoding=encoding)
+    if space.is_color:
+        return check_image(image, copy=False, encoding=encoding)
+    return check_data(image, copy=False)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:
@@ -203,11 +203,11 @@ def first_components(source: EigenGS | Eigenbasis) -> list[tuple[str, Picture]]:
         planes: Picture = np.zeros(0)
         if selection:  # there are at most 13, so one program renders all
             weights = np.stack([source.weights[channel][j] for channel, j in selection], axis=1)
-            rendered = render(with_colors(source.gaussians, weights, "data")).numpy()
+            rendered = render(with_colors(source.gaussians, weights, DATA)).numpy()
             planes = np.moveaxis(rendered, 2, 0)
     else:
-        space, counts = source.space, tuple(map(len, source.components))
-        mean, selection = np.stack(decode(space, list(source.mean)), axis=2), _selected(counts)
+        space, counts = space_of(source.space), tuple(map(len, source.components))
+        mean, selection = np.stack(space.decode(list(source.mean)), axis=2), _selected(counts)
         planes = np.array([source.components[channel][j] for channel, j in selection])
     named = [("mean", _cell(mean))]
     for (channel, j), plane in zip(selection, planes, strict=True):
@@ -228,9 +228,9 @@ def _selected(components: tuple[int, ...]) -> list[tuple[int, int]]:
     ]
 
 
-def _hue(space: str, channel: int) -> NDArray[np.float32]:
+def _hue(space: Space, channel: int) -> NDArray[np.float32]:
     """Return the RGB direction of one channel of a space; its largest entry is 1."""
-    difference = np.subtract(decode(space, list(np.eye(3)[channel])), decode(space, [0.0] * 3))
+    difference = np.subtract(space.decode(list(np.eye(3)[channel])), space.decode([0.0] * 3))
     return (difference / np.abs(difference).max()).astype(np.float32)
 
 

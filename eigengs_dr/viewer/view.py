@@ -22,7 +22,6 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
-from ..image.color import UNBOUNDED, YCBCR_TO_RGB, decode, rendered_as
 from ..image.pixels import check_encoding
 from ..storage.atomic import atomic_write
 from .pictures import check_aspect, displayed, photo_uri
@@ -142,7 +141,7 @@ def view(
     views = channel_views(gaussians.channels)
     facts = {
         "set": describe_set(gaussians, levels),
-        "light": SUM_KINDS.get(gaussians.space, 0),
+        "light": gaussians.space.page_kind,
         "channels": views[0][1],
         "photo": None if pixels is None else photo_uri(pixels),
         "model": model_facts,
@@ -153,8 +152,8 @@ def view(
         facts=facts,
         model_note="" if model is None else describe_share(model),
         views=views,
-        bright=gaussians.space in UNBOUNDED,
-        color_name="Colour" if rendered_as(gaussians.space) else "Values",
+        bright=not gaussians.space.bounded,
+        color_name="Colour" if gaussians.space.is_color else "Values",
     )
     return Page(html)
 
@@ -211,18 +210,13 @@ def decoded(gaussians: Gaussians) -> tuple[NDArray[np.float64], NDArray[np.float
     arrays = gaussians.to_arrays()
     black = np.zeros_like(arrays["background"])
     rows = np.vstack([arrays["color"], arrays["background"], black]).astype(np.float64)
-    rgb = np.stack(decode(gaussians.space, list(rows.T)), axis=1)
+    rgb = gaussians.space.decode_image(rows) if gaussians.space.affine else rows
     return rgb[:-2] - rgb[-1], rgb[-2]
 
 
 def to_text(array: NDArray[np.floating], kind: str = "<f4") -> str:
     """Return the bytes of an array in base64."""
     return b64encode(np.ascontiguousarray(array, kind).tobytes()).decode()
-
-
-SUM_KINDS = {"linear": 1, "radiance": 1, "log": 2, "normal": 3}
-"""Kind of the sums of Gaussians by space: 1 is linear light, 2 logarithms of light, 3 normals;
-other spaces have 0, codes or data."""
 
 
 def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:
@@ -245,12 +239,6 @@ MAX_WEIGHT_BYTES = 1 << 20
 MIN_COMPONENTS = 8
 """Number of components of each channel that a page always has: those with a slider."""
 
-NAMES = {
-    "ycbcr": ("Brightness (Y)", "Yellow to blue (Cb)", "Green to red (Cr)"),
-    "rgb": ("Red", "Green", "Blue"),
-}
-"""Names of the channels of a model, by its space."""
-
 
 def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> Record:
     """Return the components of a model for a page.
@@ -264,7 +252,7 @@ def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> 
     space, counts = model.gaussians.space, kept_counts(model)
     deviations = [np.sqrt(v[:n]) for v, n in zip(model.eigenvalues, counts, strict=True)]
     channels = []
-    for name, weights, deviation in zip(NAMES[space], model.weights, deviations, strict=True):
+    for name, weights, deviation in zip(space.names, model.weights, deviations, strict=True):
         kept = weights[: len(deviation)]
         scales = np.abs(kept).max(axis=1, initial=0)
         scales = np.where(scales > 0, scales, 1)
@@ -278,8 +266,7 @@ def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> 
             for values, d in zip(model.project(image), deviations, strict=True)
         ]
         photo = {"color": to_text(color), "background": background.tolist(), "scores": scores}
-    matrix = YCBCR_TO_RGB if space == "ycbcr" else np.eye(3)
-    return {"matrix": matrix.tolist(), "channels": channels, "photo": photo}
+    return {"matrix": space.to_rgb.tolist(), "channels": channels, "photo": photo}
 
 
 def kept_counts(model: EigenGS) -> list[int]:

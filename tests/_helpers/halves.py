@@ -8,6 +8,7 @@ import eigengs_dr as eg
 from eigengs_dr.backend.arrays import types_in, types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.objective import Data, Pixels, data_of
+from eigengs_dr.image.space import space_of
 from eigengs_dr.raster.render import picture_of, render, to_tensor
 
 SIDE = 32
@@ -24,7 +25,9 @@ def picture(seed=0):
 
 def objective_of(image, backend=None, space="ycbcr", weight=None):
     """The squared error of an RGB image in a space of colours."""
-    return Pixels.of(data_of(image, space, weight), space, types_in(select(backend)))
+    return Pixels.of(
+        data_of(image, space_of(space), weight), space_of(space), types_in(select(backend))
+    )
 
 
 def objective_for(gaussians, target, weight=None):

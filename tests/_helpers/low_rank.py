@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 
 from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
-from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.io import check_image
+from eigengs_dr.image.space import to_planes
 
 WIDTH, HEIGHT = SIZE = (14, 11)
 PIXELS = WIDTH * HEIGHT

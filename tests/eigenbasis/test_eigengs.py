@@ -16,9 +16,9 @@ from _helpers.families import (
 )
 from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.solve import solve
-from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resample
+from eigengs_dr.image.space import to_planes
 
 
 def test_one_seed_one_model(backend):

@@ -5,7 +5,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import small_model, splits
-from eigengs_dr.image.color import to_planes
+from eigengs_dr.image.space import to_planes
 
 
 def shown(model, coefficients):

@@ -14,9 +14,9 @@ from eigengs_dr.fitting.fit import FitInterrupted, fit
 from eigengs_dr.fitting.method import DEFAULT
 from eigengs_dr.fitting.options import default_count
 from eigengs_dr.fitting.place import Adaptive, Grid, Random, gaussians_at, grid_of
-from eigengs_dr.image.color import SPACES
 from eigengs_dr.image.io import sample, save_image
 from eigengs_dr.image.metrics import psnr
+from eigengs_dr.image.space import SPACES
 from eigengs_dr.raster.render import render
 
 places = pytest.mark.parametrize("place", [Adaptive(), Grid(), Random()], ids=repr)

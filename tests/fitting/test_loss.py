@@ -15,6 +15,7 @@ from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.coarse import Coarse, enlarge, levels_of, shrink, texel_sums
 from eigengs_dr.fitting.loss import LossObjective, View
 from eigengs_dr.fitting.objective import Data, Pixels
+from eigengs_dr.image.space import RGB, space_of
 
 SIDE = 48
 TYPES = types_in(select("llvm"))
@@ -271,7 +272,7 @@ def test_a_step_without_a_derivative_moves_nothing(weighed):
     for every, number in ((3, 18), (1000, 13)):  # the first step rests
         loss = eg.Loss(lambda p, s, n=every: weighed(p, 1.0 if s % n else 0.0))
         base = Pixels.of(Data(values, values), "rgb", TYPES)
-        objective = LossObjective.of_loss(loss, [View("", "rgb", range(3))], base)
+        objective = LossObjective.of_loss(loss, [View("", RGB, range(3))], base)
         *_, last = texel_sums(objective, replace(Coarse(), decay=1.0), number, [0.5] * 3)
         ends.append(last.numpy())
     np.testing.assert_array_equal(*ends)
@@ -521,7 +522,7 @@ def test_the_slope_is_a_finite_difference(backend, space):
         return dr.sum(dr.square(picture - target) * (1 + picture), axis=None)
 
     base = Pixels.of(Data(values.astype(np.float32), values.astype(np.float32)), space, double)
-    view = View("", space, range(3), 0.9, 0.05)
+    view = View("", space_of(space), range(3), 0.9, 0.05)
     objective = LossObjective.of_loss(eg.Loss(loss), [view], base)
     rows = double.Float(values.ravel())
     value, slopes, size = objective.derivative(objective.seen(rows))
@@ -551,7 +552,7 @@ def test_the_curvature_of_the_squared_error_is_its_weight():
         error = picture - type(picture)(image)
         return dr.sum(dr.square(error) * type(picture)(weight), axis=None)
 
-    objective = LossObjective.of_loss(eg.Loss(loss), [View("", "rgb", range(3))], base)
+    objective = LossObjective.of_loss(eg.Loss(loss), [View("", RGB, range(3))], base)
     near = objective.around(gaussians)
     curvature = near.model.curvature.numpy().reshape(-1, base.grid.pixels)
     assert (curvature.max(axis=1) - curvature.min(axis=1) <= 1e-6).all()

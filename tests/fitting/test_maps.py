@@ -163,7 +163,7 @@ ROUGH = SMALL["roughness"]
         (
             {"roughness": eg.Map(ROUGH, space="hsv")},
             {},
-            "map 'roughness': space 'hsv' is not in ycbcr",
+            "map 'roughness': space 'hsv' is unknown; use one of ycbcr",
         ),
         ({"albedo": eg.Map(SMALL["albedo"], weight=0)}, {}, "'albedo': weight is 0; it must be"),
         ({"albedo": eg.Map(SMALL["albedo"], weight=np.nan)}, {}, "weight is nan; it must be"),

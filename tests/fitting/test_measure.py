@@ -8,7 +8,7 @@ from _helpers.sets import random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.fitting.measure import psnrs
 from eigengs_dr.fitting.objective import Data, picture
-from eigengs_dr.image.metrics import float_space
+from eigengs_dr.image.space import space_of
 from eigengs_dr.raster.render import batch_to_tiles
 
 
@@ -20,11 +20,11 @@ def near(image, seed=0):
 
 def shown(gaussians, image, space, weight=None):
     """What a set shows of an image that is fitted as it is."""
-    return picture(types_of(gaussians.mean), space, [image], [Data(image, image)], weight)
+    return picture(types_of(gaussians.mean), space_of(space), [image], [Data(image, image)], weight)
 
 
 def expected(rendered, image, space):
-    return [eg.psnr(rendered, image, space=name) for name in (float_space(space), "rgb")]
+    return [eg.psnr(rendered, image, space=name) for name in (space_of(space).figure, "rgb")]
 
 
 @pytest.mark.parametrize("space", ["ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"])

@@ -12,8 +12,8 @@ from _helpers.halves import objective_of, picture
 from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Surplus
 from eigengs_dr.fitting.place import Grid, Random
 from eigengs_dr.fitting.start import keep_fitting
-from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.resize import resample
+from eigengs_dr.image.space import to_planes
 from eigengs_dr.paper.eigengs import EIGENGS
 
 places = pytest.mark.parametrize("place", [Grid(), Random()], ids=repr)

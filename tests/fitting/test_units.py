@@ -5,6 +5,7 @@ import pytest
 
 import eigengs_dr as eg
 from eigengs_dr.fitting.objective import Affine, Extent, data_of, fitted, restored
+from eigengs_dr.image.space import DATA, RGB
 
 SIDE = 40
 
@@ -87,15 +88,15 @@ def test_constant_data_are_exact(value):
 def test_the_unit_of_data(channels):
     """Mean 0 and range 1, and back."""
     pixels = np.random.default_rng(0).uniform(-3, 5, (9, 8, channels)).astype(np.float32)
-    data = data_of(pixels, "data")
+    data = data_of(pixels, DATA)
     assert data.values.mean() == pytest.approx(0, abs=1e-6)
     assert np.ptp(data.values) == pytest.approx(1)
     np.testing.assert_allclose(
         data.values * data.affine.scale + data.affine.offset, pixels, atol=1e-5
     )
     extent = Extent.of(pixels[:4]).joined(Extent.of(pixels[4:]))
-    np.testing.assert_allclose(extent.affine("data"), data.affine, rtol=1e-6)
-    assert data_of(pixels, "rgb").affine == Affine()
+    np.testing.assert_allclose(DATA.unit(extent), data.affine, rtol=1e-6)
+    assert data_of(pixels, RGB).affine == Affine()
 
 
 @pytest.mark.parametrize("space", ["linear", "log"])

@@ -6,8 +6,8 @@ import pytest
 import eigengs_dr as eg
 from _helpers.photos import coffee
 from eigengs_dr.fitting.pixels import read_pixels
-from eigengs_dr.image.color import to_planes
 from eigengs_dr.image.pixels import check_weight
+from eigengs_dr.image.space import DATA, to_planes
 
 SIDE = 48
 QUICK = {"gaussians": 80, "iterations": 110}
@@ -164,5 +164,5 @@ def test_weights_have_the_mean_1():
 
 def test_pixels_without_weight_get_the_nearest_value():
     row = np.array([[1.0, np.nan, np.nan, np.nan, 2.0]])
-    pixels, _ = read_pixels(row, "data", np.array([[1, 0, 0, 0, 1.0]]))
+    pixels, _ = read_pixels(row, DATA, np.array([[1, 0, 0, 0, 1.0]]))
     assert pixels.ravel().tolist() in ([1, 1, 1, 2, 2], [1, 1, 2, 2, 2])

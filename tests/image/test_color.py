@@ -14,10 +14,10 @@ from eigengs_dr.image.color import (
     to_coded,
     to_linear,
     to_log,
-    to_picture,
     to_pu21,
     ycbcr_to_rgb,
 )
+from eigengs_dr.image.space import space_of
 
 PRECISION = {np.float32: 2e-6, np.float64: 1e-14}
 
@@ -149,5 +149,6 @@ def test_pu21_of_known_luminances():
 
 @pytest.mark.parametrize("space", ["linear", "radiance", "log"])
 def test_pictures_are_coded(space):
-    np.testing.assert_array_equal(to_picture(space, LIGHT), to_coded(np.maximum(LIGHT, 0)))
-    assert to_picture("rgb", LIGHT) is LIGHT
+    coded = to_coded(np.maximum(LIGHT, 0))
+    np.testing.assert_array_equal(space_of(space).display(LIGHT), coded)
+    assert space_of("rgb").display(LIGHT) is LIGHT

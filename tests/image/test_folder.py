@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from _helpers.errors import refused
 from _helpers.low_rank import planes
-from eigengs_dr.image.color import rgb_to_ycbcr, to_planes
+from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.folder import (
     MAX_WAITING,
     MAX_WAITING_BYTES,
@@ -22,6 +22,7 @@ from eigengs_dr.image.folder import (
 from eigengs_dr.image.io import ImageError, check_image, save_image
 from eigengs_dr.image.pixels import check_size
 from eigengs_dr.image.resize import center_crop
+from eigengs_dr.image.space import to_planes
 
 WIDTH, HEIGHT = SIZE = (6, 5)
 

@@ -8,8 +8,8 @@ import pytest
 import eigengs_dr as eg
 from _helpers.sets import random_scene
 from eigengs_dr.backend.selection import select
-from eigengs_dr.image.color import renormalize
 from eigengs_dr.image.pixels import ImageError
+from eigengs_dr.image.space import NORMAL
 
 
 def bumps(side=24):
@@ -26,17 +26,17 @@ def lengths(codes):
 
 
 def test_unit_vectors_stay_and_others_get_the_length_1():
-    np.testing.assert_allclose(renormalize(bumps()), bumps(), atol=1e-6)
+    np.testing.assert_allclose(NORMAL.decode_image(bumps()), bumps(), atol=1e-6)
     short = 0.5 + 0.3 * (bumps() - 0.5)
-    np.testing.assert_allclose(renormalize(short), bumps(), atol=1e-6)
-    assert np.isfinite(renormalize(np.full((1, 1, 3), 0.5))).all()
+    np.testing.assert_allclose(NORMAL.decode_image(short), bumps(), atol=1e-6)
+    assert np.isfinite(NORMAL.decode_image(np.full((1, 1, 3), 0.5))).all()
 
 
 def test_a_rendering_is_the_sum_renormalised(backend):
     g = random_scene(3).on(backend, space="normal")
     summed = eg.render(replace(g, space="data")).numpy()
-    np.testing.assert_allclose(eg.render(g).numpy(), renormalize(summed), atol=2e-6)
-    np.testing.assert_allclose(eg.picture_of(g), renormalize(summed), atol=2e-6)
+    np.testing.assert_allclose(eg.render(g).numpy(), NORMAL.decode_image(summed), atol=2e-6)
+    np.testing.assert_allclose(eg.picture_of(g), NORMAL.decode_image(summed), atol=2e-6)
 
 
 @pytest.mark.parametrize("mode", ["backward", "forward"])
@@ -46,11 +46,11 @@ def test_derivatives_of_the_length(backend, mode):
     random = np.random.default_rng(0)
     codes, along = random.uniform(0, 1, (2, 3, 4, 3))
     weight, step = random.normal(size=(3, 4, 3)), 1e-6
-    sides = [np.sum(weight * renormalize(codes + d * along)) for d in (-step, step)]
+    sides = [np.sum(weight * NORMAL.decode_image(codes + d * along)) for d in (-step, step)]
     expected = (sides[1] - sides[0]) / (2 * step)
     x = Tensor(codes)
     dr.enable_grad(x)
-    y = renormalize(x)
+    y = NORMAL.decode_image(x)
     if mode == "backward":
         dr.backward(dr.sum(y * Tensor(weight), axis=None))
         found = np.sum(dr.grad(x).numpy() * along)

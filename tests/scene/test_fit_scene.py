@@ -13,6 +13,7 @@ from _helpers.sets import few
 from eigengs_dr.fitting.descent import begin
 from eigengs_dr.fitting.loop import descend, last
 from eigengs_dr.image.color import to_coded, to_linear
+from eigengs_dr.image.space import DATA
 from eigengs_dr.plugins import texture_of
 from eigengs_dr.scene import fit_scene as scenefit
 from eigengs_dr.scene.target import _blur_by, back_project, error_weights, extrapolate
@@ -33,7 +34,7 @@ class TestTarget:
         footprint = np.full((side, side), 0.4, np.float32)
         footprint[30:] = np.inf
         grey = np.full((side, side, 3), 0.5, np.float32)
-        weight = error_weights(Visibility(footprint, [rows]), grey, "data")
+        weight = error_weights(Visibility(footprint, [rows]), grey, DATA)
         assert (weight[30:] == 0).all() and weight.shape == grey.shape
         np.testing.assert_allclose(weight[10, 35] / weight[10, 5], 4, rtol=1e-3)
 
@@ -104,7 +105,7 @@ class TestFit:
     def test_few_gaussians_for_a_large_smooth_target(self):
         large = gaussian_filter(np.kron(photo(), np.ones((4, 4, 1)))[:189, :187], (8, 8, 0))
         target, seen = large.astype(np.float32), np.ones(large.shape[:2], bool)
-        objective = scenefit._objective(target, np.ones_like(target), seen, 40, "data")
+        objective = scenefit._objective(target, np.ones_like(target), seen, 40, DATA)
         assert objective.grid.width * objective.grid.height < seen.size / 3
         start = eg.DEFAULT.place_and_solve(objective, 40)
         found = last(descend(objective, eg.DEFAULT, begin(start), STEPS), start).scaled(187, 189)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...backend.doors import door
 from ...gaussian.gaussians import Gaussians, concatenate, with_colors
 from ...image.metrics import psnr_from_mse
+from ...image.space import space_of
 from ...paper.joint_training import State, joint_shapes, joint_weights, train_jointly
 from ..normal_equations import BATCH, NormalEquations, squared_norms
 from ..options import TrainOptions
@@ -88,7 +89,7 @@ def fit_model(
     pairs = zip(basis.eigenvalues, fitted, strict=True)
     error = sum(float(values @ errors) for values, (_, errors) in pairs)
     return {
-        "gaussians": with_colors(gaussians, mean.T, basis.space),
+        "gaussians": with_colors(gaussians, mean.T, space_of(basis.space)),
         "weights": tuple(rows for rows, _ in fitted),
         "eigenvalues": basis.eigenvalues,
         "mean_image": basis.mean,

@@ -15,11 +15,11 @@ from ...backend.arguments import takes_numbers
 from ...backend.messages import warn
 from ...backend.notebook import to_html
 from ...backend.progress import shows_progress
-from ...image.color import to_planes, ycbcr_to_rgb
 from ...image.folder import TrainingImages
 from ...image.io import check_image
 from ...image.pixels import check_size
 from ...image.resize import resample
+from ...image.space import space_of, to_planes
 from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
 from .incremental import orient, rank_for
 from .stream import find_states
@@ -260,7 +260,7 @@ class Eigenbasis:
 def _rgb(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
     """Convert planes (C, H, W) of a colour space to RGB (H, W, 3)."""
     image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
-    return ycbcr_to_rgb(image) if space == "ycbcr" else image
+    return np.asarray(space_of(space).decode_image(image))
 
 
 def check_components(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.types import Record
-from ...image.color import BASIS_SPACES
+from ...image.space import FAMILY_SPACES
 from ...storage import npz
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ def check_arrays(arrays: Mapping[str, NDArray], shapes: Mapping[str, tuple[int, 
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
             raise npz.BadValue(f"{name} has shape {arrays[name].shape}, expected {shape}")
-    if arrays["space"] not in BASIS_SPACES:
-        known = ", ".join(BASIS_SPACES)
+    if arrays["space"] not in FAMILY_SPACES:
+        known = ", ".join(FAMILY_SPACES)
         raise npz.BadValue(f"space is {str(arrays['space'])!r}, expected one of {known}")
     pixels = arrays.get("mean_image", arrays["mean"])[0].size
     for c in range(3):
