@@ -3,6 +3,7 @@
 from . import paper as paper
 from . import plugins as plugins
 from .backend.executor import ClusterError
+from .backend.interrupts import Interrupted
 from .backend.recording import exclusive
 from .backend.selection import BackendError
 from .blocks.fit_large import LargeFit, fit_large
@@ -12,11 +13,11 @@ from .collection.manifest import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.coarse import COARSE_TO_FINE, Coarse
-from .fitting.fit import Fit, FitInterrupted, fit
+from .fitting.fit import Fit, fit
 from .fitting.loss import Loss
-from .fitting.maps import Map
 from .fitting.method import DEFAULT, Method
 from .fitting.options import Goal, level_counts
+from .fitting.problem import Map
 from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, sample, save_image
 from .image.metrics import ms_ssim, psnr, ssim
@@ -37,11 +38,11 @@ __all__ = [
     "EigenGS",
     "Eigenbasis",
     "Fit",
-    "FitInterrupted",
     "Gaussians",
     "Goal",
     "ImageError",
     "ImageRow",
+    "Interrupted",
     "LargeFit",
     "Loss",
     "Map",

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 import eigengs_dr as eg
 from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate
 from eigengs_dr.fitting.descent import State, begin
+from eigengs_dr.fitting.fit import begin_fit
 from eigengs_dr.fitting.loop import descend
-from eigengs_dr.fitting.objective import Pixels, data_of, picture
+from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.pixels import read_pixels
 from eigengs_dr.fitting.place import Adaptive
-from eigengs_dr.fitting.start import load_start, set_in, start_from, types_for
+from eigengs_dr.fitting.problem import problem_of_images
 from eigengs_dr.image.metrics import MAX_PSNR
-from eigengs_dr.image.space import YCBCR
 from eigengs_dr.paper.eigengs import EIGENGS
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
@@ -54,23 +53,11 @@ class Run(NamedTuple):
 
 def start(image: Image, options: FitOptions) -> Run:
     """Start as `eigengs_dr.fit` does, which does not expose the state after each step."""
-    method, source = options.method, None
-    if options.start is not None:
-        source = load_start(options.start, options.backend)
-    space = options.space or (set_in(source).space if source is not None else YCBCR)
-    pixels, space = read_pixels(image, space)
-    height, width = pixels.shape[:2]
-    data = data_of(pixels, space)
-    types = types_for(source, options.backend)
-    display = picture(types, space, [pixels], [data])
-    objective = replace(Pixels.of(data, space, types), pictures=(display,))
-    if source is None:
-        count = options.count_for(width * height)
-        placed = method.place_and_solve(objective, count, options.seed)
+    problem, method = problem_of_images([image], options), options.method
+    objective, begun, chosen = begin_fit(problem)
+    if begun is None:
+        placed = method.place_and_solve(objective, problem.first_count, options.seed)
         return Run(objective, begin(placed, chosen=method.place != Adaptive()))
-    objective, begun, chosen = start_from(
-        source, objective, method, pixels, options.iterations, options.seed
-    )
     base = objective.pictures[0].base
     mean_image = 0.0 if base is None else objective.picture(base).numpy()
     return Run(objective, begin(begun, chosen=chosen), mean_image)

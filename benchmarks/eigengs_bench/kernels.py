@@ -17,11 +17,10 @@ from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.control import Perturb, Relocate
 from eigengs_dr.fitting.descent import begin
-from eigengs_dr.fitting.loop import descend, last, refine
-from eigengs_dr.fitting.measure import psnrs
-from eigengs_dr.fitting.objective import Pixels, data_of, picture
+from eigengs_dr.fitting.loop import Descent, descend, last, refine
+from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.problem import problem_of_images
 from eigengs_dr.image.resize import center_crop
-from eigengs_dr.image.space import YCBCR
 from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters
 from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize
@@ -162,20 +161,17 @@ def pixels_inside(scene: eg.Gaussians) -> int:
 def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     """Time a refinement, its steps alone, and a round of relocation."""
     photo, method = center_crop(eg.sample("astronaut"), SIDE, SIDE), eg.DEFAULT
-    data = data_of(photo, YCBCR)
-    display = picture(types, YCBCR, [photo], [data])
-    objective = replace(Pixels.of(data, YCBCR, types), pictures=(display,))
+    problem = problem_of_images([photo], FitOptions(backend=types.backend))
+    objective = problem.pixels()
     start = method.place_and_solve(objective, COUNT)
     bare = replace(method, controls=())
     moves = [c for c in method.controls if isinstance(c, (Relocate, Perturb))]
     first = moves[0].steps(LONG)[0]
 
-    def score(gaussians: eg.Gaussians) -> list[Row]:
-        [[[reached], _]] = psnrs(gaussians, objective.pictures).tolist()
-        return [{"psnr_ycbcr": reached}]
+    measured = Descent(objective, method, lambda g: problem.measure(g, objective, 0.0))
 
     def whole() -> eg.Gaussians:
-        return refine(objective, method, begin(start), FIT_STEPS, score)[0].gaussians
+        return refine(measured, begin(start), FIT_STEPS)[0].gaussians
 
     def steps() -> eg.Gaussians:
         return last(descend(objective, bare, begin(start), FIT_STEPS), start)

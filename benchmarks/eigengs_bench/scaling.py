@@ -24,7 +24,7 @@ from eigengs_dr.backend.arrays import ArrayTypes, types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.descent import begin
 from eigengs_dr.fitting.loop import descend
-from eigengs_dr.fitting.objective import Pixels, data_of
+from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solve import solve
 from eigengs_dr.image.resize import center_crop
@@ -112,9 +112,9 @@ def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
 
 def _place(image: Image, count: int, types: ArrayTypes) -> tuple[Pixels, eg.Gaussians, float]:
     """Upload an image and place Gaussians; also return the seconds of each."""
-    data = data_of(image, YCBCR)
+    values = YCBCR.values_of(image)
     started = time.perf_counter()
-    objective = Pixels.of(data, YCBCR, types)
+    objective = Pixels.of(values, YCBCR, types)
     placed = place_adaptive(objective, count)
     dr.sync_thread()
     return objective, placed, time.perf_counter() - started

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 NAME = "eigengs-dr"
 """Name of the program; every line on standard error starts with it."""
@@ -76,6 +77,20 @@ def _ignore_signals() -> None:
     """Ignore signals: the exit is under way, and Python is about to drop its handlers."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+
+
+class Interrupted(KeyboardInterrupt):
+    """A long call was interrupted, by Ctrl-C, SIGTERM, or a `KeyboardInterrupt` of a user function.
+
+    Attributes
+    ----------
+    result : object
+        What the call has so far, of the kind that it returns.
+    """
+
+    def __init__(self, result: Any, message: str) -> None:
+        super().__init__(message)
+        self.result = result
 
 
 @contextmanager

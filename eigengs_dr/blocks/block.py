@@ -32,16 +32,16 @@ from ..fitting.control import Redistribute, Relocate
 from ..fitting.descent import State, begin
 from ..fitting.loop import descend, last
 from ..fitting.method import Method
-from ..fitting.objective import Affine, Extent, Part, Pixels, data_of
+from ..fitting.objective import Channels, Part, Pixels, Target, pixels_of
 from ..fitting.options import FitOptions
-from ..fitting.pixels import WHITE
 from ..fitting.placement.adaptive import density_from_hessian, place_by_density, shift_of
 from ..fitting.placement.density import Owners, density_ratio, squared_error
 from ..fitting.placement.filters import Canvas
+from ..fitting.problem import WHITE
 from ..fitting.solve import solve
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
-from ..image.space import YCBCR, Space
+from ..image.space import YCBCR, Affine, Extent, Space
 from ..raster.render import to_tensor
 from .grid import Block
 from .windows import Window
@@ -163,8 +163,9 @@ def survey(task: PlaceTask, settings: Settings) -> Surveyed:
 def _objective(task: PlaceTask | FitTask, settings: Settings) -> Pixels:
     """Return the objective of a window."""
     types = types_in(select(settings.options.backend))
-    data = data_of(task.window.read(), settings.space, affine=settings.affine)
-    return Pixels.of(data, settings.space, types)
+    target = Target.of(task.window.read(), settings.space, settings.affine)
+    part = slice(0, target.pixels.shape[2])
+    return pixels_of([Channels("", settings.space, part, (target,))], types)
 
 
 def _density(objective: Pixels, settings: Settings) -> tuple[Canvas, Float, Float]:

@@ -184,7 +184,8 @@ def fit_large(
         data = run.fit()
         errors = run.measure(data)
         ycbcr, rgb = (psnr_from_mse(e / (3 * source.width * source.height)) for e in errors)
-        result = restored(Gaussians.from_data(data, backend), run.settings.affine)
+        fitted = Gaussians.from_data(data, backend)
+        result = restored(fitted, [run.settings.affine] * fitted.channels)
         if output is not None:
             name = Path(image).name if isinstance(image, (str, os.PathLike)) else ""
             write(output, result.data(), FitFigures(ycbcr, rgb, iterations, name))

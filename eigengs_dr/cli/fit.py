@@ -288,7 +288,7 @@ def _fit_at_once(
             target = {key: eg.Map(image[key], m.space) for key, m in maps.items()}
         try:
             result = eg.fit(target, progress=partial(show, name), **vars(settings))
-        except eg.FitInterrupted as interrupt:
+        except eg.Interrupted as interrupt:
             result = interrupt.result
             print_message(f"interrupted; the best fit so far is in {output}")
         replace(result, source=name).save(output)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.arrays import types_of
 from ..backend.doors import door
 from ..fitting.fit import Fit
-from ..fitting.maps import Map, read_maps
+from ..fitting.problem import Map, read_maps
 from ..gaussian.channels import TextureMap, channel_weights, slices
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..image.io import check_data, check_image
@@ -259,15 +259,15 @@ def _images_of(g: Gaussians, images: Images, encoding: str | None) -> tuple[list
             f"{', '.join(spaces)}"
         )
     named = {name: Map(images[name], space) for name, space in spaces.items()}
-    targets = read_maps(named, encoding=encoding)
-    for image, m in zip(targets, g.maps, strict=True):
+    pixels = [channels.targets[0].pixels for channels in read_maps(named, encoding=encoding)]
+    for image, m in zip(pixels, g.maps, strict=True):
         expected = (g.height, g.width, m.channels)
-        if image.pixels.shape != expected:
+        if image.shape != expected:
             raise ValueError(
-                f"pack: map {m.name!r} has shape {image.pixels.shape}, the set needs {expected}"
+                f"pack: map {m.name!r} has shape {image.shape}, the set needs {expected}"
             )
-    values = [image.space.values_of(image.pixels) for image in targets]
-    return [image.pixels for image in targets], np.concatenate(values, axis=2)
+    values = [m.space.values_of(image) for m, image in zip(g.maps, pixels, strict=True)]
+    return pixels, np.concatenate(values, axis=2)
 
 
 def _errors(a: list[Array], b: list[Array]) -> list[float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,31 +13,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.doors import door
-from ..backend.interrupts import defer_interrupts
+from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.notebook import to_html
 from ..backend.progress import shows_progress
-from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
-from ..gaussian.gaussians import Gaussians, one_image, scale_channels
+from ..gaussian.gaussians import Gaussians
 from ..image.pixels import check_weight
-from ..image.space import DATA, YCBCR, space_of
+from ..image.space import space_of
 from ..raster.render import picture_of
 from .coarse import COARSE_TO_FINE
 from .control import Redistribute, Surplus
 from .descent import begin
-from .fewest import fewest
-from .from_loss import Problem, Spaces, refine_loss, views_of_spaces
+from .from_loss import Watch, fit_loss
 from .levels import place_levels, sort_levels
-from .loop import FitProgress, Refinement, Score, refine, sets_of
-from .loss import Loss, LossFunction, LossObjective, View
-from .maps import Map, MapImage, balance, combine, read_maps, score_maps, views_of
-from .measure import Row, psnrs
+from .loop import Descent, FitProgress, Refinement, refine, sets_of
+from .loss import Loss, LossFunction, LossObjective
+from .measure import Row
 from .method import DEFAULT, Method
-from .objective import Affine, Pixels, data_of, fitted, picture, restored
+from .objective import Pixels
 from .options import FitOptions, Goal, Start, named_options
-from .pixels import Image, PixelsOrPath, check_channels, read_pixels
 from .place import Adaptive
-from .start import check_start, load_start, set_in, start_from, types_for
+from .problem import Map, PixelsOrPath, Problem, problem_of, problem_of_images
+from .search import fewest
+from .start import start_from
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,20 +123,6 @@ class Fit:
         write(path, self.gaussians.data(), figures)
 
 
-class FitInterrupted(KeyboardInterrupt):
-    """The error of a fit that Ctrl-C, SIGTERM or a `KeyboardInterrupt` of a loss interrupted.
-
-    Attributes
-    ----------
-    result : Fit
-        The best set so far.
-    """
-
-    def __init__(self, result: Fit) -> None:
-        super().__init__("the fit was interrupted; .result holds the best set so far")
-        self.result = result
-
-
 @named_options
 @shows_progress
 @door
@@ -183,7 +167,7 @@ def fit(
         PSNR in dB to reach with as few Gaussians as possible, instead of their number. Each map
         must reach it, unless it has its own goal. A `Goal` also sets the space of the PSNR and the
         largest number of Gaussians. The search takes up to about twice `iterations` steps, see
-        `eigengs_dr.fitting.fewest`.
+        `eigengs_dr.fitting.search`.
     start : Gaussians, Fit, path-like or EigenGS, optional
         Instead of a placement, Gaussians to start from, scaled to the size of the image: the set of
         the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
@@ -239,7 +223,7 @@ def fit(
         arguments contradict each other.
     BackendError
         If the backend is not available.
-    FitInterrupted
+    Interrupted
         After Ctrl-C, SIGTERM, or a `KeyboardInterrupt` of the loss, its judge or `progress`: a
         `KeyboardInterrupt` that holds the best set so far.
 
@@ -267,8 +251,6 @@ def fit(
     """
     started = time.perf_counter()
     spaces, space = space, None if isinstance(space, Mapping) else space
-    if image is None:
-        _check_loss(loss, size, target_psnr, gaussians)
     options = FitOptions(
         gaussians=gaussians,
         iterations=iterations,
@@ -281,242 +263,100 @@ def fit(
         encoding=encoding,
         loss=loss if loss is None or isinstance(loss, Loss) else Loss(loss),
     )
-    factors = check_weight(weight)
-    if image is None:
-        return fit_loss(size, spaces, options, factors, started, progress)
-    if size is not None:
-        raise ValueError("size is for a loss without an image; leave it or the image out")
-    if isinstance(image, Mapping):
-        if start is not None or spaces is not None:
-            raise ValueError(
-                "maps take no start and no space; a Map says the space of one: "
-                "Map(image, space='data')"
-            )
-        maps = read_maps(image, options.goal, factors, encoding)
-        if options.goal is None and maps[0].goal is not None:
-            if gaussians is not None:
-                raise ValueError("gaussians and goals of maps exclude each other; give one of them")
-            options = replace(options, target_psnr=maps[0].goal)
-        return fit_maps(maps, options, factors, started, progress)
+    problem = problem_of(image, options, check_weight(weight), size, spaces)
+    [result] = fit_problem(problem, started, progress)
     source = os.path.basename(image) if isinstance(image, (str, os.PathLike)) else ""
-    try:
-        [result] = fit_images([image], options, factors, progress)
-    except FitInterrupted as stop:
-        raise FitInterrupted(replace(stop.result, source=source)) from None
-    return replace(result, source=source)
+    return ended(replace(result, source=source))
 
 
-def fit_images(
-    images: Sequence[PixelsOrPath],
-    options: FitOptions,
-    weight: Image | None = None,
-    progress: FitProgress | None = None,
-) -> list[Fit]:
+def ended(result: Fit) -> Fit:
+    """Return a result, or raise `Interrupted` with it if it was interrupted."""
+    if result.stopped == "interrupted":
+        raise Interrupted(result, "the fit was interrupted; .result holds the best set so far")
+    return result
+
+
+def fit_images(images: Sequence[PixelsOrPath], options: FitOptions) -> list[Fit]:
     """Fit an image, or several of one size together; see `fit` for results and errors.
 
     On llvm, the results of a batch are bit-identical to single fits: sums run in the same order,
     and no image changes the arithmetic of another. The seconds are an equal share of the whole
     time.
     """
-    started, source = time.perf_counter(), options.start
-    start = None if source is None else load_start(source, options.backend)
-    if isinstance(start, Gaussians):
-        one_image(start)
-    requested = options.space or (set_in(start).space if start is not None else YCBCR)
-    read = [read_pixels(image, requested, weight, options.encoding) for image in images]
-    pixels, space = [p for p, _ in read], read[0][1]
-    height, width, channels = pixels[0].shape
-    options.check_image(width, height, channels)
-    check_channels(weight, channels)
-    if start is not None:
-        check_start(set_in(start), (width, height), channels, space, options)
-    types, mean_image = types_for(start, options.backend), None
+    started = time.perf_counter()
+    results = fit_problem(problem_of_images(images, options), started)
+    return [ended(result) for result in results]
+
+
+def fit_problem(problem: Problem, started: float, progress: FitProgress | None = None) -> list[Fit]:
+    """Fit what the problem asks for; one result for each image of a batch.
+
+    Parameters
+    ----------
+    problem : Problem
+    started : float
+        Seconds of `time.perf_counter` at the call.
+    progress : callable, optional
+        See `fit`.
+    """
+    mean_image = None
     with defer_interrupts() as interrupted:
-        data = [data_of(p, space, weight) for p in pixels]
-        display = picture(types, space, pixels, data, weight)
-        objective = replace(Pixels.of(data, space, types), pictures=(display,))
-        begun, chosen = None, False
-        if start is not None:
-            if isinstance(start, Gaussians):
-                start = fitted(start, data[0].affine)
-            objective, begun, chosen = start_from(
-                start, objective, options.method, pixels[0], options.iterations, options.seed
+        if not problem.channels[0].targets:
+            watch = Watch(started, problem.options.iterations, progress, interrupted)
+            refinement, seconds_init = fit_loss(problem, watch)
+            refinements = [refinement]
+        else:
+            problem = problem.balanced(problem.first_count)
+            objective, begun, chosen = begin_fit(problem)
+            if objective.pictures[0].base is not None:
+                mean_image = objective.picture(objective.pictures[0].base).numpy()
+            descent = Descent(
+                problem.objective(objective),
+                problem.options.method,
+                lambda g: problem.measure(g, descent.objective, time.perf_counter() - started),
+                problem.options.seed,
+                progress,
+                interrupted,
             )
-            base = objective.pictures[0].base
-            if base is not None:
-                mean_image = objective.picture(base).numpy()
-        if options.loss is not None:
-            view = View("", space, range(channels), *data[0].affine)
-            objective = LossObjective.of_loss(options.loss, [view], objective)
-
-        def score(gaussians: Gaussians) -> list[Row]:
-            seconds = (time.perf_counter() - started) / len(images)
-            [figures] = psnrs(gaussians, objective.pictures).transpose(0, 2, 1)
-            return [
-                {
-                    "seconds": seconds,
-                    **objective.judged(gaussians),
-                    "psnr_ycbcr": ycbcr,
-                    "psnr_rgb": rgb,
-                }
-                for ycbcr, rgb in figures.tolist()
-            ]
-
-        figure = options.goal.key(space) if options.goal else "margin"
-        refinements, seconds_init = _refined(
-            objective, options, begun, chosen, score, figure, started, progress, interrupted
-        )
-    affines = [d.affine for d in data]
-    return _finished(refinements, affines, mean_image, started, seconds_init)
+            refinements, seconds_init = _refined(problem, descent, begun, chosen, started)
+    return _finished(problem, refinements, mean_image, started, seconds_init)
 
 
-def _check_loss(loss: Any, size: Any, target_psnr: Any, gaussians: Any) -> None:
-    """Raise ValueError unless there is a loss with a size, and nothing that needs an image."""
-    if loss is None or size is None:
-        raise ValueError(
-            "fit needs an image, or a loss and the size of its picture: "
-            "fit(loss=f, size=(width, height))"
-        )
-    if np.shape(size) != (2,) or np.asarray(size).dtype.kind not in "iu":
-        raise ValueError(f"size is {size!r}; give (width, height) in whole pixels")
-    if target_psnr is not None or np.ndim(gaussians) > 0:
-        raise ValueError(
-            "without an image there is no PSNR and there are no levels; give the loss a target"
-        )
+def begin_fit(problem: Problem) -> tuple[Pixels, Gaussians | None, bool]:
+    """Return the squared error, the set to start from, and whether the user chose Gaussians of it.
 
-
-def fit_loss(
-    size: tuple[int, int] | None,
-    spaces: Spaces,
-    options: FitOptions,
-    weight: Image | None,
-    started: float,
-    progress: FitProgress | None = None,
-) -> Fit:
-    """Fit a loss without an image; see `fit` for results and errors."""
-    assert options.loss is not None and size is not None
-    start = None if options.start is None else load_start(options.start, options.backend)
-    if start is not None and not isinstance(start, Gaussians):
-        raise ValueError("a model needs an image to start from; give a set")
-    if start is not None and spaces is None:
-        spaces = {m.name: m.space for m in start.maps} or start.space
-    spaces = spaces or options.loss.space
-    views, maps = views_of_spaces(spaces)
-    channels, (width, height) = sum(len(view.channels) for view in views), size
-    options.check_image(width, height, channels)
-    if weight is not None and weight.shape[:2] != (height, width):
-        shape = f"{weight.shape[1]}x{weight.shape[0]}"
-        raise ValueError(f"weight is for {shape} pixels, but size is {width}x{height}")
-    check_channels(weight, 1 if maps else channels)
-    if start is not None:
-        space = DATA if maps else views[0].space
-        check_start(start, size, channels, space, options)
-        cutoff = float(options.method.cutoff)
-        start = replace(start.scaled(width, height), cutoff=cutoff, maps=()).bounded()
-    with defer_interrupts() as interrupted:
-        problem = Problem(options.loss, size, views, types_for(start, options.backend), weight)
-        refinement, seconds_init = refine_loss(
-            problem, options, start, started, progress, interrupted
-        )
-    refinement = replace(refinement, gaussians=replace(refinement.gaussians, maps=maps))
-    [result] = _finished([refinement], [Affine()], None, started, seconds_init)
-    return result
-
-
-def fit_maps(
-    images: list[MapImage],
-    options: FitOptions,
-    weight: Image | None,
-    started: float,
-    progress: FitProgress | None = None,
-) -> Fit:
-    """Fit maps from `read_maps` with one set; see `fit` for results and errors."""
-    height, width = images[0].pixels.shape[:2]
-    channels, types = sum(i.pixels.shape[2] for i in images), types_for(None, options.backend)
-    options.check_image(width, height, channels)
-    check_channels(weight, 1)
-    goal = options.goal
-    with defer_interrupts() as interrupted:
-        first = options.count_for(width * height)
-        if options.searches:
-            first = options.first_try(width * height, channels)
-        factors = balance(images, options, first, types, weight)
-        objective = combine(images, factors, types, weight)
-        if options.loss is not None:
-            views = views_of(images, factors)
-            objective = LossObjective.of_loss(options.loss, views, objective)
-
-        def score(gaussians: Gaussians) -> list[Row]:
-            row = score_maps(gaussians, objective, images, goal)
-            seconds = time.perf_counter() - started
-            return [{"seconds": seconds, **objective.judged(gaussians), **row}]
-
-        [refinement], seconds_init = _refined(
-            objective, options, None, False, score, "margin", started, progress, interrupted
-        )
-    maps = tuple(image.map(factor) for image, factor in zip(images, factors, strict=True))
-    whole = scale_channels(refinement.gaussians, [1 / w for w in channel_weights(maps)])
-    offsets = [i.data.affine.offset for i in images for _ in range(i.pixels.shape[2])]
-    background = type(whole.background)(
-        [row + float(b) for row, b in zip(whole.background, offsets, strict=True)]
-    )
-    named = replace(whole, background=background, maps=maps)
-    [result] = _finished(
-        [replace(refinement, gaussians=named)], [Affine()], None, started, seconds_init
-    )
-    return result
+    A method that starts from a model may change the squared error.
+    """
+    start, options, objective = problem.start, problem.options, problem.pixels()
+    if start is None:
+        return objective, None, False
+    if isinstance(start, Gaussians):
+        start = problem.fitted(start)
+    pixels = problem.channels[0].targets[0].pixels
+    return start_from(start, objective, options.method, pixels, options.iterations, options.seed)
 
 
 def _refined(
-    objective: Pixels,
-    options: FitOptions,
-    begun: Gaussians | None,
-    chosen: bool,
-    score: Score,
-    figure: str,
-    started: float,
-    progress: FitProgress | None,
-    interrupted: Callable[[], bool],
+    problem: Problem, descent: Descent, begun: Gaussians | None, chosen: bool, started: float
 ) -> tuple[list[Refinement], float]:
-    """Fit an objective as the options say: with a given number, in levels, or with the fewest.
-
-    `begun` is the set to start from, if there is one, and `chosen` whether it holds Gaussians of
-    the user. `figure` is the key in the rows of `score` to which a goal refers. Also return the
-    seconds before refinement.
-    """
-    method, iterations, key = options.method, options.iterations, options.seed
-    (width, height), channels = objective.size, objective.channels
-    counts = options.levels
+    """Fit a given number of Gaussians, levels, or the fewest; and the seconds before refinement."""
+    options, counts = problem.options, problem.options.levels
+    objective, method = descent.objective, descent.method
     if counts or method.place != Adaptive():  # the choice of a placement is not undone
         method = method.without(Surplus, Redistribute)
     if counts:
-        begun = place_levels(objective, method, counts, iterations, key, interrupted)
+        begun = place_levels(
+            objective, method, counts, options.iterations, options.seed, descent.interrupted
+        )
         objective = replace(objective, levels=counts[:-1])
     elif begun is None:
-        count = options.count_for(width * height)
-        if options.searches:
-            count = options.first_try(width * height, channels)
-        begun = method.place_and_solve(objective, count, key)
-    seconds_init = (time.perf_counter() - started) / objective.grid.images
+        begun = method.place_and_solve(objective, problem.first_count, options.seed)
+    seconds_init = (time.perf_counter() - started) / problem.images
+    descent = replace(descent, objective=objective, method=method)
     if options.searches:
-        max_count = options.max_count_for(width * height, channels)
-        goal = options.goal.psnr if options.goal and figure != "margin" else 0.0
-        refinement = fewest(
-            objective,
-            method,
-            begun,
-            score,
-            (figure, goal),
-            max_count,
-            iterations,
-            key,
-            progress,
-            interrupted,
-        )
-        refined = [refinement]
+        refined = [fewest(descent, begun, problem.max_count, options.iterations)]
     else:
-        state = begin(begun, objective.grid.images, chosen)
-        refined = refine(objective, method, state, iterations, score, key, progress, interrupted)
+        refined = refine(descent, begin(begun, problem.images, chosen), options.iterations)
     if isinstance(objective, LossObjective) and refined[0].stopped != "interrupted":
         objective.calls.check_use()
     if counts:
@@ -526,22 +366,16 @@ def _refined(
 
 
 def _finished(
+    problem: Problem,
     refinements: Sequence[Refinement],
-    affines: Sequence[Affine],
     mean_image: NDArray[np.float32] | None,
     started: float,
     seconds_init: float,
 ) -> list[Fit]:
-    """Render the results of refinements in the units of their images.
-
-    Raises
-    ------
-    FitInterrupted
-        If the refinement of a single image was interrupted.
-    """
+    """Render the results of refinements in the units of their images."""
     results = []
-    for one, gaussians, affine in zip(refinements, sets_of(refinements), affines, strict=True):
-        whole = restored(gaussians, affine)
+    for image, (one, gaussians) in enumerate(zip(refinements, sets_of(refinements), strict=True)):
+        whole = problem.restored(gaussians, image)
         rendered = picture_of(whole)
         results.append(
             Fit(
@@ -560,7 +394,4 @@ def _finished(
             )
         )
     seconds = (time.perf_counter() - started) / len(refinements)
-    results = [replace(result, seconds=seconds) for result in results]
-    if refinements[0].stopped == "interrupted":
-        raise FitInterrupted(results[0])
-    return results
+    return [replace(result, seconds=seconds) for result in results]

@@ -15,7 +15,7 @@ from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
 from .descent import State, listed, rate_table, started, step_program
 from .exchange import prune
-from .measure import Row
+from .measure import Measured, Row
 from .method import Control, Method
 from .objective import Pixels
 
@@ -129,9 +129,37 @@ def averaged(states: Generator[State, None, None], first: int) -> Generator[Stat
 
 FitProgress = Callable[[int, int, Row], None]
 
-Score = Callable[[Gaussians], list[Row]]
-"""``score(gaussians)`` returns a row for each image of a batch; `Pixels.merit` of it says
+Score = Callable[[Gaussians], list[Measured]]
+"""``score(gaussians)`` measures the set of each image of a batch; `Pixels.merit` of the row says
 which set is the best."""
+
+
+@dataclass(frozen=True)
+class Descent:
+    """What a descent makes small, by which method, and who watches it.
+
+    Attributes
+    ----------
+    objective : Pixels
+    method : Method
+    score : Score
+    key : int
+        All random numbers depend on it and on the step.
+    progress : callable or None
+        Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
+        trace, or that of a set with more Gaussians than requested. It may raise `KeyboardInterrupt`
+        to end the descent.
+    interrupted : callable
+        Called before every step; True ends the descent. See
+        `eigengs_dr.backend.interrupts.defer_interrupts`.
+    """
+
+    objective: Pixels
+    method: Method
+    score: Score
+    key: int = 0
+    progress: FitProgress | None = None
+    interrupted: Callable[[], bool] = lambda: False
 
 
 @dataclass(frozen=True)
@@ -147,7 +175,7 @@ class Refinement:
     iterations : int
         Number of steps.
     stopped : str
-        "iterations", "exact" or "interrupted"; see also `eigengs_dr.fitting.fewest.fewest`.
+        "iterations", "exact" or "interrupted"; see also `eigengs_dr.fitting.search.fewest`.
     row : dict
         The row of the trace that measures the set.
     """
@@ -179,26 +207,16 @@ class Best:
 
     Parameters
     ----------
-    objective : Pixels
+    descent : Descent
     state : State
         The state before the first step.
     iterations : int
-    score : Score
-    progress : callable, optional
-        See `refine`.
     """
 
-    def __init__(
-        self,
-        objective: Pixels,
-        state: State,
-        iterations: int,
-        score: Score,
-        progress: FitProgress | None = None,
-    ) -> None:
-        self.objective = objective
-        self.refinements = [Refinement(state.gaussians) for _ in range(objective.grid.images)]
-        self.iterations, self.score, self.progress = iterations, score, progress
+    def __init__(self, descent: Descent, state: State, iterations: int) -> None:
+        self.descent, self.iterations = descent, iterations
+        images = descent.objective.grid.images
+        self.refinements = [Refinement(state.gaussians) for _ in range(images)]
         self.marks, self.step, self.state = trace_steps(iterations), 0, state
         self.row = Row()
         self.larger: tuple[float, int, Gaussians] | None = None
@@ -208,22 +226,24 @@ class Best:
         self.step, self.state = step, state
         if step in self.marks:
             self.judge(step, state.gaussians)
-        if self.progress and (step in self.marks or step % 10 == 0):
+        progress = self.descent.progress
+        if progress and (step in self.marks or step % 10 == 0):
             dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
-            self.progress(step, self.iterations, self.row)
+            progress(step, self.iterations, self.row)
         return all(one.stopped == "exact" for one in self.refinements)
 
     def judge(self, step: int, gaussians: Gaussians) -> None:
         """Measure a set. A set with more Gaussians than requested is not compared."""
         number, count = len(gaussians) // len(self.refinements), self.state.count
-        rows = [{"iteration": step, "gaussians": number, **row} for row in self.score(gaussians)]
-        self.row, figure = rows[0], self.objective.merit(rows[0])
+        counted, objective = {"iteration": step, "gaussians": number}, self.descent.objective
+        rows = [counted | measured.row for measured in self.descent.score(gaussians)]
+        self.row, figure = rows[0], objective.merit(rows[0])
         if number == count:
             self.larger = None
         elif self.larger is None or figure > self.larger[0]:
             self.larger = figure, step, gaussians
         self.refinements = [
-            one if one.stopped == "exact" else one.judged(gaussians, row, self.objective, count)
+            one if one.stopped == "exact" else one.judged(gaussians, row, objective, count)
             for one, row in zip(self.refinements, rows, strict=True)
         ]
 
@@ -239,42 +259,22 @@ class Best:
             for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
                 measured = [row["iteration"] for row in self.refinements[0].trace]
                 if step not in measured or len(gaussians) > self.state.count:
-                    near = self.objective.around(gaussians)
+                    near = self.descent.objective.around(gaussians)
                     self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
         self.refinements = [
             replace(one, stopped="interrupted", iterations=self.step) for one in self.refinements
         ]
 
 
-def refine(
-    objective: Pixels,
-    method: Method,
-    state: State,
-    iterations: int,
-    score: Score,
-    key: int = 0,
-    progress: FitProgress | None = None,
-    interrupted: Callable[[], bool] = lambda: False,
-) -> list[Refinement]:
+def refine(descent: Descent, state: State, iterations: int) -> list[Refinement]:
     """Descend, and keep the best set of every image.
 
     Parameters
     ----------
-    objective : Pixels
-    method : Method
+    descent : Descent
     state : State
     iterations : int
         Largest number of steps.
-    score : Score
-    key : int, optional
-        See `eigengs_dr.fitting.loop.descend`.
-    progress : callable, optional
-        Called every 10 steps as ``progress(iteration, iterations, row)`` with the last row of the
-        trace, or that of a set with more Gaussians than requested. It may raise `KeyboardInterrupt`
-        to end the refinement.
-    interrupted : callable, optional
-        Called before every step; True ends the refinement. See
-        `eigengs_dr.backend.interrupts.defer_interrupts`.
 
     Returns
     -------
@@ -287,10 +287,14 @@ def refine(
     KeyboardInterrupt
         If the refinement of a batch is interrupted.
     """
-    best = Best(objective, state, iterations, score, progress)
+    best, method, interrupted = (
+        Best(descent, state, iterations),
+        descent.method,
+        descent.interrupted,
+    )
     try:
         ended = best.offer(0, state)
-        states = descend(objective, method, state, iterations, key)
+        states = descend(descent.objective, method, state, iterations, descent.key)
         if method.average:
             states = averaged(states, round((1 - method.average) * iterations))
         with closing(states):

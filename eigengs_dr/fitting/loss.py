@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from inspect import signature
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -22,12 +22,12 @@ from ..backend.arrays import types_of
 from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
-from ..image.space import Space
+from ..image.space import Affine
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import forward
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import bin_gaussians, pixels_inside, to_tensor
-from .objective import Pixels, Quadratic, Slope
+from .objective import Channels, Pixels, Quadratic, Slope
 
 if TYPE_CHECKING:
     from .descent import State
@@ -149,43 +149,23 @@ def _check_arguments(name: str, function: Callable[..., Any], arguments: str) ->
         ) from None
 
 
-class View(NamedTuple):
-    """What some channels of a set show.
-
-    Attributes
-    ----------
-    name : str
-        Name of the map, "" without maps.
-    space : Space
-    channels : range
-        The channels of the set.
-    scale, offset : float
-        ``scale s + offset`` of a fitted sum s is in units of the space.
-    """
-
-    name: str
-    space: Space
-    channels: range
-    scale: float = 1.0
-    offset: float = 0.0
-
-
-def show(views: Sequence[View], sums: Float, channels: int) -> list[Float]:
-    """Return the pictures of sums, all as rows of pixels; differentiable.
+def show(shown: Sequence[Channels], sums: Float, number: int) -> list[Float]:
+    """Return the pictures of sums of so many channels, all as rows of pixels; differentiable.
 
     Cost: a gather for each channel; none for a single picture of unchanged sums.
     """
     types, pictures = types_of(sums), []
-    first = dr.arange(types.UInt, dr.width(sums) // channels) * channels
-    for view in views:
-        if view.space.identical and view[2:] == (range(channels), 1.0, 0.0):
+    first = dr.arange(types.UInt, dr.width(sums) // number) * number
+    for channels in shown:
+        unit = channels.unit()
+        if channels.space.identical and channels.number == number and unit == Affine():
             return [sums]
         planes = [
             dr.gather(types.Float, sums, first + k, mode=dr.ReduceMode.NoConflicts)
-            for k in view.channels
+            for k in range(channels.part.start, channels.part.stop)
         ]
-        planes = [dr.fma(plane, view.scale, view.offset) for plane in planes]
-        pictures.append(dr.ravel(types.FloatX(view.space.decode(planes))))
+        planes = [dr.fma(plane, unit.scale, unit.offset) for plane in planes]
+        pictures.append(dr.ravel(types.FloatX(channels.space.decode(planes))))
     return pictures
 
 
@@ -303,18 +283,19 @@ class LossObjective(Pixels):
     Attributes
     ----------
     loss : Loss
-    views : tuple of View
+    shown : tuple of Channels
+        What the channels of a set show.
     calls : Calls
     """
 
     loss: Loss = field(kw_only=True)
-    views: tuple[View, ...] = field(kw_only=True)
+    shown: tuple[Channels, ...] = field(kw_only=True)
     calls: Calls = field(default_factory=Calls)
 
     @classmethod
-    def of_loss(cls, loss: Loss, views: Sequence[View], base: Pixels) -> LossObjective:
+    def of_loss(cls, loss: Loss, shown: Sequence[Channels], base: Pixels) -> LossObjective:
         """Return the objective of a loss near an image: the user's image, or a first guess."""
-        return cls(**vars(base), loss=loss, views=tuple(views))
+        return cls(**vars(base), loss=loss, shown=tuple(shown))
 
     @contextmanager
     def models(self) -> Iterator[Callable[[State], Slope]]:
@@ -362,7 +343,7 @@ class LossObjective(Pixels):
 
     def seen(self, sums: Float) -> list[Float]:
         """Return the pictures that the loss sees of sums, both as rows of pixels."""
-        pictures = show(self.views, sums, self.channels)
+        pictures = show(self.shown, sums, self.channels)
         if self.loss.bounds is None:
             return pictures
         return [dr.clip(picture, *self.loss.bounds) for picture in pictures]
@@ -378,7 +359,7 @@ class LossObjective(Pixels):
             traced = type(sums)(sums)
             dr.enable_grad(traced)
             rows = to_tensor(traced, self.grid, self.channels).array if in_tiles else traced
-            pictures = show(self.views, rows, self.channels)
+            pictures = show(self.shown, rows, self.channels)
             for picture, slope in zip(pictures, slopes, strict=True):
                 dr.set_grad(picture, self._bounded(dr.detach(picture), slope))
             dr.enqueue(dr.ADMode.Backward, pictures)
@@ -481,13 +462,13 @@ class LossObjective(Pixels):
         return leaves
 
     def _tensor(self, number: int, rows: Float) -> Tensor:
-        size = self.grid.height, self.grid.width, len(self.views[number].channels)
+        size = self.grid.height, self.grid.width, self.shown[number].number
         return self.types.Tensor(rows, size)
 
     def _named(self, pictures: Sequence[Tensor]) -> Any:
-        if not self.views[0].name:
+        if not self.shown[0].name:
             return pictures[0]
-        return {_Name(view.name): p for view, p in zip(self.views, pictures, strict=True)}
+        return {_Name(c.name): p for c, p in zip(self.shown, pictures, strict=True)}
 
     def around(self, gaussians: Gaussians) -> Pixels:
         """Return the squared error of the image, weighed as the loss weighs it near a set.

@@ -6,8 +6,9 @@ image. Only a few bytes go to the host.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -34,6 +35,21 @@ from .solve import spread
 
 Row: TypeAlias = Record
 """A row of a trace: its numbers by name, and under "maps" those of every map."""
+
+
+class Measured(NamedTuple):
+    """A measurement of a set.
+
+    Attributes
+    ----------
+    row : dict
+        What a row of a trace holds of it.
+    margin : float
+        Decibels above the goal of a search.
+    """
+
+    row: Row
+    margin: float = math.inf
 
 
 def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float64]:

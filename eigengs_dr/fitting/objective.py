@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arrays import ArrayTypes, types_of, upload
 from ..backend.types import Float, Record, Tensor
+from ..gaussian.channels import TextureMap
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import to_coded, to_linear
-from ..image.space import Affine, Extent, Space
+from ..image.space import DATA, Affine, Extent, Space
 from ..raster.binning.lists import TileLists
 from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums, forward, residual
@@ -150,6 +151,151 @@ class Picture(NamedTuple):
     has_codes: bool = True
 
 
+class Target(NamedTuple):
+    """An image that some channels should show.
+
+    Attributes
+    ----------
+    pixels : ndarray of float32, shape (H, W, C)
+        Display values: sRGB, above 1 for light above 1; normals or data.
+    values : ndarray of float32, shape (H, W, C)
+        In the space of the channels and the unit of the fit.
+    unit : Affine
+    """
+
+    pixels: Image
+    values: Image
+    unit: Affine
+
+    @classmethod
+    def of(cls, pixels: Image, space: Space, unit: Affine | None = None) -> Target:
+        """Convert pixels to the values of a space, ``(v - offset) / scale``.
+
+        By default the unit is that of the pixels; give one if they are a part of a larger image.
+        """
+        values = space.values_of(pixels)
+        unit = unit or space.unit(Extent.of(values))
+        if unit != Affine():
+            values = (values - np.float32(unit.offset)) / np.float32(unit.scale)
+        return cls(pixels, values, unit)
+
+
+class Channels(NamedTuple):
+    """Some channels of a set: those of an image, or of one map.
+
+    Attributes
+    ----------
+    name : str
+        Name of the map; "" for an image.
+    space : Space
+    part : slice
+        The channels of the set.
+    targets : tuple of Target
+        What they should show, one for each image of a batch; () if only a loss knows.
+    factor : float
+        Factor of the fitted values, and so of the errors.
+    goal : float or None
+        The PSNR in dB that the map must reach.
+    """
+
+    name: str
+    space: Space
+    part: slice
+    targets: tuple[Target, ...] = ()
+    factor: float = 1.0
+    goal: float | None = None
+
+    @property
+    def number(self) -> int:
+        """Number of channels."""
+        return int(self.part.stop - self.part.start)
+
+    def unit(self, image: int = 0) -> Affine:
+        """Return the map from sums of the fit to values of the space, for an image of a batch."""
+        scale, offset = self.targets[image].unit if self.targets else Affine()
+        return Affine(scale / self.factor, offset)
+
+    @property
+    def map(self) -> TextureMap:
+        """The map of the finished set, whose weight is the factor of its errors in the fit."""
+        return TextureMap(self.name, self.space, self.number, 1 / self.unit().scale)
+
+    def values(self) -> Image:
+        """Return the fitted values, shape (images, H, W, C), or (H, W, C) for one image."""
+        return self._stacked([target.values for target in self.targets])
+
+    def placement_images(self) -> Image:
+        """Return the images that place Gaussians, of the shape of `values`."""
+        trivial = Affine()
+        return self._stacked(
+            [
+                self.space.placement_image(values, pixels if unit == trivial else None)
+                for pixels, values, unit in self.targets
+            ]
+        )
+
+    def weights(self) -> Image | None:
+        """Return the factors of the squared errors, of the shape of `values`; None for 1."""
+        weights = [self.space.weight(target.values) for target in self.targets]
+        known = [weight for weight in weights if weight is not None]
+        return (np.stack(known) if len(known) > 1 else known[0]) if known else None
+
+    def _stacked(self, images: list[Image]) -> Image:
+        stacked = np.stack(images) if len(images) > 1 else images[0]
+        return stacked if self.factor == 1 else stacked * np.float32(self.factor)
+
+    def picture(self, types: ArrayTypes, weight: Image | None = None) -> Picture:
+        """Return the display values on the device, for the PSNRs.
+
+        Data are measured with their range as the peak, or 1 if they are codes. Light that may
+        exceed 1 is exposed, see `Space.exposure`.
+
+        Parameters
+        ----------
+        types : ArrayTypes
+        weight : ndarray of float32, shape (H, W) or (H, W, C), optional
+            Factor of the squared errors.
+        """
+        images, codes = [target.pixels for target in self.targets], True
+        units = [self.unit(k) for k in range(len(images))]
+        exposures = [self.space.exposure(pixels) for pixels in images]
+        if self.space.by_range:
+            codes = all(map(self.space.has_codes, images))
+            shown = self.values()
+            if not codes:
+                units = [Affine(1 / self.factor, u.offset / u.scale) for u in units]
+        else:
+            lit = zip(images, exposures, strict=True)
+            images = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
+            shown = np.stack(images) if len(images) > 1 else images[0]
+        weights = None
+        if weight is not None:
+            weights = batch_to_tiles(types, np.atleast_3d(weight).mean(axis=2, keepdims=True))
+        return Picture(
+            self.space,
+            batch_to_tiles(types, shown),
+            self.part,
+            upload(types.Float, np.array([unit.scale for unit in units])),
+            upload(types.Float, np.array([unit.offset for unit in units])),
+            upload(types.Float, np.array(exposures)),
+            weights,
+            has_codes=codes,
+        )
+
+
+def restored(gaussians: Gaussians, units: Sequence[Affine]) -> Gaussians:
+    """Return a set in the units of an image, from the unit of each channel of the fit."""
+    if all(unit == Affine() for unit in units):
+        return gaussians
+    kind = type(gaussians.color)
+    color = [row * unit.scale for row, unit in zip(gaussians.color, units, strict=True)]
+    background = [
+        row * unit.scale + unit.offset
+        for row, unit in zip(gaussians.background, units, strict=True)
+    ]
+    return replace(gaussians, color=kind(color), background=kind(background))
+
+
 class Part(NamedTuple):
     """A part of a picture, and of its Gaussians.
 
@@ -165,30 +311,12 @@ class Part(NamedTuple):
     core: tuple[slice, slice]
 
 
-class Data(NamedTuple):
-    """An image in the space of its colours, before it is uploaded.
-
-    Attributes
-    ----------
-    values : ndarray of float32, shape (H, W, C)
-        The values that are fitted.
-    placement_image : ndarray of float32, shape (H, W, C)
-        The image that places Gaussians: linear light would put too few of them into dark parts.
-    curvature : ndarray of float32, shape (H, W) or (H, W, C), or None
-    affine : Affine
-    """
-
-    values: Image
-    placement_image: Image
-    curvature: Image | None = None
-    affine: Affine = Affine()
-
-
 @dataclass(frozen=True)
 class Pixels:
     """The squared error of an image in the space of the colours, with weights.
 
-    One image, a batch of images, or several maps as the channels of one image.
+    One image, a batch of images, or several maps as the channels of one image; see
+    `eigengs_dr.fitting.problem.Problem.pixels`.
 
     Attributes
     ----------
@@ -218,40 +346,49 @@ class Pixels:
     part: Part | None = None
 
     @classmethod
-    def of(cls, data: Data | Sequence[Data], space: Space, types: ArrayTypes) -> Pixels:
+    def of(
+        cls,
+        values: Image,
+        space: Space,
+        types: ArrayTypes,
+        weight: Image | None = None,
+        placement_image: Image | None = None,
+    ) -> Pixels:
         """Upload an image, or a batch of images of one size.
 
         Parameters
         ----------
-        data : Data, or sequence of Data
+        values : ndarray of float32, shape (H, W, C) or (images, H, W, C)
+            The values that are fitted.
         space : Space
         types : ArrayTypes
             Backend and precision of the sets.
+        weight : ndarray of float32, shape (..., H, W), (..., H, W, 1) or (..., H, W, C), optional
+            Factors of the squared errors.
+        placement_image : ndarray of float32, of the shape of `values`, optional
+            The image that places Gaussians; by default `values`.
         """
-        batch = [data] if isinstance(data, Data) else list(data)
-        height, width, channels = batch[0].values.shape
-
-        def upload(images: list[Image]) -> Float:
-            stacked = images[0] if len(images) == 1 else np.stack(images)
-            return batch_to_tiles(types, stacked if stacked.ndim > 2 else stacked[..., None])
-
-        values = upload([d.values for d in batch])
-        same = all(d.placement_image is d.values for d in batch)
-        placement_image = values if same else upload([d.placement_image for d in batch])
+        target = batch_to_tiles(types, values)
+        placed = target if placement_image is None else batch_to_tiles(types, placement_image)
         curvature = None
-        if batch[0].curvature is not None:
-            # 2-D weights are one for all channels
-            layers = [np.atleast_3d(d.curvature) for d in batch if d.curvature is not None]
-            assert len(layers) == len(batch)
-            curvature = upload(layers)
-        grid = Grid(width, height, images=len(batch))
-        return cls(grid, channels, space, Quadratic(values, curvature), placement_image)
+        if weight is not None:
+            layers = weight if weight.ndim == values.ndim else weight[..., None]
+            curvature = batch_to_tiles(types, layers)
+        *batch, height, width, channels = values.shape
+        grid = Grid(width, height, images=batch[0] if batch else 1)
+        return cls(grid, channels, space, Quadratic(target, curvature), placed)
 
     @classmethod
-    def plain(cls, values: Image, gaussians: Gaussians) -> Pixels:
-        """Return the squared error of an image (H, W, C) in the space of some Gaussians."""
-        values = np.asarray(values, np.float32)
-        return cls.of(Data(values, values), gaussians.space, types_of(gaussians.mean))
+    def plain(
+        cls, values: ArrayLike, gaussians: Gaussians, weight: ArrayLike | None = None
+    ) -> Pixels:
+        """Return the squared error of values (H, W, C) in the space of some Gaussians.
+
+        A weight, shape (H, W) or (H, W, C), multiplies the squared errors.
+        """
+        factors = None if weight is None else np.asarray(weight, np.float32)
+        types = types_of(gaussians.mean)
+        return cls.of(np.asarray(values, np.float32), gaussians.space, types, factors)
 
     @property
     def types(self) -> ArrayTypes:
@@ -298,101 +435,38 @@ class Pixels:
         return to_tensor(values, self.grid, self.channels)
 
 
-def data_of(
-    pixels: Image, space: Space, weight: Image | None = None, affine: Affine | None = None
-) -> Data:
-    """Convert pixels (H, W, C) to the space of the colours, in units common to all images.
+def pixels_of(shown: Sequence[Channels], types: ArrayTypes, weight: Image | None = None) -> Pixels:
+    """Return the squared error of the targets of all channels, without what PSNRs need.
 
     Errors of light weigh more in the dark.
 
     Parameters
     ----------
-    pixels : ndarray of float32, shape (H, W, C)
-        sRGB, above 1 for light above 1; or data.
-    space : Space
-    weight : ndarray of float32, shape (H, W) or (H, W, C), optional
-        Factor of the squared errors. Pixels without any weight may have any value.
-    affine : Affine, optional
-        The unit, if these are pixels of a larger image; by default that of the pixels.
-    """
-    values = space.values_of(pixels)
-    affine = affine or space.unit(Extent.of(values))
-    if affine != Affine():
-        values = (values - np.float32(affine.offset)) / np.float32(affine.scale)
-    placement_image = space.placement_image(values, pixels if affine == Affine() else None)
-    return Data(values, placement_image, _product(space.weight(values), weight), affine)
-
-
-def picture(
-    types: ArrayTypes,
-    space: Space,
-    pixels: Sequence[Image],
-    data: Sequence[Data],
-    weight: Image | None = None,
-    first: int = 0,
-    factor: float = 1.0,
-) -> Picture:
-    """Return the display values of an image, or of a batch of images, for the PSNRs.
-
-    Data are measured with their range as the peak, or 1 if they are codes. Light that may exceed 1
-    is exposed, see `Space.exposure`.
-
-    Parameters
-    ----------
+    shown : sequence of Channels
+        The channels of a set, with targets.
     types : ArrayTypes
-    space : Space
-    pixels : sequence of ndarray of float32, shape (H, W, C)
-        sRGB, normals or data.
-    data : sequence of Data
-        The same images in the units of the fit.
     weight : ndarray of float32, shape (H, W) or (H, W, C), optional
-        Factor of the squared errors.
-    first : int, optional
-        The first channel among those of a set.
-    factor : float, optional
-        Factor of the channels in the set.
+        Factors of the squared errors.
     """
-    affines, images, codes = [d.affine for d in data], list(pixels), True
-    if space.by_range:
-        images = [d.values * np.float32(factor) for d in data]
-        codes = all(map(space.has_codes, pixels))
-        if not codes:
-            affines = [Affine(1.0, a.offset / a.scale) for a in affines]
-    exposures = [space.exposure(p) for p in images]
-    lit = zip(images, exposures, strict=True)
-    images = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
-    batch = np.stack(images) if len(images) > 1 else images[0]
-    weights = None
-    if weight is not None:
-        weights = batch_to_tiles(types, np.atleast_3d(weight).mean(axis=2, keepdims=True))
-    return Picture(
-        space,
-        batch_to_tiles(types, batch),
-        slice(first, first + batch.shape[-1]),
-        upload(types.Float, np.array([a.scale / factor for a in affines])),
-        upload(types.Float, np.array([a.offset for a in affines])),
-        upload(types.Float, np.array(exposures)),
-        weights,
-        has_codes=codes,
-    )
+    values = _joined([channels.values() for channels in shown])
+    weights = [channels.weights() for channels in shown]
+    factors = weight
+    if any(w is not None for w in weights):
+        factors = _joined(
+            [
+                np.ones_like(channels.values()) if w is None else w
+                for channels, w in zip(shown, weights, strict=True)
+            ]
+        )
+        if weight is not None:
+            factors = factors * np.atleast_3d(weight)
+    elif weight is not None and values.ndim > 3:
+        factors = np.stack([weight] * len(values))
+    placed = _joined([channels.placement_images() for channels in shown])
+    space = DATA if shown[0].name else shown[0].space
+    same = np.shares_memory(placed, values)
+    return Pixels.of(values, space, types, factors, None if same else placed)
 
 
-def _product(curvature: Image | None, weight: Image | None) -> Image | None:
-    if curvature is None or weight is None:
-        return curvature if weight is None else weight
-    return curvature * (weight if weight.ndim == 3 else weight[..., None])
-
-
-def restored(gaussians: Gaussians, affine: Affine) -> Gaussians:
-    """Return a set in the units of the image."""
-    if affine == Affine():
-        return gaussians
-    color, background = gaussians.color * affine.scale, gaussians.background * affine.scale
-    return replace(gaussians, color=color, background=background + affine.offset)
-
-
-def fitted(gaussians: Gaussians, affine: Affine) -> Gaussians:
-    """Return a set in the units of a fit: the inverse of `restored`."""
-    scale = 1 / affine.scale
-    background = (gaussians.background - affine.offset) * scale
-    return replace(gaussians, color=gaussians.color * scale, background=background)
+def _joined(images: list[Image]) -> Image:
+    return images[0] if len(images) == 1 else np.concatenate(images, axis=-1)

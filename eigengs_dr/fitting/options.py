@@ -173,10 +173,12 @@ class FitOptions:
     def _check_nested(self) -> None:
         """Raise ValueError if other options exclude what a search or levels need."""
         places = self.method.place == Adaptive() and self.start is None
-        if self.levels and not (places and not self.method.needs_model):
-            raise ValueError("levels need the placement Adaptive and no start; leave them out")
         if self.levels and self.loss is not None:
             raise ValueError("levels are for the squared error; leave them or the loss out")
+        if self.levels and not (places and not self.method.needs_model):
+            raise ValueError("levels need the placement Adaptive and no start; leave them out")
+        if self.goal and self.loss is not None and self.loss.target is not None:
+            raise ValueError("target_psnr and the target of a loss exclude each other; give one")
         if not self.searches:
             return
         target = "target_psnr" if self.goal else "the target of a loss"

@@ -20,20 +20,20 @@ from skimage.transform import resize_local_mean
 
 from ..backend.arrays import types_in
 from ..backend.doors import door
-from ..backend.interrupts import defer_interrupts
+from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.progress import shows_progress
 from ..backend.selection import backend_of, select
-from ..fitting.fewest import fewest
-from ..fitting.fit import FitInterrupted
-from ..fitting.measure import Row
+from ..fitting.loop import Descent
+from ..fitting.measure import Measured
 from ..fitting.method import DEFAULT
-from ..fitting.objective import Affine, Data, Pixels, restored
+from ..fitting.objective import Pixels, restored
+from ..fitting.search import fewest
 from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_data, check_image
 from ..image.metrics import psnr as psnr_of
-from ..image.space import DATA, LINEAR, Space, space_of
+from ..image.space import DATA, LINEAR, Affine, Space, space_of
 from ..plugins.cone import PIXEL
 from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
@@ -153,7 +153,7 @@ def fit_for_scene(
     ValueError
         If the image or an argument is unusable, the scene has no such texture, no pixel sees it, or
         the largest number of Gaussians does not suffice.
-    FitInterrupted
+    Interrupted
         After Ctrl-C in the search; its ``result`` is the SceneFit of the best set so far.
 
     Examples
@@ -245,38 +245,44 @@ def fit_seen(
     size = fine.seen.shape[1], fine.seen.shape[0]
     away = distance_transform_edt(~fine.seen)
 
-    def score(gaussians: Gaussians) -> list[Row]:
+    def score(gaussians: Gaussians) -> list[Measured]:
         psnr = seen(render(_without_unseen(gaussians.scaled(*size), away)).numpy())
-        return [{"psnr_ycbcr": min(psnr), "psnr": psnr}]
+        return [Measured({"psnr": min(psnr), "psnr_of_cameras": psnr}, min(psnr) - aimed)]
 
     def whole(gaussians: Gaussians) -> Gaussians:
         kept = _without_unseen(gaussians.scaled(*size), away)
         mean = kept.mean + type(kept.mean)(box.left + corner.left, box.top + corner.top)
         placed = replace(kept, mean=mean, width=fine_width, height=fine_height, space=space)
-        return restored(placed.scaled(width, height), Affine(peak))
+        return restored(placed.scaled(width, height), [Affine(peak)] * placed.channels)
 
+    aimed = target_psnr
     for count in (-(-most // fewer) for fewer in FEWER):
         objective = _objective(target, weight, fine.seen, count, kind)
         start = DEFAULT.place_and_solve(objective, count)
-        [row] = score(start)
-        if row["psnr_ycbcr"] >= target_psnr - GAIN:
+        [first] = score(start)
+        if first.margin >= -GAIN:
             break
-    aimed = ("psnr_ycbcr", aim(whole(start), row["psnr_ycbcr"]) if aim else target_psnr)
+    if aim:
+        aimed = aim(whole(start), first.row["psnr"])
     with defer_interrupts() as interrupted:
-        search = fewest(
-            objective, DEFAULT, start, score, aimed, max_gaussians, iterations,
-            progress=lambda step, steps, row: show("search", step, steps), interrupted=interrupted,
-        )  # fmt: skip
-    reached = search.row["psnr_ycbcr"]
+        descent = Descent(
+            objective,
+            DEFAULT,
+            score,
+            progress=lambda step, steps, row: show("search", step, steps),
+            interrupted=interrupted,
+        )
+        search = fewest(descent, start, max_gaussians, iterations)
+    reached = search.row["psnr"]
     if search.stopped == "out of reach" and reached < target_psnr:
         raise Unsuitable(
             f"{len(search.gaussians)} Gaussians reach {reached:.1f} dB, but the cameras shall see "
             f"{target_psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
         )
-    tried = [(row["gaussians"], row["psnr_ycbcr"]) for row in search.trace]
-    found = SceneFit(whole(search.gaussians), search.row["psnr"], native, tried)
+    tried = [(row["gaussians"], row["psnr"]) for row in search.trace]
+    found = SceneFit(whole(search.gaussians), search.row["psnr_of_cameras"], native, tried)
     if search.stopped == "interrupted":
-        raise FitInterrupted(found)  # type: ignore[arg-type]
+        raise Interrupted(found, "the search was interrupted; .result holds the best set so far")
     return found
 
 
@@ -286,9 +292,8 @@ def _objective(
     """Return the objective of a fit, at `DETAIL` texels per Gaussian; cameras judge all texels."""
     times = 2 ** max(0, int(math.log2(max(1.0, seen.sum() / (DETAIL * count))) / 2))
     target, weight = shrunk(target, times), shrunk(weight, times)
-    placement_image = space.placement_image(target)
     types = types_in(select(backend_of(mi.variant())))
-    return Pixels.of(Data(target, placement_image, weight), space, types)
+    return Pixels.of(target, space, types, weight, space.placement_image(target))
 
 
 def halved(values: Image, view: Visibility) -> Image:

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 import eigengs_dr as eg
-from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.objective import Data, Pixels, data_of
+from eigengs_dr.fitting.objective import Channels, Pixels, Target, pixels_of
 from eigengs_dr.image.space import space_of
 from eigengs_dr.raster.render import picture_of, render, to_tensor
 
@@ -25,15 +25,15 @@ def picture(seed=0):
 
 def objective_of(image, backend=None, space="ycbcr", weight=None):
     """The squared error of an RGB image in a space of colours."""
-    return Pixels.of(
-        data_of(image, space_of(space), weight), space_of(space), types_in(select(backend))
-    )
+    known = space_of(space)
+    target = Target.of(np.asarray(image, np.float32), known)
+    shown = [Channels("", known, slice(0, target.pixels.shape[2]), (target,))]
+    return pixels_of(shown, types_in(select(backend)), weight)
 
 
 def objective_for(gaussians, target, weight=None):
     """The squared error of an image (H, W, C) in the space of a set, with weights."""
-    data = Data(target, target, weight)
-    return Pixels.of(data, gaussians.space, types_of(gaussians.mean))
+    return Pixels.plain(target, gaussians, weight)
 
 
 def fitted(count=60, backend=None, image=None):

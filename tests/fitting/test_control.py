@@ -11,7 +11,8 @@ from _helpers.halves import SIDE, fitted, objective_of, picture, squared_error, 
 from _helpers.sets import check_equal
 from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Retreat, Surplus, rounds
 from eigengs_dr.fitting.descent import begin
-from eigengs_dr.fitting.loop import descend, refine
+from eigengs_dr.fitting.loop import Descent, descend, refine
+from eigengs_dr.fitting.measure import Measured
 from eigengs_dr.fitting.objective import Part
 
 COUNT, STEPS = 30, 100
@@ -232,21 +233,17 @@ def test_a_fit_with_a_surplus_after_fits_of_other_sizes():
 
 def scored(image, row=None):
     """A score by the psnr_ycbcr of RGB images."""
-    return lambda gaussians: [{"psnr_ycbcr": ycbcr_psnr(gaussians, image)}]
+    return lambda gaussians: [Measured({"psnr_ycbcr": ycbcr_psnr(gaussians, image)})]
 
 
 def test_the_trace_has_a_row_at_each_of_its_steps():
     """Those of sets with a surplus too, which are never the result."""
     told, image = [], picture()
     gaussians, objective = placed(image)
-    [found] = refine(
-        objective,
-        often(),
-        begin(gaussians),
-        200,
-        scored(image),
-        progress=lambda *a: told.append((a[0], a[2])),
+    descent = Descent(
+        objective, often(), scored(image), progress=lambda *a: told.append((a[0], a[2]))
     )
+    [found] = refine(descent, begin(gaussians), 200)
     assert len(found.gaussians) == COUNT
     numbers = {row["iteration"]: row["gaussians"] for row in found.trace}
     assert list(numbers) == [0, 10, 20, 50, 100, 200]
@@ -267,7 +264,7 @@ def test_an_interrupt_in_between_leaves_the_number_asked_for(color):
         if iteration == 60:
             raise KeyboardInterrupt
 
-    with pytest.raises(eg.FitInterrupted) as caught:
+    with pytest.raises(eg.Interrupted) as caught:
         eg.fit(image, COUNT, 200, space=color, progress=stop, method=often())
     result = caught.value.result
     assert len(result.gaussians) == COUNT
@@ -287,7 +284,8 @@ def test_an_interrupt_after_the_last_round_keeps_the_best_set_before_it():
             raise KeyboardInterrupt
 
     gaussians, objective = placed(image)
-    [found] = refine(objective, often(), begin(gaussians), 200, scored(image), progress=stop)
+    descent = Descent(objective, often(), scored(image), progress=stop)
+    [found] = refine(descent, begin(gaussians), 200)
     rows = [row for row in found.trace if row["gaussians"] == COUNT]
     *first, best, last = (row["iteration"] for row in rows)
     assert first == [0, 10, 20] and best in (50, 100) and last == last_round

@@ -11,13 +11,17 @@ import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, picture
 from _helpers.photos import coffee
 from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.interrupts import Interrupted
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.control import Redistribute
-from eigengs_dr.fitting.fewest import fewest
-from eigengs_dr.fitting.fit import FitInterrupted, fit
-from eigengs_dr.fitting.objective import Data, Pixels
+from eigengs_dr.fitting.fit import fit
+from eigengs_dr.fitting.loop import Descent
+from eigengs_dr.fitting.measure import Measured
+from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.options import Goal, max_gaussians_for
 from eigengs_dr.fitting.place import Random
+from eigengs_dr.fitting.search import fewest
+from eigengs_dr.image.space import DATA
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 
@@ -54,14 +58,14 @@ def test_short_descents_that_lose_do_not_count():
     """A smooth image, and a placement near the goal: ten steps lose decibels, and say nothing."""
     image = gaussian_filter(eg.sample("coffee")[60:156, 150:246], (3, 3, 0)).astype(np.float32)
     types = types_in(select("llvm"))
-    objective = Pixels.of(Data(image, image, None), "data", types)
+    objective = Pixels.of(image, DATA, types)
 
     def score(gaussians):
-        return [{"psnr": eg.psnr(eg.render(gaussians).numpy(), image, "data")}]
+        return [Measured({}, eg.psnr(eg.render(gaussians).numpy(), image, "data") - 45)]
 
     start = eg.DEFAULT.place_and_solve(objective, 800)
-    assert score(start)[0]["psnr"] > 38
-    found = fewest(objective, eg.DEFAULT, start, score, ("psnr", 45), 9000, 50)
+    assert score(start)[0].margin > 38 - 45
+    found = fewest(Descent(objective, eg.DEFAULT, score), start, 9000, 50)
     assert found.stopped == "met" and len(found.gaussians) < 4000
 
 
@@ -101,7 +105,7 @@ def test_interrupted_while_it_settles_it_keeps_the_goal_with_fewer():
         if row["psnr_rgb"] >= 28:  # the search has met its goal, and settles
             raise KeyboardInterrupt
 
-    with pytest.raises(FitInterrupted) as interruption:
+    with pytest.raises(Interrupted) as interruption:
         fit(picture(), target_psnr=28, iterations=200, progress=press)
     found = interruption.value.result
     assert found.stopped == "interrupted"
@@ -118,7 +122,7 @@ def interrupted(image, step, **options):
         if iteration == step:
             signal.raise_signal(signal.SIGINT)
 
-    with pytest.raises(FitInterrupted) as interruption:
+    with pytest.raises(Interrupted) as interruption:
         fit(image, iterations=200, progress=press, **options)
     return interruption.value.result
 
@@ -148,9 +152,13 @@ def test_an_image_that_is_fitted_without_error(space, value):
 def searched(measure, iterations=40, most=1000, image=None, method=eg.DEFAULT, progress=None):
     """Search for 0 dB, from 60 splats, where ``measure(gaussians)`` returns decibels."""
     gaussians, objective = fitted(60, image=image)
-    score = lambda gaussians: [{"decibels": measure(gaussians)}]  # noqa: E731
-    goal = "decibels", 0.0
-    return fewest(objective, method, gaussians, score, goal, most, iterations, progress=progress)
+
+    def score(gaussians):
+        decibels = measure(gaussians)
+        return [Measured({"decibels": decibels}, decibels)]
+
+    descent = Descent(objective, method, score, progress=progress)
+    return fewest(descent, gaussians, most, iterations)
 
 
 def test_a_search_whose_goal_is_not_met_ends():

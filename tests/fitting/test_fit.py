@@ -10,7 +10,8 @@ import eigengs_dr as eg
 from _helpers.families import small_model
 from _helpers.sets import check_equal
 from _helpers.waves import METHODS, SIDE, SPLATS, check_sound, figures, methods, picture
-from eigengs_dr.fitting.fit import FitInterrupted, fit
+from eigengs_dr.backend.interrupts import Interrupted
+from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.method import DEFAULT
 from eigengs_dr.fitting.options import default_count
 from eigengs_dr.fitting.place import Adaptive, Grid, Random, gaussians_at, grid_of
@@ -273,7 +274,7 @@ def test_interruption_keeps_the_best_so_far(backend, when, tmp_path):
         if iteration >= when:
             raise KeyboardInterrupt
 
-    with pytest.raises(FitInterrupted) as interruption:
+    with pytest.raises(Interrupted) as interruption:
         fit(
             tmp_path / "a.pfm",
             SPLATS,
@@ -326,7 +327,7 @@ class Pressing:
 def test_ctrl_c_before_refinement(backend, iterations):
     """The start is kept, and the caller told."""
     method = replace(DEFAULT, place=Pressing())
-    with pytest.raises(FitInterrupted) as interruption:
+    with pytest.raises(Interrupted) as interruption:
         fit(picture(), SPLATS, iterations, method=method, backend=backend)
     result = interruption.value.result
     check_sound(result, picture())

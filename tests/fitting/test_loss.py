@@ -13,9 +13,9 @@ import eigengs_dr as eg
 from eigengs_dr.backend.arrays import _types, types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.coarse import Coarse, enlarge, levels_of, shrink, texel_sums
-from eigengs_dr.fitting.loss import LossObjective, View
-from eigengs_dr.fitting.objective import Data, Pixels
-from eigengs_dr.image.space import RGB, space_of
+from eigengs_dr.fitting.loss import LossObjective
+from eigengs_dr.fitting.objective import Channels, Pixels, Target
+from eigengs_dr.image.space import RGB, Affine, space_of
 
 SIDE = 48
 TYPES = types_in(select("llvm"))
@@ -271,8 +271,8 @@ def test_a_step_without_a_derivative_moves_nothing(weighed):
     values, ends = np.full((SIDE, SIDE, 3), 0.5, np.float32), []
     for every, number in ((3, 18), (1000, 13)):  # the first step rests
         loss = eg.Loss(lambda p, s, n=every: weighed(p, 1.0 if s % n else 0.0))
-        base = Pixels.of(Data(values, values), "rgb", TYPES)
-        objective = LossObjective.of_loss(loss, [View("", RGB, range(3))], base)
+        base = Pixels.of(values, RGB, TYPES)
+        objective = LossObjective.of_loss(loss, [Channels("", RGB, slice(0, 3))], base)
         *_, last = texel_sums(objective, replace(Coarse(), decay=1.0), number, [0.5] * 3)
         ends.append(last.numpy())
     np.testing.assert_array_equal(*ends)
@@ -393,7 +393,14 @@ def test_what_is_no_loss_ends_in_one_line(loss, message):
         ({"loss": squares, "size": (8, 8), "space": {"1a": "rgb"}}, "starts with a letter"),
         ({"loss": squares, "size": 8}, r"give \(width, height\)"),
         ({"loss": squares, "size": (8.0, 8.0)}, r"give \(width, height\) in whole pixels"),
-        ({"loss": squares, "size": (8, 8), "gaussians": [2, 4]}, "no levels"),
+        (
+            {"loss": squares, "size": (8, 8), "gaussians": [2, 4]},
+            "levels are for the squared error",
+        ),
+        (
+            {"image": IMAGE, "target_psnr": 20, "loss": eg.Loss(squares, target=1e-4)},
+            "target_psnr and the target of a loss exclude each other",
+        ),
         ({"loss": squares, "size": (8, 8), "weight": np.ones((8, 9))}, "9x8 pixels, but size is"),
         ({"loss": squares, "size": (8, 8), "weight": np.ones((8, 8, 2))}, "2 channels, but the"),
         ({"image": IMAGE, "size": (8, 8)}, "size is for a loss without an image"),
@@ -444,7 +451,7 @@ def test_an_interrupted_fit_keeps_its_set(last):
             raise KeyboardInterrupt
 
     options = {"loss": squares, "size": (SIDE, SIDE), "gaussians": 50, "space": "rgb"}
-    with pytest.raises(eg.FitInterrupted) as error:
+    with pytest.raises(eg.Interrupted) as error:
         eg.fit(**options, iterations=100, progress=stop)
     result = error.value.result
     assert len(result.gaussians) == 50 and result.iterations == last
@@ -486,7 +493,7 @@ def test_a_loss_or_a_judge_may_end_the_fit(kind, stop):
         with pytest.raises(BaseException) as got:
             eg.fit(**given, iterations=40, space="rgb", loss=asked)
         if isinstance(error, KeyboardInterrupt):
-            assert isinstance(got.value, eg.FitInterrupted)
+            assert isinstance(got.value, eg.Interrupted)
             result = got.value.result
             assert result.stopped == "interrupted" and result.image.shape == IMAGE.shape
             assert len(result.gaussians) == given.get("gaussians", len(result.gaussians))
@@ -505,7 +512,7 @@ def test_an_operation_of_a_loss_may_end_the_fit():
     def loss(picture, step):
         return squares(dr.custom(Ends, picture) if step == 3 else picture)
 
-    with pytest.raises(eg.FitInterrupted) as error:
+    with pytest.raises(eg.Interrupted) as error:
         eg.fit(IMAGE, 20, 10, space="rgb", loss=loss)
     assert error.value.result.iterations == 3
 
@@ -521,9 +528,11 @@ def test_the_slope_is_a_finite_difference(backend, space):
     def loss(picture, step):
         return dr.sum(dr.square(picture - target) * (1 + picture), axis=None)
 
-    base = Pixels.of(Data(values.astype(np.float32), values.astype(np.float32)), space, double)
-    view = View("", space_of(space), range(3), 0.9, 0.05)
-    objective = LossObjective.of_loss(eg.Loss(loss), [view], base)
+    known, values32 = space_of(space), values.astype(np.float32)
+    base = Pixels.of(values32, known, double)
+    fitted = Target(values32, values32, Affine(0.9, 0.05))
+    shown = [Channels("", known, slice(0, 3), (fitted,))]
+    objective = LossObjective.of_loss(eg.Loss(loss), shown, base)
     rows = double.Float(values.ravel())
     value, slopes, size = objective.derivative(objective.seen(rows))
     slope = objective.pull_back(rows, slopes).numpy() / objective.calls.unit
@@ -552,7 +561,7 @@ def test_the_curvature_of_the_squared_error_is_its_weight():
         error = picture - type(picture)(image)
         return dr.sum(dr.square(error) * type(picture)(weight), axis=None)
 
-    objective = LossObjective.of_loss(eg.Loss(loss), [View("", RGB, range(3))], base)
+    objective = LossObjective.of_loss(eg.Loss(loss), [Channels("", RGB, slice(0, 3))], base)
     near = objective.around(gaussians)
     curvature = near.model.curvature.numpy().reshape(-1, base.grid.pixels)
     assert (curvature.max(axis=1) - curvature.min(axis=1) <= 1e-6).all()

@@ -7,8 +7,8 @@ import eigengs_dr as eg
 from _helpers.sets import random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.fitting.measure import psnrs
-from eigengs_dr.fitting.objective import Data, picture
-from eigengs_dr.image.space import space_of
+from eigengs_dr.fitting.objective import Channels, Target
+from eigengs_dr.image.space import Affine, space_of
 from eigengs_dr.raster.render import batch_to_tiles
 
 
@@ -20,7 +20,9 @@ def near(image, seed=0):
 
 def shown(gaussians, image, space, weight=None):
     """What a set shows of an image that is fitted as it is."""
-    return picture(types_of(gaussians.mean), space_of(space), [image], [Data(image, image)], weight)
+    part, target = slice(0, image.shape[2]), Target(image, image, Affine())
+    channels = Channels("", space_of(space), part, (target,))
+    return channels.picture(types_of(gaussians.mean), weight)
 
 
 def expected(rendered, image, space):

@@ -10,8 +10,7 @@ from drjit import JitFlag
 from hypothesis import given
 
 from _helpers.sets import COUNT, SIZE, Scene, check_equal, few, random_scene, scene_of, scenes
-from eigengs_dr.backend.arrays import types_of
-from eigengs_dr.fitting.objective import Data, Pixels
+from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.solve import solve as solve_objective
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.raster.render import render
@@ -30,8 +29,7 @@ def roomy(count=12, channels=3):
 
 def solve(gaussians, image, steps=10, warm_start=False, background=None, weight=None):
     """The solve for an image (H, W, C) in the space of the set, with weights."""
-    data = Data(image, image, weight)
-    objective = Pixels.of(data, gaussians.space, types_of(gaussians.mean))
+    objective = Pixels.plain(image, gaussians, weight)
     return solve_objective(gaussians, objective, steps, warm_start, background)
 
 

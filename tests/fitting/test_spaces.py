@@ -8,8 +8,7 @@ from _helpers.errors import one_line
 from _helpers.families import small_model
 from _helpers.waves import SPLATS, check_sound, figures, methods, picture
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.objective import data_of
-from eigengs_dr.fitting.pixels import read_pixels
+from eigengs_dr.fitting.problem import read_pixels
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.pixels import ImageError
 from eigengs_dr.image.space import BLACK, LINEAR, YCBCR
@@ -42,11 +41,11 @@ def test_linear_light_places_by_what_one_sees(backend):
 def test_linear_light_weighs_errors_as_they_show():
     """Squares count by the slope of the sRGB curve, down to the darkest light."""
     light = np.geomspace(BLACK, 1, 50, dtype=np.float32)[None, :, None].repeat(3, axis=2)
-    weight = data_of(to_coded(light), LINEAR).curvature
+    weight = LINEAR.weight(to_linear(to_coded(light)))
     slope = np.gradient(to_coded(light)[0, :, 0], light[0, :, 0])
     ratio = weight[0, :, 0] / slope
     np.testing.assert_allclose(ratio, ratio.mean(), rtol=0.2)
-    np.testing.assert_array_equal(data_of(0 * light, LINEAR).curvature, weight.max())
+    np.testing.assert_array_equal(LINEAR.weight(0 * light), weight.max())
 
 
 @methods

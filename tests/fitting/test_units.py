@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from eigengs_dr.fitting.objective import Affine, Extent, data_of, fitted, restored
-from eigengs_dr.image.space import DATA, RGB
+from eigengs_dr.fitting.objective import Channels, Target
+from eigengs_dr.fitting.options import FitOptions
+from eigengs_dr.fitting.problem import Problem
+from eigengs_dr.image.space import DATA, RGB, Affine, Extent
 
 SIDE = 40
 
@@ -88,15 +90,14 @@ def test_constant_data_are_exact(value):
 def test_the_unit_of_data(channels):
     """Mean 0 and range 1, and back."""
     pixels = np.random.default_rng(0).uniform(-3, 5, (9, 8, channels)).astype(np.float32)
-    data = data_of(pixels, DATA)
-    assert data.values.mean() == pytest.approx(0, abs=1e-6)
-    assert np.ptp(data.values) == pytest.approx(1)
-    np.testing.assert_allclose(
-        data.values * data.affine.scale + data.affine.offset, pixels, atol=1e-5
-    )
+    target = Target.of(pixels, DATA)
+    assert target.values.mean() == pytest.approx(0, abs=1e-6)
+    assert np.ptp(target.values) == pytest.approx(1)
+    shown = target.values * target.unit.scale + target.unit.offset
+    np.testing.assert_allclose(shown, pixels, atol=1e-5)
     extent = Extent.of(pixels[:4]).joined(Extent.of(pixels[4:]))
-    np.testing.assert_allclose(DATA.unit(extent), data.affine, rtol=1e-6)
-    assert data_of(pixels, RGB).affine == Affine()
+    np.testing.assert_allclose(DATA.unit(extent), target.unit, rtol=1e-6)
+    assert Target.of(pixels, RGB).unit == Affine()
 
 
 @pytest.mark.parametrize("space", ["linear", "log"])
@@ -115,7 +116,9 @@ def test_light_of_any_scale(values, space):
 
 def test_sets_there_and_back():
     gaussians = eg.fit(np.eye(8), 5, 0, space="data").gaussians
-    affine = Affine(30.0, -7.0)
-    back = restored(fitted(gaussians, affine), affine).to_arrays()
+    target = Target(np.zeros((8, 8, 1)), np.zeros((8, 8, 1)), Affine(30.0, -7.0))
+    channels = Channels("", DATA, slice(0, 1), (target,))
+    problem = Problem((channels,), (8, 8), FitOptions())
+    back = problem.restored(problem.fitted(gaussians)).to_arrays()
     for name, expected in gaussians.to_arrays().items():
         np.testing.assert_allclose(back[name], expected, atol=1e-5)

@@ -5,7 +5,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.photos import coffee
-from eigengs_dr.fitting.pixels import read_pixels
+from eigengs_dr.fitting.problem import read_pixels
 from eigengs_dr.image.pixels import check_weight
 from eigengs_dr.image.space import DATA, to_planes
 

@@ -212,7 +212,7 @@ def test_ctrl_c_keeps_the_best_set():
             raise KeyboardInterrupt
 
     scene = scene_of(camera([0, 0, 5.0]))
-    with pytest.raises(eg.FitInterrupted) as stopped:
+    with pytest.raises(eg.Interrupted) as stopped:
         eg.fit_for_scene(scene, NAME, photo(), BOUND, iterations=STEPS, progress=stop)
     found = stopped.value.result
     assert list(dict.fromkeys(calls)) == ["rays", "target", "search"]

@@ -19,7 +19,7 @@ from _helpers.plain_placement import (
 from _helpers.sets import few
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.objective import Data, Pixels
+from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.place import Grid
 from eigengs_dr.fitting.placement.adaptive import (
     DENSITY_BLUR,
@@ -34,6 +34,7 @@ from eigengs_dr.fitting.placement.adaptive import (
     shapes_from_hessian,
 )
 from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.image.space import DATA
 from eigengs_dr.raster.render import render
 
 
@@ -141,8 +142,8 @@ def test_sets_of_a_batch_are_those_of_its_images(backend):
     batch = generator(7).uniform(0, 1, (3, 30, 33, 3)).astype(np.float32)
 
     def placed_for(*images):
-        data = [Data(image, image) for image in images]
-        return place_adaptive(Pixels.of(data, "data", types_in(select(backend))), 60)
+        objective = Pixels.of(np.stack(images), DATA, types_in(select(backend)))
+        return place_adaptive(objective, 60)
 
     found = placed_for(*batch)
     for name in ("mean", "factor"):

@@ -10,7 +10,6 @@ added while it does not; each change ends with a short descent.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -18,13 +17,11 @@ from typing import NamedTuple
 import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
-from ..image.metrics import MAX_PSNR
 from .control import Perturb, Redistribute, Relocate, Surplus
 from .descent import begin
 from .exchange import densify, prune
-from .loop import FitProgress, Refinement, Score, descend
+from .loop import Descent, Refinement, descend
 from .measure import Row
-from .method import Method
 from .objective import Pixels
 from .placement.adaptive import redistribute
 
@@ -99,35 +96,21 @@ ENOUGH = 0.02
 
 
 def fewest(
-    objective: Pixels,
-    method: Method,
-    start: Gaussians,
-    score: Score,
-    goal: tuple[str, float],
-    max_count: int,
-    iterations: int = 1000,
-    key: int = 0,
-    progress: FitProgress | None = None,
-    interrupted: Callable[[], bool] = lambda: False,
+    descent: Descent, start: Gaussians, max_count: int, iterations: int = 1000
 ) -> Refinement:
     """Find the smallest number of Gaussians that meets a goal.
 
     Parameters
     ----------
-    objective : Pixels
-    method : Method
+    descent : Descent
+        Its score says by how much a set is above the goal.
     start : Gaussians
         A first guess by the placement `Adaptive`, which can be redistributed.
-    score : Score
-    goal : (str, float)
-        Key of the value in the rows of `score` that must reach the goal, and the goal in dB.
     max_count : int
         Largest number of Gaussians.
     iterations : int, optional
         Steps of a fit with a known number; the search takes up to about twice as many, and a
         quarter more where the first fit is far off.
-    key, progress, interrupted : optional
-        See `eigengs_dr.fitting.loop.refine`.
 
     Returns
     -------
@@ -139,7 +122,7 @@ def fewest(
     shares = (TRY_SHARE, FIT_SHARE, POLISH_SHARE)
     tries, fit, polish = (max(1, round(share * iterations)) for share in shares)
     planned = MAX_TRIES * tries + fit + MAX_POLISHES * polish
-    run = _Run(objective, method, start, score, goal, key, progress, interrupted, planned)
+    run = _Run(descent, start, planned)
     try:
         run.score(start)
         estimate = _estimate(run, max_count, tries)
@@ -172,14 +155,8 @@ class _Trial(NamedTuple):
 class _Run:
     """The state of one search."""
 
-    objective: Pixels
-    method: Method
+    descent: Descent
     start: Gaussians
-    measure: Score
-    goal: tuple[str, float]
-    key: int
-    progress: FitProgress | None
-    interrupted: Callable[[], bool]
     planned: int
     stopped: bool = False
     step: int = 0
@@ -194,17 +171,18 @@ class _Run:
         self, gaussians: Gaussians, steps: int, share: float = 1.0, surplus: int = 0
     ) -> _Trial:
         """Take some steps at a fraction of the learning rates, and score the pruned set."""
-        method = self.method.at_rates(share).without(Surplus, Redistribute)
+        descent = self.descent
+        method = descent.method.at_rates(share).without(Surplus, Redistribute)
         if share < 1:  # a polish moves Gaussians by itself
             method = method.without(Relocate, Perturb)
         self.planned, before = max(self.planned, self.step + steps), self.step
         current = replace(begin(gaussians), count=len(gaussians) - surplus, surplus=surplus)
-        states = descend(self.objective, method, current, steps, self.key + before)
+        states = descend(descent.objective, method, current, steps, descent.key + before)
         try:
             with closing(states):
                 for step, current in enumerate(states, 1):  # noqa: B007
                     self.step = before + step
-                    if self.progress and self.step % 10 == 0:
+                    if descent.progress and self.step % 10 == 0:
                         dr.sync_thread()  # steps run asynchronously; the bar shows finished steps
                         self.show(self.trace[-1])
                     if self.ended():
@@ -213,21 +191,22 @@ class _Run:
             self.stopped = True
         fitted = dr.detach(current.gaussians)
         # An interrupt may come before the last relocation.
-        return self.score(prune(fitted, self.objective.around(fitted), current.count))
+        return self.score(prune(fitted, self.around(fitted), current.count))
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Place `count` Gaussians anew, denser where a set leaves more error."""
-        near = self.objective.around(gaussians)
-        return redistribute(gaussians, near, count, self.method.solve_steps)
+        near = self.around(gaussians)
+        return redistribute(gaussians, near, count, self.descent.method.solve_steps)
+
+    def around(self, gaussians: Gaussians) -> Pixels:
+        """Return the squared error that stands for the objective near a set."""
+        return self.descent.objective.around(gaussians)
 
     def score(self, gaussians: Gaussians) -> _Trial:
-        figure, goal = self.goal
-        [figures] = self.measure(gaussians)
-        row = {"iteration": self.step, "gaussians": len(gaussians), **figures}
+        [measured] = self.descent.score(gaussians)
+        row = {"iteration": self.step, "gaussians": len(gaussians), **measured.row}
         self.trace.append(row)
-        # The PSNR of a set without error is infinite, and the difference of two such is not a
-        # number.
-        trial = _Trial(gaussians, goal - min(figures[figure], MAX_PSNR), row)
+        trial = _Trial(gaussians, -measured.margin, row)
         if len(self.trace) == 1 or _better(trial, self.best):
             self.best = trial
         self.show(row)
@@ -235,15 +214,15 @@ class _Run:
 
     def show(self, row: Row) -> None:
         """Call `progress`, which may end the search by a `KeyboardInterrupt`."""
-        if self.progress and not self.stopped:
+        if self.descent.progress and not self.stopped:
             try:
-                self.progress(self.step, self.planned, row)
+                self.descent.progress(self.step, self.planned, row)
             except KeyboardInterrupt:
                 self.stopped = True
 
     def ended(self) -> bool:
         """Return whether the search was ended from outside."""
-        return self.stopped or self.interrupted()
+        return self.stopped or self.descent.interrupted()
 
 
 def _better(a: _Trial, b: _Trial) -> bool:
@@ -300,7 +279,7 @@ def _fit_estimate(
 def _fit(run: _Run, estimate: _Estimate, steps: int) -> _Trial:
     """Fit the estimated number, with a surplus that is placed as well and leaves."""
     tried, placed = estimate
-    surplus, more = run.method.control(Surplus), 0
+    surplus, more = run.descent.method.control(Surplus), 0
     if surplus:
         more = surplus.number(len(placed), placed.width * placed.height, steps)
     if more:
@@ -343,19 +322,19 @@ def _polish(run: _Run, trial: _Trial, max_count: int, steps: int, max_steps: int
             )
             if new_count == count or -missing < ENOUGH:
                 return
-            changed = prune(trial.gaussians, run.objective.around(trial.gaussians), new_count)
+            changed = prune(trial.gaussians, run.around(trial.gaussians), new_count)
         elif best.missing <= 0 and len(best.gaussians) <= FAR * count:
             # The best number lies between this one and that of the best set; or a polish suffices.
             new_count = max(
                 count, _count_for_gain(run, count, missing, (count + len(best.gaussians)) // 2)
             )
-            changed = densify(trial.gaussians, run.objective.around(trial.gaussians), new_count)
+            changed = densify(trial.gaussians, run.around(trial.gaussians), new_count)
         else:
             new_count = max(
                 _count_for_gain(run, count, missing, max_count), math.ceil(least_growth * count)
             )
             changed = densify(
-                trial.gaussians, run.objective.around(trial.gaussians), min(new_count, max_count)
+                trial.gaussians, run.around(trial.gaussians), min(new_count, max_count)
             )
             if len(changed) == count:  # at `max_count`, or none would reduce the error
                 return
@@ -380,6 +359,6 @@ def _trim(run: _Run) -> None:
         new_count = (too_few + len(above.gaussians)) // 2
         if new_count in (too_few, len(above.gaussians)):
             return
-        near = run.objective.around(above.gaussians)
+        near = run.around(above.gaussians)
         trial = run.score(prune(above.gaussians, near, new_count))
         above, too_few = (trial, too_few) if trial.missing <= 0 else (above, new_count)
