@@ -38,7 +38,7 @@ PRESETS = ("default", "gaussianimage", "eigengs")
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
 
-EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "cluster", "recursive")
+EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
 """Options that cannot be combined with maps."""
 
 
@@ -62,7 +62,8 @@ EXCLUDED_BY_MAPS = ("init", "basis", "preset", "space", "seed", "blocks", "clust
     "--space",
     SPACES,
     "Colour space: linear for textures, log for light above 1, normal for normal maps, data for "
-    "other values.",
+    "other values.  [default: ycbcr]",
+    True,
 )
 @options.encoding
 @options.number("--seed", "Seed of the random numbers.", 0)
@@ -135,7 +136,7 @@ def fit(
     files = [m.path for m in maps.values()] or [
         file for given in images for file in _expand(given, recursive)
     ]
-    settings = _settings(choices, basis, run.backend, files[0], bool(maps))
+    settings = _settings(choices, basis, run.backend)
     several = not maps and (len(files) > 1 or files != list(images))
     if recursive and files == list(images):
         raise ValueError("--recursive takes a folder of images")
@@ -167,7 +168,7 @@ def fit(
             records = [_fit_by_blocks(run, files[0], outputs[0], blocks, settings, client)]
         else:
             records = [_fit_at_once(run, maps or files[0], outputs[0], pictures[0], settings)]
-    used = dict(choices)
+    used = choices | {"space": settings.space or YCBCR}
     if settings.start is not None:
         used["basis"] = basis or DEFAULT_BASIS
     figures = {"images": records} if several else records[0]
@@ -189,13 +190,8 @@ def _check_maps(context: click.Context, images: Sequence[Path | str], output: Pa
         raise ValueError("--map needs -o, the .npz file to write")
 
 
-def _settings(
-    choices: dict[str, Any], basis: str | None, backend: str | None, first: Path | str, maps: bool
-) -> FitOptions:
-    """Return the options of a fit for the options of the command line.
-
-    `first` is the first image, whose size determines the levels if only their number is given.
-    """
+def _settings(choices: dict[str, Any], basis: str | None, backend: str | None) -> FitOptions:
+    """Return the options of a fit for the options of the command line."""
     from ..fitting.options import FitOptions
 
     method, start = _method(choices["preset"], choices["init"]), None
@@ -213,25 +209,21 @@ def _settings(
         goal = eg.Goal(target, choices["target_space"] or "rgb", choices["max_gaussians"])
     elif choices["max_gaussians"] is not None or choices["target_space"]:
         raise ValueError("--max-gaussians and --target-space need --target-psnr")
-    if levels is not None:
-        if goal:
-            raise ValueError("--levels and --target-psnr exclude each other; give one of them")
-        if isinstance(levels, int) and count is None:
-            count = _default_count(first)
-        try:
-            count = eg.level_counts(levels[-1] if count is None else count, levels)
-        except ValueError as error:
-            raise ValueError(f"{first}: {error}") from None
+    if goal and levels is not None:
+        raise ValueError("--levels and --target-psnr exclude each other; give one of them")
+    if isinstance(levels, tuple):
+        count, levels = tuple(eg.level_counts(count or levels[-1], levels)), None
     return FitOptions(
         gaussians=count,
         iterations=choices["iterations"],
         target_psnr=goal,
         start=start,
-        space=None if maps else choices["space"],
+        space=choices["space"],
         method=method,
         seed=choices["seed"],
         backend=backend,
         encoding=choices["encoding"],
+        levels=levels,
     )
 
 
@@ -244,15 +236,6 @@ def _method(preset: str, init: str | None) -> Method:
     method = {"default": eg.DEFAULT, "gaussianimage": GAUSSIANIMAGE, "eigengs": EIGENGS}[preset]
     places: dict[str, Placement] = {"adaptive": Adaptive(), "grid": Grid(), "random": Random()}
     return method if init is None else replace(method, place=places[init])
-
-
-def _default_count(path: Path | str) -> int:
-    """Return the default number of Gaussians for an image, from the header of its file."""
-    from ..blocks.windows import image_size
-    from ..fitting.options import DEFAULT_COUNT, default_count
-
-    size = image_size(path)
-    return DEFAULT_COUNT if size is None else default_count(size[0] * size[1])
 
 
 def _expand(source: Path | str, recursive: bool) -> Sequence[Path | str]:
@@ -491,13 +474,14 @@ def _given_options(context: click.Context, settings: FitOptions) -> dict[str, An
     default = click.core.ParameterSource.DEFAULT
     given = [n for n in context.params if context.get_parameter_source(n) is not default]
     names = {FIELD_OF_OPTION.get(name, name) for name in given}
+    if "levels" in names:
+        names.add("gaussians")
     if settings.start is not None:
         names.add("start")
     return {name: value for name, value in vars(settings).items() if name in names}
 
 
 FIELD_OF_OPTION = {
-    "levels": "gaussians",
     "init": "method",
     "preset": "method",
     "target_space": "target_psnr",
@@ -536,7 +520,7 @@ REPORTED_BYTES = 1_000_000_000
 def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
     """Return whether a fit by blocks supports these options."""
     default = settings.method == eg.DEFAULT and settings.start is None
-    return default and settings.goal is None and not settings.levels and preview is None
+    return default and settings.goal is None and not settings.has_levels and preview is None
 
 
 def _check_memory(
@@ -575,6 +559,7 @@ def _fit_by_blocks(
     """Fit one image by blocks into a file; an interrupt keeps the finished blocks beside it."""
     names = ("gaussians", "iterations", "space", "method", "seed", "backend", "encoding")
     choices = {name: getattr(settings, name) for name in names}
+    choices["space"] = settings.space or YCBCR
     with bar(run.quiet) as show:
 
         def progress(done: int, total: int, row: Record) -> None:

@@ -151,8 +151,8 @@ def _settings_of(settings: FitOptions) -> dict[str, Any]:
     options["method"] = repr(settings.method)
     if settings.goal:
         options["target_psnr"] = vars(settings.goal)
-    if settings.levels:
-        options["gaussians"] = list(settings.levels)
+    if isinstance(settings.gaussians, tuple):
+        options["gaussians"] = list(settings.gaussians)
     if settings.start is not None:
         start: Any = settings.start
         options["start"] = fingerprint(set_in(start))
@@ -178,7 +178,7 @@ def _is_groupable(image: EncodedImage, options: FitOptions) -> bool:
         and options.start is None
         and not method.place.has_colors
         and options.goal is None
-        and not options.levels
+        and not options.has_levels
         and method.cutoff <= MAX_CUTOFF
         and max(pixels.shape[:2]) <= MAX_SIDE
         and options.count_for(pixels.shape[0] * pixels.shape[1]) <= MAX_GAUSSIANS

@@ -141,6 +141,7 @@ def fit(
     encoding: str | None = None,
     loss: Loss | LossFunction | None = None,
     size: tuple[int, int] | None = None,
+    levels: int | None = None,
 ) -> Fit:
     """Fit an image, or a loss of your own, with a number of Gaussians or as few as a target needs.
 
@@ -211,6 +212,8 @@ def fit(
         image, the image places the Gaussians and gives PSNRs.
     size : (int, int), optional
         Width and height of the picture of a loss without an image, in pixels.
+    levels : int, optional
+        Number of levels of detail, each with four times as many Gaussians as the one before.
 
     Returns
     -------
@@ -262,6 +265,7 @@ def fit(
         backend=backend,
         encoding=encoding,
         loss=loss if loss is None or isinstance(loss, Loss) else Loss(loss),
+        levels=levels,
     )
     problem = problem_of(image, options, check_weight(weight), size, spaces)
     [result] = fit_problem(problem, started, progress)
@@ -340,7 +344,7 @@ def _refined(
     problem: Problem, descent: Descent, begun: Gaussians | None, chosen: bool, started: float
 ) -> tuple[list[Refinement], float]:
     """Fit a given number of Gaussians, levels, or the fewest; and the seconds before refinement."""
-    options, counts = problem.options, problem.options.levels
+    options, counts = problem.options, problem.levels
     objective, method = descent.objective, descent.method
     if counts or method.place != Adaptive():  # the choice of a placement is not undone
         method = method.without(Surplus, Redistribute)

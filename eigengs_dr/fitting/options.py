@@ -140,6 +140,7 @@ class FitOptions:
     backend: str | None = None
     encoding: str | None = None
     loss: Loss | None = None
+    levels: int | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.gaussians, Sequence) and not isinstance(self.gaussians, (str, bytes)):
@@ -150,11 +151,11 @@ class FitOptions:
         if self.target_psnr is not None and not isinstance(self.target_psnr, Goal):
             object.__setattr__(self, "target_psnr", Goal(self.target_psnr))
         kinds = FitOptions.__annotations__
-        if not self.levels:
+        if not isinstance(self.gaussians, tuple):
             kinds = kinds | {"gaussians": "int | None"}
         for name, value in plain_numbers(vars(self), kinds).items():
             object.__setattr__(self, name, value)
-        for name, least in (("gaussians", 1), ("iterations", 0), ("seed", 0)):
+        for name, least in (("gaussians", 1), ("iterations", 0), ("seed", 0), ("levels", 1)):
             count = getattr(self, name)
             if isinstance(count, int) and count < least:
                 raise ValueError(f"{name} is {count!r}; it must be at least {least}")
@@ -173,15 +174,19 @@ class FitOptions:
     def _check_nested(self) -> None:
         """Raise ValueError if other options exclude what a search or levels need."""
         places = self.method.place == Adaptive() and self.start is None
-        if self.levels and self.loss is not None:
+        if self.levels and isinstance(self.gaussians, tuple):
+            raise ValueError("levels and numbers of Gaussians up to each exclude each other")
+        if self.has_levels and self.loss is not None:
             raise ValueError("levels are for the squared error; leave them or the loss out")
-        if self.levels and not (places and not self.method.needs_model):
+        if self.has_levels and not (places and not self.method.needs_model):
             raise ValueError("levels need the placement Adaptive and no start; leave them out")
         if self.goal and self.loss is not None and self.loss.target is not None:
             raise ValueError("target_psnr and the target of a loss exclude each other; give one")
         if not self.searches:
             return
         target = "target_psnr" if self.goal else "the target of a loss"
+        if self.levels:
+            raise ValueError(f"levels and {target} exclude each other; give one of them")
         if self.gaussians is not None:
             raise ValueError(
                 f"gaussians and {target} exclude each other; give one of them, or "
@@ -206,9 +211,21 @@ class FitOptions:
         return self.goal is not None or (self.loss is not None and self.loss.target is not None)
 
     @property
-    def levels(self) -> tuple[int, ...]:
-        """Numbers of Gaussians up to each level; () without levels."""
-        return self.gaussians if isinstance(self.gaussians, tuple) else ()
+    def has_levels(self) -> bool:
+        """Whether the first Gaussians of the set form the image too."""
+        return self.levels is not None or isinstance(self.gaussians, tuple)
+
+    def levels_for(self, pixels: int) -> tuple[int, ...]:
+        """Return the numbers of Gaussians up to each level; () without levels.
+
+        Raises
+        ------
+        ValueError
+            If an image of so many pixels has too few Gaussians for the number of levels.
+        """
+        if isinstance(self.gaussians, tuple):
+            return self.gaussians
+        return tuple(level_counts(self.count_for(pixels), self.levels)) if self.levels else ()
 
     def check_image(self, width: int, height: int, channels: int) -> None:
         """Raise ValueError for more Gaussians than pixels, and for an image too large to index."""
@@ -220,11 +237,13 @@ class FitOptions:
                 raise ValueError(
                     f"{name} is {count}; an image of {width}x{height} takes 1 to {width * height}"
                 )
+        self.levels_for(width * height)
 
     @property
     def count(self) -> int | None:
         """Number of Gaussians, if the user gives one; with levels, of all."""
-        return self.levels[-1] if self.levels else self.gaussians  # type: ignore[return-value]
+        given = self.gaussians
+        return given[-1] if isinstance(given, tuple) else given  # type: ignore[return-value]
 
     def count_for(self, pixels: int) -> int:
         """Return the number of Gaussians for so many pixels, if the fit does not search for it."""

@@ -139,6 +139,11 @@ class Problem:
         return self.options.count_for(area)
 
     @property
+    def levels(self) -> tuple[int, ...]:
+        """Numbers of Gaussians up to each level; () without levels."""
+        return self.options.levels_for(self.size[0] * self.size[1])
+
+    @property
     def max_count(self) -> int:
         """Largest number of Gaussians that a search tries."""
         return self.options.max_count_for(self.size[0] * self.size[1], self.number)
@@ -321,7 +326,7 @@ def _problem_of_loss(
         )
     if np.shape(size) != (2,) or np.asarray(size).dtype.kind not in "iu":
         raise ValueError(f"size is {size!r}; give (width, height) in whole pixels")
-    if options.goal is not None or options.levels:
+    if options.goal is not None or options.has_levels:
         raise ValueError(
             "without an image there is no PSNR and there are no levels; give the loss a target"
         )
