@@ -29,10 +29,6 @@ if TYPE_CHECKING:
 # is set.
 select_libllvm()
 
-# In a checkout the plugins lie beside the package; an install has them inside.
-if not Path(__file__).with_name("plugins").exists():
-    __path__.append(str(Path(__file__).parents[1]))
-
 
 # Folders that know nothing of the codec and the viewer use them through these functions.
 def _make_html(value: object) -> str:

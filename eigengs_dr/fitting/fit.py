@@ -10,12 +10,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..backend.doors import door
 from ..backend.interrupts import defer_interrupts
 from ..backend.notebook import to_html
 from ..backend.progress import shows_progress
+from ..backend.types import ArrayLike
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians, one_image, scale_channels

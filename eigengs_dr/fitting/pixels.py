@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from ..backend.types import PathLike, Values
+from ..backend.types import ArrayLike, PathLike, Values
 from ..image.color import rendered_as
 from ..image.io import check_data, check_image, read_image
 from ..image.pixels import MAX_PIXEL, MIN_PIXEL, EncodedImage, ImageError

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
@@ -23,6 +23,7 @@ from ..backend.doors import door
 from ..backend.interrupts import defer_interrupts
 from ..backend.progress import shows_progress
 from ..backend.selection import backend_of, select
+from ..backend.types import ArrayLike
 from ..fitting.fewest import fewest
 from ..fitting.fit import FitInterrupted
 from ..fitting.measure import Row
