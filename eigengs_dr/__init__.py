@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
-from .backend import notebook
-from .backend.libllvm import select_libllvm
+from .backend import messages
+from .backend.selection import select_libllvm
 from .gaussian import packed
 from .version import __version__ as __version__
 
@@ -49,7 +49,7 @@ def _packed_maps(path: Path) -> tuple[TextureMap, ...]:
     return maps_of(path)
 
 
-notebook.make_html = _make_html
+messages.make_html = _make_html
 packed.read_set, packed.read_maps = _read_packed, _packed_maps
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arguments import takes_numbers
-from ..backend.notebook import to_html
-from ..backend.progress import shows_progress
+from ..backend.doors import shows_progress, takes_numbers
+from ..backend.messages import to_html
 from ..backend.types import ArrayLike, Record
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image

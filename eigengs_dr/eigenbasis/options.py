@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..backend.arguments import plain_numbers
+from ..backend.doors import plain_numbers
 from ..image.color import BASIS_SPACES
 from ..image.pixels import check_size
 from .pca.basis import check_components

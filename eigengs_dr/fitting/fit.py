@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import door
+from ..backend.doors import door, shows_progress
 from ..backend.interrupts import defer_interrupts
-from ..backend.notebook import to_html
-from ..backend.progress import shows_progress
+from ..backend.messages import to_html
 from ..backend.types import ArrayLike
 from ..gaussian.channels import channel_weights
 from ..gaussian.file import FitFigures, write

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arguments import plain_numbers
 from ..backend.arrays import ArrayTypes
+from ..backend.doors import plain_numbers
 from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space
 from ..gaussian.gaussians import Gaussians
 from ..image.color import rendered_as

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from ..backend.arguments import plain_numbers, takes_numbers
+from ..backend.doors import plain_numbers, takes_numbers
 from ..gaussian.file import check_index_range, check_sides
 from ..gaussian.gaussians import Fitted, Gaussians
 from ..image.color import SPACES

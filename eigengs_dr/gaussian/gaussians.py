@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
 from ..backend.doors import class_of_doors, door
-from ..backend.notebook import to_html
+from ..backend.messages import to_html
 from ..backend.selection import BackendError, select
 from ..backend.types import Array2f, Array3f, Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size

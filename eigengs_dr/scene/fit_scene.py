@@ -19,9 +19,8 @@ from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
 from ..backend.arrays import types_in
-from ..backend.doors import door
+from ..backend.doors import door, shows_progress
 from ..backend.interrupts import defer_interrupts
-from ..backend.progress import shows_progress
 from ..backend.selection import backend_of, select
 from ..backend.types import ArrayLike
 from ..fitting.fewest import fewest
