@@ -85,11 +85,8 @@ test: $(READY)
 	@$(MAKE) --no-print-directory layers
 	$(BIN)/python -m pytest -q $(ON_ALL_CORES)
 
-# In the installed layout: in a checkout the plugins lie beside the package.
 layers: $(READY)
-	@rm -rf build/layout && mkdir -p build/layout && cp -r eigengs_dr build/layout \
-		&& cp -r plugins build/layout/eigengs_dr/plugins
-	cd build/layout && ../../$(BIN)/lint-imports --config ../../pyproject.toml
+	$(BIN)/lint-imports
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -q -m slow

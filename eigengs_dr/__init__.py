@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
-from .backend import notebook
-from .backend.libllvm import select_libllvm
+from .backend import messages
+from .backend.selection import select_libllvm
 from .gaussian import packed
 from .version import __version__ as __version__
 
@@ -28,10 +28,6 @@ if TYPE_CHECKING:
 # Dr.Jit looks for libLLVM once, while it is imported; lazy_loader imports it here if EAGER_IMPORT
 # is set.
 select_libllvm()
-
-# In a checkout the plugins lie beside the package; an install has them inside.
-if not Path(__file__).with_name("plugins").exists():
-    __path__.append(str(Path(__file__).parents[1]))
 
 
 # Folders that know nothing of the codec and the viewer use them through these functions.
@@ -53,7 +49,7 @@ def _packed_maps(path: Path) -> tuple[TextureMap, ...]:
     return maps_of(path)
 
 
-notebook.make_html = _make_html
+messages.make_html = _make_html
 packed.read_set, packed.read_maps = _read_packed, _packed_maps
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

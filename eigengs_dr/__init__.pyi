@@ -2,32 +2,47 @@
 
 from . import paper as paper
 from . import plugins as plugins
-from .backend.executor import ClusterError
-from .backend.interrupts import Interrupted
-from .backend.recording import exclusive
-from .backend.selection import BackendError
-from .blocks.fit_large import LargeFit, fit_large
-from .codec.packing import pack
-from .collection.fit_many import fit_many
-from .collection.manifest import ImageRow, RunInterrupted
-from .eigenbasis.eigengs import EigenGS
-from .eigenbasis.pca.basis import Eigenbasis
-from .fitting.coarse import COARSE_TO_FINE, Coarse
-from .fitting.fit import Fit, fit
-from .fitting.loss import Loss
-from .fitting.method import DEFAULT, Method
-from .fitting.options import Goal, level_counts
-from .fitting.problem import Map
-from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
-from .image.io import load_image, sample, save_image
-from .image.metrics import ms_ssim, psnr, ssim
-from .image.pixels import ImageError
-from .plugins import register_plugins
-from .raster.render import picture_of, render, tile_lists
-from .scene.convert import convert_scene
-from .scene.fit_scene import fit_for_scene
+from .backend.executor import ClusterError as ClusterError
+from .backend.interrupts import Interrupted as Interrupted
+from .backend.recording import exclusive as exclusive
+from .backend.selection import BackendError as BackendError
+from .blocks.fit_large import LargeFit as LargeFit
+from .blocks.fit_large import fit_large as fit_large
+from .codec.packing import pack as pack
+from .collection.fit_many import fit_many as fit_many
+from .collection.manifest import ImageRow as ImageRow
+from .collection.manifest import RunInterrupted as RunInterrupted
+from .eigenbasis.eigengs import EigenGS as EigenGS
+from .eigenbasis.pca.basis import Eigenbasis as Eigenbasis
+from .fitting.coarse import COARSE_TO_FINE as COARSE_TO_FINE
+from .fitting.coarse import Coarse as Coarse
+from .fitting.fit import Fit as Fit
+from .fitting.fit import fit as fit
+from .fitting.loss import Loss as Loss
+from .fitting.method import DEFAULT as DEFAULT
+from .fitting.method import Method as Method
+from .fitting.options import Goal as Goal
+from .fitting.options import level_counts as level_counts
+from .fitting.problem import Map as Map
+from .gaussian.gaussians import Gaussians as Gaussians
+from .gaussian.gaussians import concatenate as concatenate
+from .gaussian.gaussians import from_tensors as from_tensors
+from .gaussian.gaussians import to_tensors as to_tensors
+from .image.io import load_image as load_image
+from .image.io import sample as sample
+from .image.io import save_image as save_image
+from .image.metrics import ms_ssim as ms_ssim
+from .image.metrics import psnr as psnr
+from .image.metrics import ssim as ssim
+from .image.pixels import ImageError as ImageError
+from .plugins import register_plugins as register_plugins
+from .raster.render import picture_of as picture_of
+from .raster.render import render as render
+from .raster.render import tile_lists as tile_lists
+from .scene.convert import convert_scene as convert_scene
+from .scene.fit_scene import fit_for_scene as fit_for_scene
 from .version import __version__ as __version__
-from .viewer.view import view
+from .viewer.view import view as view
 
 __all__ = [
     "COARSE_TO_FINE",

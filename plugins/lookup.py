@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend.detail import indices_of, scope
+from eigengs_dr.backend.arrays import indices_of, scope
 from eigengs_dr.backend.types import Bool, Float
 from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend.detail import indices_of
+from eigengs_dr.backend.arrays import indices_of
 from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.types import DrJitArray
 

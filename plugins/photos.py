@@ -12,10 +12,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
 
 from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.recording import freeze_rendering
+from eigengs_dr.backend.types import ArrayLike
 from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
@@ -38,7 +38,7 @@ mean as its mean, without the noise of renderings."""
 def photo_loss(
     scene: mi.Scene,
     pictures: str | Mapping[str, str],
-    photos: Sequence[ArrayLike],
+    photos: Sequence[ArrayLike | mi.Bitmap],
     *,
     sensors: Sequence[mi.Sensor | int] | None = None,
     integrator: mi.Integrator | None = None,

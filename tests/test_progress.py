@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 import eigengs_dr as eg
-from eigengs_dr.backend import progress as bars
+from eigengs_dr.backend import doors
 from eigengs_dr.cli import console
 
 QUICK = {"gaussians": 30, "iterations": 10}
@@ -28,10 +28,10 @@ def photo():
 @pytest.fixture
 def at_once(monkeypatch):
     """Bars appear at once."""
-    monkeypatch.setattr(bars, "DELAY", 0.0)
+    monkeypatch.setattr(doors, "DELAY", 0.0)
 
 
-@bars.shows_progress
+@doors.shows_progress
 def slow(steps, progress=None):
     for step in range(steps):
         time.sleep(0.05)

@@ -12,7 +12,7 @@ import pytest
 import eigengs_dr
 from _helpers.families import family, small_basis, small_model
 from _helpers.process import run_python
-from eigengs_dr.backend.libllvm import candidates
+from eigengs_dr.backend.selection import candidates
 
 MODULES = [
     module.name

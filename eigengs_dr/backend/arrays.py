@@ -1,8 +1,11 @@
 """Array types of one Dr.Jit backend and precision, copies of NumPy arrays, and exact arithmetic.
 
 On cuda, Dr.Jit 1.5 uses approximate instructions: `drjit.rcp` and `drjit.rsqrt` of double
-precision have 20 bits (PTX: ``rcp.approx.ftz.f64``), and `drjit.tanh` of single precision has 11
-(``tanh.approx.f32``). This package uses the three functions of this module instead.
+precision have 20 bits (PTX: ``rcp.approx.ftz.f64``). This package uses the two functions of this
+module instead.
+
+The last functions are the uses of `drjit.detail`, which Dr.Jit may change in any version;
+``tests/backend/test_detail.py`` shows what each of them is needed for.
 """
 
 from __future__ import annotations
@@ -180,20 +183,6 @@ def gather_run(
     return list(dr.gather(kind, source, index, active, shape=shape))
 
 
-TANH_NUMERATOR = (-9.64399179425052238628e-1, -9.92877231001918586564e1, -1.61468768441708447952e3)
-TANH_DENOMINATOR = (
-    1.0,
-    1.12811678491632931402e2,
-    2.23548839060100448583e3,
-    4.84406305325125486048e3,
-)
-"""Coefficients of ``tanh(v) = v + v^3 P(v^2) / Q(v^2)`` for ``|v| < TANH_SMALL``, from the highest
-power: Cephes 2.8, tanh.c (Moshier, 1989)."""
-
-TANH_SMALL = 0.625
-"""Below this absolute value, ``1 - exp(-2 |v|)`` would lose digits."""
-
-
 def rcp(x: Number) -> Number:
     """Return ``1 / x``, accurate to the last bits in double precision on every backend.
 
@@ -230,31 +219,6 @@ def rsqrt(x: Number) -> Number:
         return dr.rsqrt(x)
     value = 1 / dr.sqrt(dr.detach(x))
     return _with_slope(value, -0.5 * value * dr.square(value), x)
-
-
-def tanh(v: kinds.Float) -> kinds.Float:
-    """Return the hyperbolic tangent with a relative error of a few last bits; differentiable.
-
-    Parameters
-    ----------
-    v : Float, shape (N,), or an array of several Floats
-        In single or double precision; infinities are allowed.
-
-    Returns
-    -------
-    Same type as `v`
-        In [-1, 1]. Relative error of the value: below 6e-7 in single precision, 1e-15 in double.
-    """
-    exact = dr.detach(v)
-    square = dr.square(exact)
-    ratio = _polynomial(square, TANH_NUMERATOR) * rcp(_polynomial(square, TANH_DENOMINATOR))
-    small = dr.fma(exact * square, ratio, exact)
-    decay = dr.exp(-2 * dr.abs(exact))
-    share = rcp(1 + decay)
-    large = dr.copysign((1 - decay) * share, exact)
-    value = dr.select(dr.abs(exact) < TANH_SMALL, small, large)
-    # Dr.Jit would differentiate both branches, and the branch for small v overflows for large v.
-    return _with_slope(value, 4 * decay * dr.square(share), v)
 
 
 @dataclass(frozen=True)
@@ -297,13 +261,34 @@ def _with_slope(value: Number, slope: Number, x: Number) -> Number:
     return dr.replace_grad(value, slope * x) if dr.grad_enabled(x) else value
 
 
-def _polynomial(x: kinds.Float, coefficients: tuple[float, ...]) -> kinds.Float:
-    """Evaluate a polynomial by Horner's rule, from the highest power."""
-    result = type(x)(coefficients[0])
-    for coefficient in coefficients[1:]:
-        result = dr.fma(result, x, coefficient)
-    return result
-
-
 def _is_double(x: DrJitArray) -> bool:
     return bool(dr.type_v(x) == dr.VarType.Float64)
+
+
+def scope(backend: dr.JitBackend) -> int:
+    """Return the number of the current scope of a `drjit.JitBackend` in this thread.
+
+    In a program, Dr.Jit places the operations of an earlier scope before those of a later one, and
+    merges equal operations only within a scope. Nested calls, loops and branches begin new scopes.
+    """
+    return int(dr.detail.scope(backend))
+
+
+def new_scope(backend: dr.JitBackend) -> None:
+    """Begin a new scope."""
+    dr.detail.new_scope(backend)
+
+
+def kernel_misses() -> tuple[int, ...]:
+    """Return how many kernels were missing in memory so far: read from the disk, and compiled."""
+    return tuple(dr.detail.launch_stats()[1:])
+
+
+def indices_of(arrays: object) -> tuple[int, ...]:
+    """Return the indices by which Dr.Jit identifies the variables in nested arrays."""
+    return tuple(dr.detail.collect_indices(arrays))
+
+
+def sorting_index(digit: kinds.UInt, values: int) -> kinds.UInt:
+    """Return the permutation that sorts digits below `values` stably; fast on cuda only."""
+    return dr.detail.block_mkperm(digit, dr.width(digit), values)

@@ -13,8 +13,13 @@ import sys
 from importlib.metadata import requires
 from typing import NamedTuple
 
-from . import libllvm
-from .selection import BACKENDS, version_of
+from .selection import (
+    BACKENDS,
+    INSTALL_ADVICE,
+    PATH_VARIABLE,
+    candidates,
+    version_of,
+)
 from .types import Record
 
 PROGRAM = """
@@ -60,10 +65,8 @@ def report() -> Record:
     """
     return {
         **{backend: _try(backend) for backend in BACKENDS},
-        "libllvm": [
-            {**library._asdict(), "usable": library.usable} for library in libllvm.candidates()
-        ],
-        "libllvm_path": os.environ.get(libllvm.PATH_VARIABLE),
+        "libllvm": [{**library._asdict(), "usable": library.usable} for library in candidates()],
+        "libllvm_path": os.environ.get(PATH_VARIABLE),
         "mitsuba": _mitsuba(),
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -121,7 +124,7 @@ def _try(name: str) -> Record:
         return dict(json.loads(process.stdout.splitlines()[-1]))
     code = process.returncode
     status = f"signal {-code}" if code < 0 else f"exit code {code}"
-    return {"works": False, "problem": f"the process ended with {status}; {libllvm.INSTALL_ADVICE}"}
+    return {"works": False, "problem": f"the process ended with {status}; {INSTALL_ADVICE}"}
 
 
 def _mitsuba() -> Record:

@@ -1,19 +1,24 @@
-"""Doors: the entry points of the package, and the one place where these take the lock of Dr.Jit.
+"""Doors: the entry points of the package, their numbers, progress bars, and the lock of Dr.Jit.
 
 A public function that uses Dr.Jit is a door, and so is each public method of a class of doors.
 Functions that are only called from doors need no lock. Work that starts elsewhere takes
-`exclusive` itself: a group of images, a block, a task of a cluster.
+`eigengs_dr.exclusive` itself: a group of images, a block, a task of a cluster.
 """
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import wraps
-from inspect import isfunction
-from typing import TypeVar, cast
+from inspect import isfunction, signature
+from numbers import Integral, Real
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from .arguments import Function, takes_numbers
-from .recording import exclusive
+if TYPE_CHECKING:
+    from .types import Record
 
+Function = TypeVar("Function", bound=Callable[..., object])
 Kind = TypeVar("Kind", bound=type)
 
 
@@ -28,6 +33,8 @@ def door(function: Function) -> Function:
 
     @wraps(function)
     def call(*values: object, **options: object) -> object:
+        from .recording import exclusive  # loads Dr.Jit, which `--help` does not need
+
         with exclusive():
             try:
                 return plain(*values, **options)
@@ -49,3 +56,143 @@ def class_of_doors(kind: Kind) -> Kind:
         elif isfunction(member):
             setattr(kind, name, door(member))
     return kind
+
+
+KINDS: dict[str, type] = {"int": int, "int | None": int, "float": float, "float | None": float}
+"""The numeric type that each annotation stands for."""
+
+
+def plain_numbers(values: Mapping[str, object], annotations: Mapping[str, str]) -> Record:
+    """Return the numbers among named values as Python numbers.
+
+    NumPy numbers would promote Dr.Jit arrays to double precision, and JSON cannot store them.
+
+    Parameters
+    ----------
+    values : mapping of str to object
+    annotations : mapping of str to str
+        Annotations of the values. Those of numbers are "int" or "float", optionally with "| None".
+
+    Raises
+    ------
+    ValueError
+        If an argument that is annotated as a number has another type.
+    """
+    return {
+        name: _plain(name, value, KINDS[annotations[name]])
+        for name, value in values.items()
+        if annotations.get(name) in KINDS
+        and not (value is None and annotations[name].endswith("None"))
+    }
+
+
+def _plain(name: str, value: object, kind: type) -> Any:
+    # NumPy registers its numbers with these classes, but not its booleans.
+    if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
+        expected = "a whole number" if kind is int else "a number"
+        raise ValueError(f"{name} is {value!r}; it must be {expected}")
+    return kind(value)
+
+
+def takes_numbers(function: Function) -> Function:
+    """Decorate a function so that it accepts NumPy numbers, see `plain_numbers`."""
+    arguments = signature(function)
+    annotations = {name: p.annotation for name, p in arguments.parameters.items()}
+    if not any(annotation in KINDS for annotation in annotations.values()):
+        return function
+
+    @wraps(function)
+    def call(*values: object, **options: object) -> object:
+        try:
+            bound = arguments.bind(*values, **options)
+        except TypeError as error:  # as Python says it, which names the function
+            raise TypeError(f"{function.__qualname__}() {error}") from None
+        bound.arguments.update(plain_numbers(bound.arguments, annotations))
+        return function(*bound.args, **bound.kwargs)
+
+    return call  # type: ignore[return-value]
+
+
+DELAY = 2.0
+"""Seconds before a bar appears."""
+
+Progress = Callable[..., None] | bool | None
+"""Values of the argument ``progress``, see `shows_progress`."""
+
+
+def shows_progress(function: Function) -> Function:
+    """Decorate a function with an argument ``progress``, so that it shows a progress bar.
+
+    None and True show a bar after `DELAY` seconds, in a notebook or if standard error is a
+    terminal. False shows nothing. A function is called as ``progress(done, total, row)``.
+    """
+    arguments = signature(function)
+
+    @wraps(function)
+    def call(*values: object, **options: object) -> object:
+        bound = arguments.bind(*values, **options)
+        with progress_bar(bound.arguments.get("progress"), function.__name__) as show:
+            bound.arguments["progress"] = show
+            return function(*bound.args, **bound.kwargs)
+
+    return call  # type: ignore[return-value]
+
+
+@contextmanager
+def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable[..., None] | None]:
+    """Show a bar during a block, and yield a function that updates it.
+
+    Parameters
+    ----------
+    progress : bool or callable, optional
+        See `shows_progress`.
+    name : str, optional
+        Text before the bar.
+
+    Yields
+    ------
+    callable or None
+        ``show(done, total, row)``, optionally with a label as the first argument; a new label
+        restarts the bar. The bar shows ``psnr_rgb`` of the row, or its loss; the row may be left
+        out. None if no bar is visible.
+    """
+    if callable(progress):
+        yield progress
+        return
+    if not (progress is None or isinstance(progress, bool)):
+        raise ValueError(f"progress is {progress!r}; pass True, False or a function")
+    if progress is False or not _is_watched():
+        yield None
+        return
+    from tqdm.auto import tqdm
+
+    with tqdm(desc=name, delay=DELAY, leave=False) as bar:
+
+        def show(*values: Any) -> None:
+            if isinstance(values[0], str):
+                label, *values = values  # type: ignore[assignment]
+                if label != bar.desc:
+                    bar.set_description_str(label, refresh=False)
+                    if bar.n:  # otherwise the bar would appear at once
+                        bar.reset()
+            done, bar.total, *rest = values
+            row = rest[0] if rest else None
+            figures = row if isinstance(row, dict) else {"psnr_rgb": getattr(row, "psnr_rgb", None)}
+            if figures.get("psnr_rgb") is not None:
+                bar.set_postfix_str(f"psnr_rgb {figures['psnr_rgb']:.2f} dB", refresh=False)
+            elif "loss" in figures:
+                bar.set_postfix_str(f"loss {figures['loss']:.4g}", refresh=False)
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def _is_watched() -> bool:
+    """Return whether a bar is visible, in a notebook or in a terminal."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if shell is not None and hasattr(shell, "kernel"):
+        return True
+    try:
+        return bool(sys.stderr.isatty())
+    except (AttributeError, ValueError):  # there is none, it has no such method, or it is closed
+        return False

@@ -1,9 +1,10 @@
-"""Messages to users: warnings, and text that is safe to print on a terminal."""
+"""What users see: warnings, text that is safe to print on a terminal, pictures in a notebook."""
 
 from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Callable
 
 SKIPPED_MODULES = ("eigengs_dr", "contextlib", "functools")
 """Modules whose frames a warning skips to reach the caller's line."""
@@ -26,3 +27,13 @@ def _escaped(character: str) -> str:
     number = ord(character)
     is_byte = 0xDC80 <= number <= 0xDCFF  # Python's surrogate escapes in file names
     return f"\\x{number - 0xDC00:02x}" if is_byte else repr(character)[1:-1]
+
+
+make_html: Callable[[object], str] = repr
+"""`eigengs_dr.viewer.notebook.to_html`, a layer above, which `eigengs_dr` assigns
+here."""
+
+
+def to_html(value: object) -> str:
+    """Return pictures and figures of a set, a fit, a basis or a model as HTML."""
+    return make_html(value)

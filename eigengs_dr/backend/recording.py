@@ -30,7 +30,7 @@ from typing import Any
 
 import drjit as dr
 
-from .detail import kernel_misses, new_scope
+from .arrays import kernel_misses, new_scope
 from .types import DrJitArray
 
 Program = Callable[..., Any]

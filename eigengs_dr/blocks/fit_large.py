@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..backend.arguments import takes_numbers
+from ..backend.doors import shows_progress, takes_numbers
 from ..backend.interrupts import defer_interrupts
-from ..backend.progress import shows_progress
 from ..backend.selection import select
 from ..cluster.client import executor_for
 from ..fitting.method import DEFAULT, Method

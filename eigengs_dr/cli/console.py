@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 
 import click
 
+from ..backend.doors import progress_bar
 from ..backend.executor import ClusterError
 from ..backend.interrupts import INTERRUPTED, NAME, terminate_as_interrupt
 from ..backend.messages import printable
-from ..backend.progress import progress_bar
 from ..backend.selection import BackendError
 
 Result = TypeVar("Result")

@@ -14,8 +14,7 @@ from ..backend.selection import describe
 from ..gaussian.file import FORMAT, MATERIAL
 from ..image.remote import stem_of
 from ..storage import npz
-from ..storage.atomic import atomic_write, remove_stale, require_writable
-from ..storage.locks import lock_output
+from ..storage.atomic import atomic_write, lock_output, remove_stale, require_writable
 from .console import NAME
 
 

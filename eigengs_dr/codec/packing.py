@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
 from ..backend.doors import door
+from ..backend.types import ArrayLike
 from ..fitting.fit import Fit
 from ..fitting.problem import Map, read_maps
 from ..gaussian.channels import TextureMap, channel_weights, slices

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
-from ..backend.progress import shows_progress
+from ..backend.doors import shows_progress
 from ..backend.selection import name_of, select
 from ..fitting.control import Diverged
 from ..fitting.fit import Fit, fit_images

@@ -21,8 +21,7 @@ import numpy as np
 
 from ..backend.types import Record
 from ..gaussian.gaussians import Gaussians
-from ..storage.atomic import atomic_write, refuse_link, remove_stale
-from ..storage.locks import lock_folder
+from ..storage.atomic import atomic_write, lock_folder, refuse_link, remove_stale
 from ..storage.settings import Settings, difference, to_json
 
 

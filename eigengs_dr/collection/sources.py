@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 from zipfile import is_zipfile
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..backend.types import Record
+from ..backend.types import ArrayLike, Record
 from ..gaussian.file import read_figures, read_head
 from ..image.folder import list_images
 from ..image.remote import is_url, stem_of

@@ -8,18 +8,18 @@ These are the same Gaussians, with colours from one matrix product (eq. 2 and 3 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..backend.arguments import takes_numbers
-from ..backend.notebook import to_html
-from ..backend.progress import shows_progress
-from ..backend.types import Record
+from ..backend.doors import shows_progress, takes_numbers
+from ..backend.messages import to_html
+from ..backend.types import ArrayLike, Record
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from ..image.pixels import EncodedImage
@@ -192,7 +192,7 @@ class EigenGS:
         return self.encoder.project(check_image(image, copy=False), target_psnr)
 
     def reconstruct(
-        self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
+        self, coefficients: Sequence[ArrayLike], size: tuple[int, int] | None = None
     ) -> Gaussians:
         """Convert coefficients to Gaussians, by one matrix product per channel.
 

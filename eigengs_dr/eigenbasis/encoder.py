@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 
 from ..backend.doors import class_of_doors
+from ..backend.types import ArrayLike
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET
 from ..image.resize import resample

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..backend.arguments import plain_numbers
+from ..backend.doors import plain_numbers
 from ..image.pixels import check_size
 from ..image.space import FAMILY_SPACES, space_of
 from .pca.basis import check_components

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..backend.doors import door
+from ..backend.doors import door, shows_progress
 from ..backend.interrupts import Interrupted, defer_interrupts
-from ..backend.notebook import to_html
-from ..backend.progress import shows_progress
+from ..backend.messages import to_html
+from ..backend.types import ArrayLike
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import check_weight

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 import numpy as np
 
-from ..backend.arguments import plain_numbers
 from ..backend.arrays import types_of
+from ..backend.doors import plain_numbers
 from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole

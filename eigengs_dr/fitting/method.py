@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arguments import plain_numbers
+from ..backend.doors import plain_numbers
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from .control import Perturb, Redistribute, Relocate, Retreat, Surplus
 from .optimizer import Adam, Optimizer

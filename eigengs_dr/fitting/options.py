@@ -13,9 +13,9 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from ..backend.arguments import plain_numbers, takes_numbers
+from ..backend.doors import plain_numbers, takes_numbers
 from ..gaussian.file import check_index_range, check_sides
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Fitted, Gaussians
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
 from ..image.space import Space, space_of
@@ -41,7 +41,7 @@ LEVEL_RATIO = 4
 """Ratio of the numbers of Gaussians up to a level and up to the previous level; 4 halves their
 spacing."""
 
-Start: TypeAlias = "Gaussians | Model | str | os.PathLike[str]"
+Start: TypeAlias = "Gaussians | Fitted | Model | str | os.PathLike[str]"
 """What a fit starts from: a set, the file of a set, or a model."""
 
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from ..backend.arguments import plain_numbers
 from ..backend.arrays import ArrayTypes, types_in, types_of
+from ..backend.doors import plain_numbers
 from ..backend.selection import select
-from ..backend.types import PathLike, Values
+from ..backend.types import ArrayLike, PathLike, Values
 from ..gaussian.channels import TextureMap, check_maps, check_name, usual_space
 from ..gaussian.gaussians import Gaussians, one_image
 from ..image.io import check_data, check_image, read_image

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
 from ..backend.doors import class_of_doors, door
-from ..backend.notebook import to_html
+from ..backend.messages import to_html
 from ..backend.selection import BackendError, select
-from ..backend.types import Float, FloatLike, Rows, Tensor, UInt
+from ..backend.types import Array2f, Array3f, Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size
 from ..image.space import YCBCR, Space, space_of
 from ..storage.npz import BadValue
@@ -74,8 +74,8 @@ class Gaussians:
     (1, 1)
     """
 
-    mean: Rows
-    factor: Rows
+    mean: Array2f
+    factor: Array3f
     color: Rows
     background: Rows
     width: int

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..backend.arguments import takes_numbers
+from ..backend.doors import takes_numbers
 from ..backend.messages import warn
+from ..backend.types import ArrayLike
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats import (

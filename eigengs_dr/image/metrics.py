@@ -12,9 +12,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+import numpy.typing as npt
+from numpy.typing import NDArray
 
-from ..backend.types import Doubles, Float, Singles, Tensor
+from ..backend.types import ArrayLike, Doubles, DrJitArray, Float, Singles, Tensor
 from .color import RGB_TO_YCBCR, rgb_to_ycbcr, to_linear, to_pu21
 from .io import pixels_of, to_8bit
 from .pixels import check_weight, peak_of
@@ -142,13 +143,13 @@ def psnr_from_mse(mse: float) -> float:
 if TYPE_CHECKING:
 
     @overload
-    def ssim(a: Tensor, b: Any, weight: Any = None) -> Float: ...
+    def ssim(a: DrJitArray, b: ArrayLike, weight: ArrayLike | None = None) -> Float: ...
 
     @overload
-    def ssim(a: ArrayLike, b: Tensor, weight: Any = None) -> Float: ...
+    def ssim(a: ArrayLike, b: DrJitArray, weight: ArrayLike | None = None) -> Float: ...
 
     @overload
-    def ssim(a: ArrayLike, b: ArrayLike, weight: ArrayLike | None = None) -> float: ...
+    def ssim(a: npt.ArrayLike, b: npt.ArrayLike, weight: npt.ArrayLike | None = None) -> float: ...
 
 
 def ssim(a: Any, b: Any, weight: Any = None) -> Any:

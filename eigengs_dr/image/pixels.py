@@ -13,10 +13,10 @@ from operator import index
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..backend.messages import warn
-from ..backend.types import Singles
+from ..backend.types import ArrayLike, Singles
 from .strips import Pixels, by_strips
 
 ENCODINGS = ("srgb", "linear")

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from ..backend.arrays import tanh, types_of
+from ..backend.arrays import rcp, types_of
 from ..backend.types import Float, FloatLike
 from ..fitting.variables import ImageSize, Variables
 from ..gaussian.covariance import cholesky_from_factor, factor_from_cholesky
@@ -42,7 +42,7 @@ class Cholesky:
         width, height = size or (fixed.width, fixed.height)
         mean, factor = fixed.mean, fixed.factor
         if "mean" in variables:
-            x, y = (0.5 * (tanh(v) + 1) for v in variables["mean"])
+            x, y = (_share(v) for v in variables["mean"])
             mean = type(mean)(x * width, y * height)
         if "cholesky" in variables:
             l1, l2, l3 = variables["cholesky"]
@@ -64,6 +64,15 @@ class Cholesky:
         """Return the growth of ellipses; see `eigengs_dr.fitting.variables.Coordinates`."""
         side = 0.5 * max(fixed.width, fixed.height)  # the slope of tanh is at most 1
         return moves.get("mean", 0.0) * side + moves.get("cholesky", 0.0) * fixed.cutoff, 1.0
+
+
+FARTHEST = 40.0
+"""Largest absolute value of a variable, beyond which nothing changes and `exp` would overflow."""
+
+
+def _share(v: Float) -> Float:
+    """Return ``(tanh(v) + 1) / 2``; on cuda, `drjit.tanh` of single precision has 11 bits."""
+    return rcp(1 + dr.exp(-2 * dr.clip(v, -FARTHEST, FARTHEST)))
 
 
 def _atanh(x: Float) -> Float:

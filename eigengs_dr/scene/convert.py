@@ -14,9 +14,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import door
+from ..backend.doors import door, shows_progress
 from ..backend.messages import warn
-from ..backend.progress import shows_progress
 from ..backend.types import PathLike, Record
 from ..fitting.options import Goal
 from ..gaussian.file import CUTOFF
@@ -26,8 +25,7 @@ from ..image.metrics import psnr
 from ..plugins import resident_bytes
 from ..plugins.properties import check_rotation, source_of, to_uv
 from ..plugins.versions import Properties
-from ..storage.atomic import atomic_folder, refuse_url, remove_stale
-from ..storage.locks import lock_output
+from ..storage.atomic import atomic_folder, lock_output, refuse_url, remove_stale
 from .bitmaps import (
     GAUSSIANS,
     SKY,

@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
 from ..backend.arrays import types_in
-from ..backend.doors import door
+from ..backend.doors import door, shows_progress
 from ..backend.interrupts import Interrupted, defer_interrupts
-from ..backend.progress import shows_progress
 from ..backend.selection import backend_of, select
+from ..backend.types import ArrayLike
 from ..fitting.loop import Descent
 from ..fitting.measure import Measured
 from ..fitting.method import DEFAULT

@@ -1,7 +1,6 @@
 """Atomic storage of arrays in files. Depends on NumPy only.
 
-- ``locks``: one writer at a time for a file or a folder
-- ``atomic``: files and folders that are created in one step
+- ``atomic``: files and folders that are created in one step, and have one writer at a time
 - ``npz``: arrays with a format, a version and checks
 - ``memory``: limits of the memory that a file may take
 - ``settings``: the options on which a result depends

@@ -14,8 +14,7 @@ import numpy as np
 from ..backend.interrupts import undone_at_end
 from ..backend.types import Arrays
 from . import npz
-from .atomic import atomic_folder, refuse_link, remove_folder, remove_stale
-from .locks import lock_output
+from .atomic import atomic_folder, lock_output, refuse_link, remove_folder, remove_stale
 from .settings import Settings, difference, to_json
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1

@@ -6,8 +6,9 @@ from base64 import b64encode
 from io import BytesIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from ..backend.types import ArrayLike
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.pca.basis import Eigenbasis
 from ..eigenbasis.pca.truncation import CHANNELS

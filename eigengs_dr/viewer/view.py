@@ -15,9 +15,9 @@ from pathlib import Path
 
 import jinja2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..backend.types import Record
+from ..backend.types import ArrayLike, Record
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check

@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from _helpers.process import SELECT, run_python
-from eigengs_dr.backend import libllvm as module
-from eigengs_dr.backend.libllvm import PATH_VARIABLE, candidates, select_libllvm
+from eigengs_dr.backend import selection as module
+from eigengs_dr.backend.selection import PATH_VARIABLE, candidates, select_libllvm
 
 SYSTEMS = ("libllvm19", "Debian", "Ubuntu", "Fedora", "macOS", "Windows")
 needs_llvm = pytest.mark.skipif(
@@ -34,7 +34,7 @@ def test_forced_old_llvm_is_refused_before_it_is_loaded(tmp_path, version):
 
 @needs_llvm
 def test_loaded_old_llvm_is_refused():
-    old = "import eigengs_dr.backend.selection as selection\nselection.MIN_VERSION = 99\n"
+    old = "import eigengs_dr, drjit\ndrjit.detail.llvm_version = lambda: (15, 0, 6)\n"
     process = run_python(old + SELECT, **{PATH_VARIABLE: None})
     assert "which crashes Dr.Jit; " in process.stdout
     assert process.stderr == ""

@@ -8,11 +8,11 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from _helpers.process import SELECT, run_python
-from eigengs_dr.backend import detail, doctor
-from eigengs_dr.backend import libllvm as module
-from eigengs_dr.backend.libllvm import PATH_VARIABLE
+from eigengs_dr.backend import doctor
+from eigengs_dr.backend import selection as module
 from eigengs_dr.backend.selection import (
     BACKENDS,
+    PATH_VARIABLE,
     BackendError,
     backend_of,
     describe,
@@ -29,7 +29,7 @@ def fake_drjit(monkeypatch, *, llvm=True, version=(19, 1, 7), cuda=False, metal=
     drjit.has_backend = works.__getitem__
     for name in BACKENDS:
         setattr(drjit, name, SimpleNamespace(ad=ModuleType(f"drjit.{name}.ad")))
-    monkeypatch.setattr(detail, "llvm_version", lambda: version)
+    drjit.detail = SimpleNamespace(llvm_version=lambda: version)
     monkeypatch.setitem(sys.modules, "drjit", drjit)
     monkeypatch.delenv(PATH_VARIABLE, raising=False)
     return drjit

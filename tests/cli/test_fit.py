@@ -15,7 +15,7 @@ from eigengs_dr.backend.selection import BackendError, select
 from eigengs_dr.cli.fit import DEFAULT_BASIS
 from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
-from eigengs_dr.storage.locks import lock_output
+from eigengs_dr.storage.atomic import lock_output
 
 QUICK = ("--gaussians", 20, "--iterations", 1)
 

@@ -11,7 +11,7 @@ from _helpers.sets import check_equal
 from eigengs_dr.collection.manifest import KEYS, NAME, read_manifest
 from eigengs_dr.collection.sources import list_sources
 from eigengs_dr.image.remote import list_urls
-from eigengs_dr.storage.locks import lock_folder
+from eigengs_dr.storage.atomic import lock_folder
 
 
 def statuses(output):
@@ -159,7 +159,7 @@ def test_two_runs_into_one_folder(photos, output):
 def test_a_run_that_was_killed_holds_no_lock(photos, output):
     output.mkdir()
     code = (
-        "import os, pathlib; from eigengs_dr.storage.locks import lock_folder\n"
+        "import os, pathlib; from eigengs_dr.storage.atomic import lock_folder\n"
         f"with lock_folder(pathlib.Path({str(output)!r})): os.kill(os.getpid(), 9)"
     )
     run_python(code)

@@ -16,7 +16,7 @@ from eigengs_dr.image.io import load_image
 from eigengs_dr.plugins import texture_of
 from eigengs_dr.scene import convert, fit_uses
 from eigengs_dr.scene.rendering import pictures
-from eigengs_dr.storage.locks import lock_output
+from eigengs_dr.storage.atomic import lock_output
 
 pytestmark = pytest.mark.mitsuba
 

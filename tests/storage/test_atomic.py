@@ -11,11 +11,12 @@ from _helpers.process import python_path, run_python
 from eigengs_dr.storage.atomic import (
     atomic_folder,
     atomic_write,
+    lock_folder,
+    lock_output,
     remove_folder,
     remove_stale,
     require_writable,
 )
-from eigengs_dr.storage.locks import lock_folder, lock_output
 
 
 @pytest.fixture
@@ -114,7 +115,7 @@ KILLED = """
 import os
 from pathlib import Path
 from eigengs_dr.storage.atomic import atomic_folder, atomic_write
-from eigengs_dr.storage.locks import lock_output
+from eigengs_dr.storage.atomic import lock_output
 folder = Path({folder!r})
 with lock_output(folder / "y.txt"), atomic_folder(folder / "made") as made:
     (made / "half").touch()

@@ -9,12 +9,11 @@ from operator import index
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ...backend.arguments import takes_numbers
-from ...backend.messages import warn
-from ...backend.notebook import to_html
-from ...backend.progress import shows_progress
+from ...backend.doors import shows_progress, takes_numbers
+from ...backend.messages import to_html, warn
+from ...backend.types import ArrayLike
 from ...image.folder import TrainingImages
 from ...image.io import check_image
 from ...image.pixels import check_size

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
-from ...backend.arrays import ArrayTypes, make_divisor, types_of, upload
-from ...backend.detail import sorting_index
+from ...backend.arrays import ArrayTypes, make_divisor, sorting_index, types_of, upload
 from ...backend.recording import record
 from ...backend.types import Bool, FloatLike, UInt
 from ..evaluate import is_steep

@@ -1,0 +1,103 @@
+"""What type checkers and editors see of the package: the programs of the manual pass mypy."""
+
+import builtins
+import os
+import re
+import shutil
+import subprocess
+import symtable
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FOLDER = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(FOLDER.glob("*.md")), *sorted(FOLDER.glob("*/*.md"))]
+BLOCK = re.compile(r"^ *```python\n(.*?)^ *```", re.M | re.S)
+
+IMPORTED = """
+import numpy as np
+from numpy.typing import NDArray
+import eigengs_dr as eg
+"""
+OF_A_PAGE = {
+    "mi": "import mitsuba as mi",
+    "texture_of": "from eigengs_dr.plugins import texture_of",
+    "result": "result: eg.Fit",
+    "model": "model: eg.EigenGS",
+    "gaussians": "gaussians: eg.Gaussians",
+    "frames": "frames: list[NDArray[np.float32]]",
+    "images": "images: list[NDArray[np.float32]]",
+    "files": "files: list[str]",
+    "fit_one": "def fit_one(file: str) -> None: ...",
+}
+"""What pages take from their reader; other names are images."""
+
+SETTINGS = """
+[mypy]
+strict = true
+untyped_calls_exclude = distributed, drjit
+[mypy-scipy.*,torch.*]
+ignore_missing_imports = true
+"""
+"""These four packages come without types, or with few."""
+
+
+def program_of(page):
+    """The blocks of a page as one program that knows the names which the page takes from users."""
+    code = "\n".join(BLOCK.findall(page.read_text()))
+    whole = symtable.symtable(code, str(page), "exec")
+    tables = [whole]
+    for table in tables:
+        tables += table.get_children()
+    used = {s.get_name() for t in tables for s in t.get_symbols() if s.is_global() or t is whole}
+    made = {s.get_name() for s in whole.get_symbols() if s.is_assigned() or s.is_imported()}
+    taken = sorted(used - made - {"eg", "np", *dir(builtins)})
+    context = [OF_A_PAGE.get(name, f"{name}: NDArray[np.float32]") for name in taken]
+    return "\n".join([IMPORTED, *context, code])
+
+
+def errors_of_mypy(folder, installed, files):
+    """What mypy says of files in a folder, where the package lies in the folder `installed`."""
+    environment = {**os.environ, "PYTHONPATH": str(installed)}
+    command = [sys.executable, "-m", "mypy", "--cache-dir", str(folder / "cache"), *files]
+    process = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert process.returncode in (0, 1), process.stderr
+    return process.stdout if process.returncode else ""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.mitsuba
+def test_programs_of_the_manual_are_typed(tmp_path):
+    """In strict mode, against the files of an installed wheel and against the checkout."""
+    pytest.importorskip("mypy", reason="pip install mypy")
+    pytest.importorskip("mitsuba")
+    (tmp_path / "mypy.ini").write_text(SETTINGS)
+    files = []
+    for page in PAGES:
+        if BLOCK.search(page.read_text()):
+            path = page.relative_to(ROOT).with_suffix(".py")
+            files.append(re.sub(r"[-/]", "_", path.as_posix()))
+            (tmp_path / files[-1]).write_text(program_of(page))
+    assert len(files) > 25
+    hidden = shutil.ignore_patterns(".*", "build", "dist", "*.egg-info")
+    source = shutil.copytree(ROOT, tmp_path / "source", ignore=hidden)
+    build = ["wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", str(tmp_path)]
+    subprocess.run([sys.executable, "-m", "pip", *build, str(source)], check=True)
+    shutil.unpack_archive(next(tmp_path.glob("*.whl")), tmp_path / "installed", "zip")
+    assert errors_of_mypy(tmp_path, tmp_path / "installed", files) == ""
+    assert errors_of_mypy(tmp_path, ROOT, files) == ""
+
+
+def test_an_editor_completes_the_public_names_with_their_signatures():
+    jedi = pytest.importorskip("jedi", reason="comes with IPython")
+    script = jedi.Script("import eigengs_dr as eg\neg.")
+    import eigengs_dr as eg
+
+    assert set(eg.__all__) <= {found.name for found in script.complete(2, 3)}
+    [signature] = jedi.Script("import eigengs_dr as eg\neg.fit(").get_signatures(2, 7)
+    assert {"gaussians", "target_psnr", "loss"} <= {found.name for found in signature.params}
