@@ -9,8 +9,8 @@ from .blocks.fit_large import LargeFit, fit_large
 from .codec.packing import pack
 from .collection.fit_many import fit_many
 from .collection.manifest import ImageRow, RunInterrupted
+from .eigenbasis.basis import Eigenbasis
 from .eigenbasis.eigengs import EigenGS
-from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.coarse import COARSE_TO_FINE, Coarse
 from .fitting.fit import Fit, FitInterrupted, fit
 from .fitting.loss import Loss

@@ -24,15 +24,15 @@ from ..gaussian.gaussians import Gaussians
 from ..image.io import check_image
 from ..image.pixels import EncodedImage
 from ..image.resize import resample
-from .model_file import read_members, write_model
-from .pca.truncation import TruncationCurve, curve_from_eigenvalues, name_components
+from .files import read_model, write_model
+from .truncation import TruncationCurve, curve_from_eigenvalues, name_components
 
 if TYPE_CHECKING:  # training, encoding and runs over many images are imported on demand
     from ..collection.manifest import ImageRow
     from ..collection.sources import Images
     from ..image.folder import TrainingImages
-    from .encoder import Encoder
-    from .pca.basis import Eigenbasis
+    from .basis import Eigenbasis
+    from .encoder import ModelEncoder
 
 Planes = NDArray[np.float32]
 
@@ -62,10 +62,10 @@ class EigenGS:
         See `eigengs_dr.Eigenbasis`; empty if unknown.
     held_out : ndarray of float64, shape (n + 1,) or (0,)
         Mean PSNR in dB of PCA with 0, 1, ..., n components, for images that were held out of the
-        training; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. Empty if there were
+        training; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. Empty if there were
         none.
     figures : dict of str to float
-        See `eigengs_dr.eigenbasis.components.solve.fit_model`; not saved.
+        See `eigengs_dr.eigenbasis.components.fit_model`; not saved.
     """
 
     gaussians: Gaussians
@@ -122,9 +122,8 @@ class EigenGS:
         BackendError
             If the backend does not work.
         """
-        from .components.solve import fit_model
-        from .options import TrainOptions
-        from .pca.basis import Eigenbasis
+        from .basis import Eigenbasis
+        from .components import TrainOptions, fit_model
 
         if not isinstance(basis, Eigenbasis):
             basis = Eigenbasis.from_images(basis, progress=False)
@@ -136,7 +135,12 @@ class EigenGS:
             iterations=iterations,
             seed=seed,
         )
-        return cls(**fit_model(basis, options, backend, progress))
+
+        def report(states: object, done: int, total: int) -> None:
+            if progress:
+                progress(done, total, {})
+
+        return cls(**fit_model(basis, options, backend, after_round=report))
 
     def __repr__(self) -> str:
         size = f"{len(self.gaussians)} Gaussians, {self.gaussians.width}x{self.gaussians.height}"
@@ -172,7 +176,7 @@ class EigenGS:
             An image of any size; it is resampled to the size of the model.
         target_psnr : float, optional
             Use the fewest components that reach this PSNR, in dB, for the image at the size of the
-            model; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. By default all.
+            model; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. By default all.
 
         Returns
         -------
@@ -281,9 +285,9 @@ class EigenGS:
         """
         from ..collection.manifest import fingerprint
         from ..collection.run import Job, run_images
-        from .encoder import check_encoding
+        from .encoder import check_coding
 
-        check_encoding(colors, mean, target_psnr)
+        check_coding(colors, mean, target_psnr)
         work = partial(_encode_all, model=self, options=(colors, mean, target_psnr))
         options = {"colors": colors, "mean": mean, "target_psnr": target_psnr}
         options |= {"model": fingerprint(self.gaussians)}
@@ -297,7 +301,7 @@ class EigenGS:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
-        write_model(path, self)
+        write_model(path, vars(self))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> EigenGS:
@@ -319,18 +323,18 @@ class EigenGS:
         if not Path(path).is_file():
             names = ", ".join(SHIPPED)
             raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
-        return cls(**read_members(path, backend))
+        return cls(**read_model(path, backend))
 
     def __getstate__(self) -> Record:
         """Leave out the encoder, whose cached values are Dr.Jit arrays."""
         return {key: value for key, value in self.__dict__.items() if key != "encoder"}
 
     @cached_property
-    def encoder(self) -> Encoder:
-        """The `eigengs_dr.eigenbasis.encoder.Encoder` of the model, with cached values."""
-        from .encoder import Encoder
+    def encoder(self) -> ModelEncoder:
+        """The `eigengs_dr.eigenbasis.encoder.ModelEncoder` of the model, with cached values."""
+        from .encoder import ModelEncoder
 
-        return Encoder(self.gaussians, self.weights, self.mean_image, self.low)
+        return ModelEncoder(self.gaussians, self.weights, self.mean_image, self.low)
 
 
 def _encode_all(
@@ -342,4 +346,4 @@ def _encode_all(
 
 @cache  # files of the package do not change
 def _shipped(name: str, backend: str | None) -> EigenGS:
-    return EigenGS(**read_members(SHIPPED[name], backend))
+    return EigenGS(**read_model(SHIPPED[name], backend))

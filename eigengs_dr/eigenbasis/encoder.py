@@ -22,7 +22,7 @@ from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET, to_planes
 from ..image.resize import resample
 from .normal_equations import NormalEquations, squared_norms
-from .pca.truncation import min_ranks_per_channel, residual_energy
+from .truncation import min_ranks_per_channel, residual_energy
 
 Planes = NDArray[np.float32]
 Columns = NDArray[np.float64]
@@ -30,7 +30,7 @@ Columns = NDArray[np.float64]
 
 @class_of_doors
 @dataclass(frozen=True, eq=False)
-class Encoder:
+class ModelEncoder:
     """The functions that encode images by a model, with the values that all images share.
 
     Attributes
@@ -74,7 +74,7 @@ class Encoder:
 
     def encode(self, image: Planes, colors: str, mean: str, target_psnr: float | None) -> Gaussians:
         """Encode a checked image (H, W, 3) of any size; see `eigengs_dr.EigenGS.encode`."""
-        check_encoding(colors, mean, target_psnr)
+        check_coding(colors, mean, target_psnr)
         pixels = resample(image, self.gaussians.width, self.gaussians.height)
         correlations, centred = self._correlate(pixels), mean == "dense"
         if centred:
@@ -183,7 +183,7 @@ def _solve(lower: Columns, right: NDArray, transposed: bool = False) -> Columns:
     )
 
 
-def check_encoding(colors: str, mean: str, target_psnr: float | None) -> None:
+def check_coding(colors: str, mean: str, target_psnr: float | None) -> None:
     """Raise ValueError if options of `eigengs_dr.EigenGS.encode` are unknown or contradictory.
 
     Parameters

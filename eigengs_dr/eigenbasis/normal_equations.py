@@ -64,7 +64,7 @@ colours of Gaussians that overlap strongly, without a visible effect."""
 
 
 @dataclass(frozen=True)
-class Block:
+class FactoredBlock:
     """Consecutive Gaussians whose colours are solved for together.
 
     Attributes
@@ -144,7 +144,7 @@ class NormalEquations:
         self.adjoint = programs.enter_context(freeze_program(adjoint))
         weakref.finalize(self, programs.close)
 
-    def _block(self, rows: slice) -> Block:
+    def _block(self, rows: slice) -> FactoredBlock:
         """Factorise the equations of some Gaussians."""
         gram = self.gram[rows, rows]
         ridge = max(RIDGE * gram.diagonal().mean(), 1e-12)
@@ -163,7 +163,7 @@ class NormalEquations:
                 "differ more"
             ) from None
         coverage = self.coverage[rows]
-        block = Block(rows, system, factor, 0 * coverage)
+        block = FactoredBlock(rows, system, factor, 0 * coverage)
         response = block.divide(coverage)  # with one step of iterative refinement
         response = response + block.divide(coverage - system @ response)
         return replace(block, background_response=response)

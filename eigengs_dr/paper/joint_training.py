@@ -8,7 +8,7 @@ loss is the mean squared error of the rendered components, with each channel sca
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -38,30 +38,34 @@ State = dict[str, NDArray]
 CHOLESKY = Cholesky()
 
 
-class Components(Protocol):
-    """Components and the number of their Gaussians, as `eigengs_dr.eigenbasis` divides them."""
+class Band(NamedTuple):
+    """Components, and the number of Gaussians that represent them.
 
-    @property
-    def number(self) -> int:
-        """Number of Gaussians."""
+    Attributes
+    ----------
+    number : int
+    components : tuple of C ndarrays of float32, shape (k_c, H, W)
+        A channel may have none.
+    """
 
-    @property
-    def components(self) -> tuple[Planes, ...]:
-        """Components of each channel, (k_c, H, W)."""
+    number: int
+    components: tuple[Planes, ...]
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
+        height, width = self.components[0].shape[1:]
+        return width, height
 
 
-def joint_shapes(state: State, band: Components, backend: str | None = None) -> Gaussians:
+def joint_shapes(state: State, band: Band, backend: str | None = None) -> Gaussians:
     """Return the Gaussians of a state, with one channel of zeros, in the space "data"."""
     types = types_in(select(backend))
     rows = [upload(types.Float, row) for row in state["rows"][0, :NUM_SHAPE_PARAMS]]
     return decode_shapes(rows, band.size)
 
 
-def joint_weights(state: State, band: Components) -> list[Planes]:
+def joint_weights(state: State, band: Band) -> list[Planes]:
     """Return the weights of the components of a state, with the scaling undone.
 
     The scaled weight ``w_nj`` of Gaussian n in component j and the bounds of the channel give
@@ -80,7 +84,7 @@ def joint_weights(state: State, band: Components) -> list[Planes]:
     ]
 
 
-def _bounds(band: Components) -> list[tuple[np.float32, np.float32]]:
+def _bounds(band: Band) -> list[tuple[np.float32, np.float32]]:
     """Return the smallest and largest value of all components of each channel."""
     none = np.zeros(1, np.float32)
     return [(p.min(), p.max()) for p in (c if len(c) else none for c in band.components)]
@@ -121,7 +125,7 @@ OPTIMIZER = Adan()
 
 
 def train_jointly(
-    band: Components,
+    band: Band,
     seed: int,
     steps: int,
     backend: str | None = None,
@@ -140,7 +144,7 @@ def train_jointly(
 
     Parameters
     ----------
-    band : Components
+    band : Band
     seed : int
         Seed of the random start.
     steps : int
@@ -175,7 +179,7 @@ def train_jointly(
     return _train(band, state or _start(band, seed, backend), steps, backend)
 
 
-def _start(band: Components, seed: int, backend: str | None) -> State:
+def _start(band: Band, seed: int, backend: str | None) -> State:
     """Draw a random initial state, with moments of 0."""
     generator = np.random.default_rng(seed)
     count = band.number
@@ -191,7 +195,7 @@ def _start(band: Components, seed: int, backend: str | None) -> State:
     return {"step": np.array(0), "rows": rows}
 
 
-def _train(band: Components, state: State, steps: int, backend: str | None) -> Iterator[State]:
+def _train(band: Band, state: State, steps: int, backend: str | None) -> Iterator[State]:
     """Take the remaining steps."""
     types, size, start = types_in(select(backend)), band.size, state["rows"]
     shape = _upload(types, start[:, :NUM_SHAPE_PARAMS])

@@ -8,9 +8,9 @@ from io import BytesIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..eigenbasis.basis import Eigenbasis
 from ..eigenbasis.eigengs import EigenGS
-from ..eigenbasis.pca.basis import Eigenbasis
-from ..eigenbasis.pca.truncation import CHANNELS
+from ..eigenbasis.truncation import CHANNELS
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import decode, rendered_as

@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...backend.arguments import takes_numbers
-from ...backend.messages import warn
-from ...backend.notebook import to_html
-from ...backend.progress import shows_progress
-from ...image.color import to_planes, ycbcr_to_rgb
-from ...image.folder import TrainingImages
-from ...image.io import check_image
-from ...image.pixels import check_size
-from ...image.resize import resample
-from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
-from .incremental import orient, rank_for
-from .stream import find_states
+from ..backend.arguments import takes_numbers
+from ..backend.messages import warn
+from ..backend.notebook import to_html
+from ..backend.progress import shows_progress
+from ..image.color import to_planes, ycbcr_to_rgb
+from ..image.folder import TrainingImages
+from ..image.io import check_image
+from ..image.pixels import check_size
+from ..image.resize import resample
+from .files import ENERGY_TOLERANCE, read_basis, write_basis
+from .incremental import Stream, block_length, find_states, orient, rank_for
 from .truncation import (
     CHANNELS,
     TruncationCurve,
@@ -127,7 +126,8 @@ class Eigenbasis:
         """
         size, limits = check_size(size), check_components(components, energy)
         ranks = [rank_for(k) for k in limits]
-        states = find_states(images, size, space, ranks, progress, client, checkpoint)
+        stream = Stream(size, space, ranks, block_length(size), progress)
+        states = find_states(images, stream, client, checkpoint)
         count, shape = states[0].count, (size[1], size[0])
         if energy is None and count <= max(limits):
             images_give = "1 image gives" if count == 1 else f"{count} images give"
@@ -223,7 +223,7 @@ class Eigenbasis:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
-        write_basis(path, self)
+        write_basis(path, vars(self))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Eigenbasis:

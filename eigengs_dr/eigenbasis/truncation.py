@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.messages import warn
-from ...backend.types import Doubles
+from ..backend.messages import warn
+from ..backend.types import Doubles
 
 MIN_MSE = 1e-12
 """Lower bound of mean squared errors, 120 dB; smaller errors are rounding of single precision."""
