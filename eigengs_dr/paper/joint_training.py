@@ -28,7 +28,7 @@ from ..raster.kernels import residual
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import bin_gaussians, to_tiles
 from .adan import Adan
-from .cholesky import Cholesky
+from .gaussianimage import Cholesky
 
 Planes = NDArray[np.float32]
 
@@ -123,6 +123,9 @@ evaluated more often."""
 
 OPTIMIZER = Adan()
 
+RADIUS = kernel_radius(CUTOFF)
+"""Radius of all kernels."""
+
 
 def train_jointly(
     band: Band,
@@ -208,8 +211,7 @@ def _train(band: Band, state: State, steps: int, backend: str | None) -> Iterato
         to_tiles(types, np.moveaxis(planes, 0, 2), Grid(*size))
         for planes in _split(np.concatenate(scaled), axis=0)
     ]
-    radius, number = kernel_radius(CUTOFF), sum(planes.size for planes in band.components)
-    scale = dr.opaque(types.Float, 2 / number)
+    scale = dr.opaque(types.Float, 2 / sum(planes.size for planes in band.components))
     with freeze_program(_move_group) as move, freeze_program(_move_shape) as move_shape:
         for step in range(int(state["step"]), steps):
             rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVING_STEPS))
@@ -222,7 +224,7 @@ def _train(band: Band, state: State, steps: int, backend: str | None) -> Iterato
             slopes = [dr.opaque(types.Float, 0, dr.width(v)) for v in values]
             for k, target in enumerate(targets):
                 groups[k], slopes = move(
-                    groups[k], target, values, lists, radius, scale, slopes, rate, time
+                    groups[k], target, values, lists, scale, slopes, rate, time
                 )
             shape = move_shape(shape, slopes, size, rate, time)
             if (step + 1) % STATE_STEPS == 0 or step + 1 == steps:
@@ -236,7 +238,6 @@ def _move_group(
     target: Float,
     shape: list,
     lists: TileLists,
-    radius: float,
     scale: Float,
     slopes: list,
     rate: Float,
@@ -246,8 +247,8 @@ def _move_group(
     moments: Sequence[Rows]
     rows, *moments = group
     packed = pack_parameters([*shape, *rows])
-    delta, _ = residual(packed, [type(target)(0)] * GROUP_COMPONENTS, lists, radius, target)
-    gradient = [g * scale for g in adjoint(packed, delta, GROUP_COMPONENTS, lists, radius)]
+    delta, _ = residual(packed, [type(target)(0)] * GROUP_COMPONENTS, lists, RADIUS, target)
+    gradient = [g * scale for g in adjoint(packed, delta, GROUP_COMPONENTS, lists, RADIUS)]
     added = [s + g for s, g in zip(slopes, gradient[:NUM_SHAPE_PARAMS], strict=True)]
     weight_gradient = type(rows)(gradient[NUM_SHAPE_PARAMS:])
     rows, moments = OPTIMIZER.step(rows, weight_gradient, tuple(moments), rate, time)
