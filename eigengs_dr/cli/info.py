@@ -137,9 +137,9 @@ def _describe_fit(file: Path) -> Facts:
 
 def _describe_packed(file: Path) -> Facts:
     """Describe a packed set, with the Gaussians of each section and the quantisation steps."""
-    from ..codec import egs
+    from ..codec.egs import read_egs
 
-    packed = egs.read(file)
+    packed = read_egs(file)
     data = packed.set_data()
     with prefix_errors(file):
         set_file.check(data)

@@ -28,9 +28,9 @@ from ..fitting.objective import Pixels
 from ..fitting.solve import solve
 from ..gaussian.gaussians import Gaussians, like
 from ..raster.render import render
-from .cells import hilbert_encode
 from .egs import EgsContent
 from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
+from .range_coder import hilbert_encode
 
 Array = NDArray[np.floating]
 
