@@ -9,12 +9,13 @@ from operator import index
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..backend.arguments import takes_numbers
 from ..backend.messages import warn
 from ..backend.notebook import to_html
 from ..backend.progress import shows_progress
+from ..backend.types import Doubles, Singles
 from ..image.color import to_planes, ycbcr_to_rgb
 from ..image.folder import TrainingImages
 from ..image.io import check_image
@@ -57,10 +58,10 @@ class Eigenbasis:
         Colour space of the C = 3 channels.
     """
 
-    mean: NDArray[np.float32]
-    components: tuple[NDArray[np.float32], ...]
-    eigenvalues: tuple[NDArray[np.float64], ...]
-    variance: NDArray[np.float64]
+    mean: Singles
+    components: tuple[Singles, ...]
+    eigenvalues: tuple[Doubles, ...]
+    variance: Doubles
     count: int
     space: str
 
@@ -161,7 +162,7 @@ class Eigenbasis:
         """Height in pixels."""
         return self.mean.shape[1]
 
-    def project(self, image: ArrayLike) -> tuple[NDArray[np.float32], ...]:
+    def project(self, image: ArrayLike) -> tuple[Singles, ...]:
         """Return the coefficients w_j of an image, a tuple of C float32 arrays of shape (k_c,).
 
         The image, (H, W, 3), (H, W, 1) or (H, W), may have any size and is resampled to the basis.
@@ -169,7 +170,7 @@ class Eigenbasis:
         """
         return self._coefficients(self._centred(image))
 
-    def reconstruct(self, coefficients: Sequence[ArrayLike]) -> NDArray[np.float32]:
+    def reconstruct(self, coefficients: Sequence[ArrayLike]) -> Singles:
         """Return the image for C arrays of coefficients, shape (k_c,), as `project` returns them.
 
         The image is RGB, not clamped, float32, shape (H, W, 3). The method raises ValueError unless
@@ -182,7 +183,7 @@ class Eigenbasis:
         pairs = zip(weights, self.components, strict=True)
         return _rgb(self.mean + np.stack([np.tensordot(w, c, 1) for w, c in pairs]), self.space)
 
-    def energy(self) -> tuple[NDArray[np.float64], ...]:
+    def energy(self) -> tuple[Doubles, ...]:
         """Return the share of the variance of the first 1, 2, ..., k_c components.
 
         The result is a tuple of C float64 arrays of shape (k_c,), ascending, at most 1.
@@ -239,17 +240,17 @@ class Eigenbasis:
         """
         return cls(**read_basis(path))
 
-    def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
+    def _centred(self, image: ArrayLike) -> Singles:
         """Resample and convert an image, and subtract the mean; shape (C, H, W)."""
         pixels = resample(check_image(image), self.width, self.height)
         planes = to_planes(pixels, self.space) - self.mean.reshape(len(self.mean), -1)
         return planes.reshape(self.mean.shape)
 
-    def _coefficients(self, planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+    def _coefficients(self, planes: Singles) -> tuple[Singles, ...]:
         pairs = zip(self.components, planes, strict=True)
         return tuple(np.tensordot(components, plane) for components, plane in pairs)
 
-    def _residuals(self, image: ArrayLike) -> list[NDArray[np.float64]]:
+    def _residuals(self, image: ArrayLike) -> list[Doubles]:
         """Return the squared error of each channel after 0, 1, ..., k_c components."""
         planes = self._centred(image)
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
@@ -257,7 +258,7 @@ class Eigenbasis:
         return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
 
 
-def _rgb(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
+def _rgb(planes: Singles, space: str) -> Singles:
     """Convert planes (C, H, W) of a colour space to RGB (H, W, 3)."""
     image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
     return ycbcr_to_rgb(image) if space == "ycbcr" else image

@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..backend.arguments import takes_numbers
+from ..backend.doors import door
 from ..backend.notebook import to_html
 from ..backend.progress import shows_progress
-from ..backend.types import Record
-from ..gaussian.gaussians import Gaussians
+from ..backend.types import Doubles, Record, Singles
+from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.io import check_image
 from ..image.pixels import EncodedImage
 from ..image.resize import resample
@@ -34,7 +35,6 @@ if TYPE_CHECKING:  # training, encoding and runs over many images are imported o
     from .basis import Eigenbasis
     from .encoder import ModelEncoder
 
-Planes = NDArray[np.float32]
 
 SHIPPED = {"natural": Path(__file__).parent / "data" / "natural.npz"}
 """Files of the package's models, by name; see ``tools/train_natural.py``."""
@@ -69,13 +69,13 @@ class EigenGS:
     """
 
     gaussians: Gaussians
-    weights: tuple[Planes, ...]
-    eigenvalues: tuple[NDArray[np.float64], ...]
-    mean_image: Planes
+    weights: tuple[Singles, ...]
+    eigenvalues: tuple[Doubles, ...]
+    mean_image: Singles
     low: int = 0
     low_components: int = 0
-    variance: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    held_out: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    variance: Doubles = field(default_factory=lambda: np.zeros(0))
+    held_out: Doubles = field(default_factory=lambda: np.zeros(0))
     figures: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -162,8 +162,8 @@ class EigenGS:
             return None
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
-    @takes_numbers
-    def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
+    @door
+    def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Singles, ...]:
         """Compute the coefficients of an image by least squares on the rendered components.
 
         The function solves ``min_a |Psi~ a - (I - Psi~_0)|^2``. If the Gaussians render the
@@ -195,8 +195,9 @@ class EigenGS:
         """
         return self.encoder.project(check_image(image, copy=False), target_psnr)
 
+    @door
     def reconstruct(
-        self, coefficients: tuple[Planes, ...], size: tuple[int, int] | None = None
+        self, coefficients: tuple[Singles, ...], size: tuple[int, int] | None = None
     ) -> Gaussians:
         """Convert coefficients to Gaussians, by one matrix product per channel.
 
@@ -213,9 +214,16 @@ class EigenGS:
             If there is not one array per channel, one has more than k_c coefficients, or a
             coefficient is not finite.
         """
-        return self.encoder.reconstruct(coefficients, size)
+        shapes, limits = [np.shape(values) for values in coefficients], self.components
+        if len(shapes) != len(limits) or not all(
+            len(shape) == 1 and shape[0] <= k for shape, k in zip(shapes, limits, strict=True)
+        ):
+            raise ValueError(f"coefficients have shapes {shapes}; expected up to {limits}")
+        if not all(np.isfinite(np.asarray(values, np.float32)).all() for values in coefficients):
+            raise ValueError("coefficients are not all finite in single precision; replace them")
+        return self._colored(self.encoder.mean_colors + self.encoder.sum(coefficients), size)
 
-    @takes_numbers
+    @door
     def encode(
         self,
         image: ArrayLike,
@@ -247,7 +255,9 @@ class EigenGS:
             colours.
         """
         pixels = check_image(image, copy=False)
-        return self.encoder.encode(pixels, colors, mean, target_psnr)
+        check_coding(colors, mean, target_psnr)
+        columns = self.encoder.columns(pixels, colors, mean == "dense", target_psnr)
+        return self._colored(columns, (pixels.shape[1], pixels.shape[0]))
 
     @shows_progress
     @takes_numbers
@@ -285,7 +295,6 @@ class EigenGS:
         """
         from ..collection.manifest import fingerprint
         from ..collection.run import Job, run_images
-        from .encoder import check_coding
 
         check_coding(colors, mean, target_psnr)
         work = partial(_encode_all, model=self, options=(colors, mean, target_psnr))
@@ -294,8 +303,13 @@ class EigenGS:
         job = Job(work, options=options, given=list(options))
         return run_images(images, output, overwrite, job, progress, client)
 
+    def _colored(self, columns: Doubles, size: tuple[int, int] | None) -> Gaussians:
+        """Return the Gaussians with other colours and background (N + 1, C), scaled to a size."""
+        result = with_colors(self.gaussians, columns, self.gaussians.space)
+        return result.scaled(*size) if size else result
+
     @takes_numbers
-    def dense_mean(self, width: int, height: int) -> Planes:
+    def dense_mean(self, width: int, height: int) -> Singles:
         """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
         return resample(np.moveaxis(self.mean_image, 0, 2), width, height)
 
@@ -347,3 +361,21 @@ def _encode_all(
 @cache  # files of the package do not change
 def _shipped(name: str, backend: str | None) -> EigenGS:
     return EigenGS(**read_model(SHIPPED[name], backend))
+
+
+def check_coding(colors: str, mean: str, target_psnr: float | None) -> None:
+    """Raise ValueError if options of `eigengs_dr.EigenGS.encode` are unknown or contradictory.
+
+    Parameters
+    ----------
+    colors, mean, target_psnr
+        See `eigengs_dr.EigenGS.encode`.
+    """
+    for name, value, valid in (
+        ("colors", colors, ("exact", "projected")),
+        ("mean", mean, ("gaussians", "dense")),
+    ):
+        if value not in valid:
+            raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(valid)}")
+    if colors == "exact" and target_psnr is not None:
+        raise ValueError("target_psnr chooses components; use it with colors 'projected'")

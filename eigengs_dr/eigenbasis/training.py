@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import warn
-from ..backend.types import Record
+from ..backend.types import Record, Singles
 from ..image.folder import list_images
 from ..image.io import ImageError, check_image
 from ..image.metrics import psnr
@@ -237,7 +236,7 @@ def _evaluate(model: EigenGS, basis: Eigenbasis, run: _Run) -> dict[str, float]:
 
 def _readable(
     basis: Eigenbasis, run: _Run, errors: list[str] | None = None, stage: str = ""
-) -> Iterator[NDArray[np.float32]]:
+) -> Iterator[Singles]:
     """Read the held-out images at the size of a basis; skip those that cannot be read."""
     for done, path in enumerate(run.held_out):
         if stage:

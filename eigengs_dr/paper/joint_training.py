@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_in, types_of, upload
 from ..backend.recording import freeze_program
 from ..backend.selection import select
-from ..backend.types import Float, Rows
+from ..backend.types import Float, Rows, Singles
 from ..fitting.place import random_shapes
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
@@ -29,8 +29,6 @@ from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, p
 from ..raster.render import bin_gaussians, to_tiles
 from .adan import Adan
 from .gaussianimage import Cholesky
-
-Planes = NDArray[np.float32]
 
 State = dict[str, NDArray]
 """The state of a training as plain arrays, for a checkpoint."""
@@ -49,7 +47,7 @@ class Band(NamedTuple):
     """
 
     number: int
-    components: tuple[Planes, ...]
+    components: tuple[Singles, ...]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -65,7 +63,7 @@ def joint_shapes(state: State, band: Band, backend: str | None = None) -> Gaussi
     return decode_shapes(rows, band.size)
 
 
-def joint_weights(state: State, band: Band) -> list[Planes]:
+def joint_weights(state: State, band: Band) -> list[Singles]:
     """Return the weights of the components of a state, with the scaling undone.
 
     The scaled weight ``w_nj`` of Gaussian n in component j and the bounds of the channel give
@@ -271,17 +269,17 @@ def _move_shape(
     return [rows, *moments]
 
 
-def _upload(types: ArrayTypes, rows: Planes) -> list:
+def _upload(types: ArrayTypes, rows: Singles) -> list:
     """Copy values, moments and gradients of `Adan`, shape (5, R, N), to the device."""
     return [types.FloatX([upload(types.Float, row) for row in part]) for part in rows]
 
 
-def _download(parts: list) -> Planes:
+def _download(parts: list) -> Singles:
     """Copy the state of an optimiser to NumPy; the inverse of `_upload`."""
     return np.stack([dr.detach(part).numpy() for part in parts])
 
 
-def _split(array: Planes, axis: int) -> Iterator[Planes]:
+def _split(array: Singles, axis: int) -> Iterator[Singles]:
     """Yield groups of `GROUP_COMPONENTS` components, the last one padded with zeros.
 
     The padding remains 0, because a zero component with zero weights has no gradient.
