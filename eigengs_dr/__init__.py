@@ -38,15 +38,15 @@ def _make_html(value: object) -> str:
 
 
 def _read_packed(path: Path, sections: int | None) -> SetData:
-    from .codec.egs import read_set
+    from .codec.egs import read_egs
 
-    return read_set(path, sections)
+    return read_egs(path, sections).set_data()
 
 
 def _packed_maps(path: Path) -> tuple[TextureMap, ...]:
-    from .codec.egs import maps_of
+    from .codec.egs import read_egs_maps
 
-    return maps_of(path)
+    return read_egs_maps(path)
 
 
 messages.make_html = _make_html

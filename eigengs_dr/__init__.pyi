@@ -12,8 +12,8 @@ from .codec.packing import pack as pack
 from .collection.fit_many import fit_many as fit_many
 from .collection.manifest import ImageRow as ImageRow
 from .collection.manifest import RunInterrupted as RunInterrupted
+from .eigenbasis.basis import Eigenbasis as Eigenbasis
 from .eigenbasis.eigengs import EigenGS as EigenGS
-from .eigenbasis.pca.basis import Eigenbasis as Eigenbasis
 from .fitting.coarse import COARSE_TO_FINE as COARSE_TO_FINE
 from .fitting.coarse import Coarse as Coarse
 from .fitting.fit import Fit as Fit

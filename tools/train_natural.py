@@ -63,8 +63,8 @@ def crops(count: int = CROPS, seed: int = 0) -> Iterator[NDArray[np.float32]]:
 def main(path: str) -> None:
     """Train the basis in about a minute and write it to a file."""
     from eigengs_dr.cli.console import bar
+    from eigengs_dr.eigenbasis.basis import Eigenbasis
     from eigengs_dr.eigenbasis.eigengs import EigenGS
-    from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 
     with bar(False) as show:
 

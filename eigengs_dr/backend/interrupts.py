@@ -37,6 +37,23 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that ask a program to end: Ctrl-C sends SIGINT, schedulers and ``kill`` send SIGTERM."""
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM ended a call between two steps.
+
+    Attributes
+    ----------
+    result : object
+        What the call has finished; its documentation says of which type.
+    """
+
+    def __init__(self, result: Any, message: str) -> None:
+        super().__init__(message)
+        self.result = result
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.result, str(self))
+
+
 def is_program() -> bool:
     """Return whether this process is the program itself, not one that imports the package."""
     words = sys.orig_argv[1:3]
@@ -77,20 +94,6 @@ def _ignore_signals() -> None:
     """Ignore signals: the exit is under way, and Python is about to drop its handlers."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-
-
-class Interrupted(KeyboardInterrupt):
-    """A long call was interrupted, by Ctrl-C, SIGTERM, or a `KeyboardInterrupt` of a user function.
-
-    Attributes
-    ----------
-    result : object
-        What the call has so far, of the kind that it returns.
-    """
-
-    def __init__(self, result: Any, message: str) -> None:
-        super().__init__(message)
-        self.result = result
 
 
 @contextmanager

@@ -85,11 +85,11 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
 
 def _facts_of(file: Path, picture: Path | None, texture: bool) -> Facts:
     """Return what a file holds, and draw it."""
-    from ..eigenbasis import model_file
+    from ..eigenbasis.files import MODEL_FORMAT
 
     packed = is_packed(file)
     file_format = set_file.FORMAT if packed else npz.format_of(file)
-    kinds = {set_file.FORMAT: "image", set_file.MATERIAL: "material", model_file.FORMAT: "model"}
+    kinds = {set_file.FORMAT: "image", set_file.MATERIAL: "material", MODEL_FORMAT: "model"}
     if file_format not in kinds:
         expected = ", ".join(kinds)
         raise ValueError(f"{file}: format is {file_format[:40]!r}, expected one of {expected}")
@@ -137,9 +137,9 @@ def _describe_fit(file: Path) -> Facts:
 
 def _describe_packed(file: Path) -> Facts:
     """Describe a packed set, with the Gaussians of each section and the quantisation steps."""
-    from ..codec import egs
+    from ..codec.egs import read_egs
 
-    packed = egs.read(file)
+    packed = read_egs(file)
     data = packed.set_data()
     with prefix_errors(file):
         set_file.check(data)

@@ -63,8 +63,9 @@ def train(
       eigengs-dr train /shared/faces/ -o /shared/faces.npz --cluster tcp://node1:8786
       eigengs-dr fit photo.jpg --basis photos.npz
     """
-    from ..eigenbasis import training
-    from ..eigenbasis.options import TrainOptions
+    from ..backend.interrupts import Interrupted
+    from ..eigenbasis.components import TrainOptions
+    from ..eigenbasis.training import train_model
     from ..fitting.options import default_count
     from ..image.folder import list_images
     from ..image.io import save_image
@@ -80,8 +81,15 @@ def train(
     settings = TrainOptions(**choices)
     try:
         with open_cluster(run.cluster) as client, bar(run.quiet) as show:
-            result = training.train(folder, output, settings, run.backend, show, client)
-    except training.Interrupted as error:
+            result = train_model(
+                folder,
+                output,
+                settings,
+                run.backend,
+                lambda done, total, row: show(row["stage"], done, total),
+                client,
+            )
+    except Interrupted as error:
         print_message(f"interrupted; {error}")
         run.write_report(vars(settings) | {"input": folder, "stopped": "interrupted"})
         run.context.exit(INTERRUPTED)

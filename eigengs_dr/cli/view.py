@@ -83,13 +83,13 @@ def _load(
     The file need not be trusted: the number of Gaussians is checked before they are read.
     """
     from ..codec import egs
-    from ..eigenbasis import model_file
     from ..eigenbasis.eigengs import SHIPPED
+    from ..eigenbasis.files import MODEL_FORMAT
     from ..viewer.view import check_count
 
     file = SHIPPED.get(str(file), file)
     sections = egs.section_counts(file) if is_packed(file) else []
-    if not sections and npz.format_of(file) == model_file.FORMAT:
+    if not sections and npz.format_of(file) == MODEL_FORMAT:
         if levels is not None or name is not None:
             raise ValueError(f"{file}: is a model; leave out --levels and --map")
         return eg.EigenGS.load(file, backend), []

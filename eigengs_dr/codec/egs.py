@@ -5,8 +5,8 @@ checksum; the header of a set with maps is followed by their table.
 
 The sections follow, each coded separately. A section starts with its number of Gaussians, its
 length and its checksum (`HEAD`). Its body holds a byte (`RICH` and an index into `EVENNESS`), the
-weights of a model (`eigengs_dr.codec.weights`), and the words of a range coder: the cells
-(`eigengs_dr.codec.cells`), then all other integers (`eigengs_dr.codec.gaussian_model`).
+weights of a model (`eigengs_dr.codec.gaussian_model.SectionModel`), and the words of a range coder:
+the cells (`eigengs_dr.codec.range_coder.code_cells`), then all other integers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -31,11 +30,9 @@ from ..image.space import SPACES, Space
 from ..storage.atomic import atomic_write
 from ..storage.memory import check_content
 from ..storage.npz import BadValue
-from . import weights
-from .cells import EVENNESS, MAX_LEVELS, code_cells, hilbert_encode
-from .gaussian_model import GaussianCoder
+from .gaussian_model import MIN_RICH_COUNT, GaussianCoder, SectionModel
 from .quantization import Steps, Symbols, dequantize
-from .range_coder import Decoder, Encoder
+from .range_coder import EVENNESS, MAX_LEVELS, Decoder, Encoder, code_cells, hilbert_encode
 
 SUFFIX = ".egs"
 
@@ -107,7 +104,7 @@ class EgsContent(NamedTuple):
         return Symbols(*map(np.concatenate, zip(*self.sections, strict=True)))
 
 
-def to_bytes(packed: EgsContent) -> bytes:
+def egs_bytes(packed: EgsContent) -> bytes:
     """Return the bytes of a file, with the Gaussians of each section in Hilbert-curve order."""
     cells = packed.all_symbols().cell
     corner = cells.min(axis=0)
@@ -131,7 +128,7 @@ def to_bytes(packed: EgsContent) -> bytes:
     return b"".join(parts)
 
 
-def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
+def write_egs(path: str | os.PathLike[str], packed: EgsContent) -> int:
     """Write a file atomically; return its number of bytes.
 
     Raises
@@ -145,7 +142,7 @@ def write(path: str | os.PathLike[str], packed: EgsContent) -> int:
         check(packed.set_data())
     except BadValue as error:
         raise ValueError(f"{path}: {error}") from None
-    content = to_bytes(packed)
+    content = egs_bytes(packed)
     with atomic_write(path) as temporary:
         return temporary.write_bytes(content)
 
@@ -181,7 +178,7 @@ def section_to_bytes(section: Symbols, steps: Steps, corner: Integers, levels: i
     order = np.lexsort([*numbers.T[::-1], hilbert_encode(cells, levels)])
     symbols = section._replace(cell=cells).select(order)
     evenness = min(range(len(EVENNESS)), key=lambda k: len(_cells(cells, levels, k).to_bytes()))
-    choices = [True, False] if count < weights.MIN_RICH_COUNT else [True]
+    choices = [True, False] if count < MIN_RICH_COUNT else [True]
     body = min((_body(symbols, steps, levels, evenness, rich) for rich in choices), key=len)
     body = body.ljust(count, b"\0")  # a reader expects at least one byte per Gaussian
     return HEAD.pack(count, len(body), section_check(count, body)) + body
@@ -199,7 +196,7 @@ def _body(symbols: Symbols, steps: Steps, levels: int, evenness: int, rich: bool
     coder = _cells(symbols.cell, levels, evenness)
     gaussian_coder = GaussianCoder(coder, symbols.cell, rich=rich)
     gaussian_coder.code(symbols, steps)
-    head = bytes([evenness | RICH * rich]) + weights.to_bytes(gaussian_coder.model, rich)
+    head = bytes([evenness | RICH * rich]) + gaussian_coder.model.to_bytes(rich)
     return head + coder.to_bytes()
 
 
@@ -208,7 +205,7 @@ def section_check(count: int, body: bytes) -> int:
     return zlib.crc32(body, zlib.crc32(count.to_bytes(4, "little")))
 
 
-def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsContent:
+def read_egs(path: str | os.PathLike[str], sections: int | None = None) -> EgsContent:
     """Read a packed set; the file need not be trusted.
 
     Parameters
@@ -248,19 +245,14 @@ def read(path: str | os.PathLike[str], sections: int | None = None) -> EgsConten
         return content
 
 
-def read_set(path: Path, sections: int | None = None) -> SetData:
-    """Read a packed set for `eigengs_dr.Gaussians.load`; for parameters and errors see `read`."""
-    return read(path, sections).set_data()
-
-
-def maps_of(path: str | os.PathLike[str]) -> tuple[TextureMap, ...]:
-    """Return the maps of a packed set, without its Gaussians; errors as for `read`."""
+def read_egs_maps(path: str | os.PathLike[str]) -> tuple[TextureMap, ...]:
+    """Return the maps of a packed set, without its Gaussians; errors as for `read_egs`."""
     with _opened(path) as file:
         return _read_header(file)[3].maps
 
 
 def section_counts(path: str | os.PathLike[str]) -> list[int]:
-    """Return the number of Gaussians per section, without decoding them; errors as for `read`."""
+    """Return the number of Gaussians per section, undecoded; errors as for `read_egs`."""
     with _opened(path) as file:
         _, count, *_ = _read_header(file)
         return [read_body(file, k + 1)[1] for k in range(count)]
@@ -279,7 +271,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
     """Return the levels, the number of sections, the first cell, and the content without sections.
 
-    Headers that `to_bytes` never writes are rejected; `Gaussians.load` checks the rest.
+    Headers that `egs_bytes` never writes are rejected; `Gaussians.load` checks the rest.
     """
     head = exactly(file, _HEADER.size)
     magic, version, space, channels, levels, count, *rest = _HEADER.unpack(head)
@@ -357,7 +349,7 @@ def decode_body(body: bytes, splats: int, channels: int, levels: int, steps: Ste
     rich, evenness = bool(body[0] & RICH), body[0] & ~RICH
     if evenness >= len(EVENNESS):
         raise BadValue("the first byte is unknown")
-    model, codes = weights.from_bytes(body[1:], channels, rich)
+    model, codes = SectionModel.from_bytes(body[1:], channels, rich)
     coder = Decoder(codes[: len(codes) // 4 * 4])  # a short body is padded
     with np.errstate(all="ignore"):  # the weights are not trusted
         scalars, pairs = np.zeros(splats, np.int64), np.zeros((splats, 2), np.int64)

@@ -37,7 +37,7 @@ _SIN = (
 """Taylor coefficients of ``sin(2 pi x) / x`` in ``x^2``."""
 
 
-def in_order(rows: Doubles) -> Doubles:
+def sum_in_order(rows: Doubles) -> Doubles:
     """Return the sum of rows (K, n), added one after another, which libraries do not guarantee."""
     total = np.zeros(rows.shape[1])
     for row in rows:

@@ -15,25 +15,17 @@ on every machine, see `eigengs_dr.codec.exact_math`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from ..backend.types import Doubles, Integers
-from .exact_math import angle_in_turns, cos_turns, in_order, log2, sin_turns
-from .quantization import (
-    SCALE_STEP,
-    STRETCH_STEP,
-    Steps,
-    Symbols,
-    factors_of,
-    parts_of,
-    precision,
-    turns_of,
-)
-from .range_coder import Coder, categorical
-from .weights import CLASSES, MIN_WIDTH, Model, Weights, fit_weights
+from ..storage.npz import BadValue
+from .exact_math import angle_in_turns, cos_turns, log2, sin_turns, sum_in_order
+from .quantization import Quantizer, Steps, Symbols
+from .range_coder import TAILS, Coder, categorical
 
 STRIDES = (8, 4, 2, 1)
 """Distances along the curve, in Gaussians, of the passes after the first one."""
@@ -63,7 +55,7 @@ class Pass(NamedTuple):
 
     def mean(self, values: Doubles) -> Doubles:
         """Return the weighted means, shape (n,), of the values (N,) of the neighbours."""
-        return in_order(self.weight * values[self.known])
+        return sum_in_order(self.weight * values[self.known])
 
 
 def passes_of(cells: Integers) -> list[Pass]:
@@ -77,7 +69,7 @@ def passes_of(cells: Integers) -> list[Pass]:
         inside = (known >= 0) & (known < len(cells))
         known = np.clip(known, 0, len(cells) - 1)
         weight = np.where(inside, 1 / (squared_distance(cells[rows], cells[known]) + 1), 0)
-        passes.append(Pass(rows, known, weight / in_order(weight)))
+        passes.append(Pass(rows, known, weight / sum_in_order(weight)))
     return [part for part in passes if len(part.rows)]
 
 
@@ -215,6 +207,154 @@ def sector_chances(sharpness: int) -> Doubles:
     return np.asarray(1 / (1 + sharpness / SHARPNESS_SCALE * distance * distance))
 
 
+# --- What a section stores -----------------------------------------------------------------------
+
+MIN_WIDTH = 0.1
+"""Smallest width of a distribution, in steps."""
+
+WIDTH_FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2)
+"""Factors of the mean absolute error that are tried as the width."""
+
+CLASSES = 15
+"""Number of classes of directions, see `Directions`."""
+
+MIN_RICH_COUNT = 1500
+"""Number of Gaussians below which all weights may take more bytes than they save."""
+
+
+class Prediction(NamedTuple):
+    """The prediction of one kind of numbers.
+
+    Attributes
+    ----------
+    center, width : ndarray of float64
+        Weights of the features.
+    tails : int
+        One of `eigengs_dr.codec.range_coder.TAILS`.
+    """
+
+    center: Doubles
+    width: Doubles
+    tails: int
+
+
+@dataclass
+class SectionModel:
+    """All parameters that a section stores besides the integers.
+
+    Attributes
+    ----------
+    predictions : list of Prediction
+        For each channel, for the scale, and for the stretch.
+    sharpness : ndarray of int64, shape (CLASSES,)
+        Concentration of directions around those of the neighbours, from 0 to 255.
+    """
+
+    predictions: list[Prediction] = field(default_factory=list)
+    sharpness: Integers = field(default_factory=lambda: np.zeros(CLASSES, np.int64))
+
+    def to_bytes(self, rich: bool) -> bytes:
+        """Return the bytes of a model; if it is not rich, only of the first weights."""
+        used, parts = slice(None) if rich else slice(0, 1), list[bytes]()
+        for center, width, tails in self.predictions:
+            high = width[used].astype("<f2").view("<u2") >> 8
+            parts.append(bytes([TAILS.index(tails)]))
+            parts += [center[used].astype("<f2").tobytes(), high.astype(np.uint8).tobytes()]
+        if rich:
+            parts.append(self.sharpness.astype(np.uint8).tobytes())
+        return b"".join(parts)
+
+    @classmethod
+    def from_bytes(cls, data: bytes, channels: int, rich: bool) -> tuple[SectionModel, bytes]:
+        """Return a model and the bytes after it; the bytes need not be trusted."""
+        model = cls()
+
+        def take(count: int) -> bytes:
+            nonlocal data
+            if count > len(data):
+                raise BadValue("the weights are truncated")
+            taken, data = data[:count], data[count:]
+            return taken
+
+        for numbers in feature_counts(channels):
+            used = numbers if rich else (1, 1)
+            [tails] = take(1)
+            if tails >= len(TAILS):
+                raise BadValue("the weights name an unknown distribution")
+            center, width = np.zeros(numbers[0]), np.zeros(numbers[1])
+            center[: used[0]] = np.frombuffer(take(2 * used[0]), "<f2")
+            high = np.frombuffer(take(used[1]), np.uint8).astype("<u2") << 8
+            width[: used[1]] = high.view("<f2")
+            model.predictions.append(Prediction(center, width, TAILS[tails]))
+        if rich:
+            model.sharpness = np.frombuffer(take(CLASSES), np.uint8).astype(np.int64)
+        return model, data
+
+
+def feature_counts(channels: int) -> list[tuple[int, int]]:
+    """Return the number of features of the centre and of the width, for each `Prediction`."""
+    colors = [(1 + 2 * min(k, 2), 4 + 2 * min(k, 2)) for k in range(channels)]
+    return [*colors, (7, 2), (5, 2)]
+
+
+def fit_prediction(
+    center: Doubles, width: Doubles, values: Doubles, step: Doubles, rich: bool = True
+) -> Prediction:
+    """Return the prediction with which the numbers take few bits.
+
+    Parameters
+    ----------
+    center, width : ndarray, shape (N, F)
+        Features of the centre and of the width of each distribution.
+    values, step : ndarray, shape (N,)
+        The numbers, which are multiples of the steps.
+    rich : bool, optional
+        Whether all weights may differ from 0, or only the first one of each.
+    """
+    width_weights, deviation = np.zeros(width.shape[1]), np.maximum(step, 1e-9)
+    used = slice(None) if rich else slice(0, 1)
+    center_weights = np.zeros(center.shape[1])
+    for _ in range(3):
+        scaled = center[:, used] / deviation[:, None]
+        ridge = 1e-3 * len(values) ** 0.5 * np.eye(scaled.shape[1])
+        known = np.append(values / deviation, np.zeros(len(ridge)))
+        solution = np.linalg.lstsq(np.vstack([scaled, ridge]), known, rcond=None)[0]
+        center_weights[used] = stored_center(solution)
+        error = values - sum_in_order(center_weights[:, None] * center.T)
+        width_weights[used] = _fit_width(width[:, used], np.abs(error) + 0.1 * step, deviation)
+        deviation = np.maximum(sum_in_order(width_weights[:, None] * width.T), MIN_WIDTH * step)
+    trials = [(w, tails) for tails in TAILS for w in WIDTH_FACTORS]
+    best = min(trials, key=lambda trial: _bits(error / step, trial[0] * deviation / step, trial[1]))
+    return Prediction(center_weights, stored_width(width_weights * best[0]), best[1])
+
+
+def _fit_width(features: Doubles, error: Doubles, deviation: Doubles) -> Doubles:
+    """Return non-negative weights of features whose weighted sum approximates absolute errors."""
+    from scipy.optimize import nnls  # imported here, because decoders do not need it
+
+    return np.asarray(nnls(features / deviation[:, None], error / deviation)[0])
+
+
+def _bits(error: Doubles, width: Doubles, tails: int) -> float:
+    """Estimate the bits that errors, in steps, take with a distribution."""
+    t = error / width
+    density = np.log2(width) + 0.5 * (tails + 1) * np.log2(1 + t * t / tails)
+    return float(density.sum()) + len(t) * {2: 1.5, 4: 1.415, 8: 1.369}[tails]
+
+
+def stored_center(weights: Doubles) -> Doubles:
+    """Round weights to half precision, as in files."""
+    return np.clip(np.nan_to_num(weights), -6e4, 6e4).astype(np.float16).astype(np.float64)
+
+
+def stored_width(weights: Doubles) -> Doubles:
+    """Round positive weights to half precision with a mantissa of two bits, as in files."""
+    half = np.clip(np.nan_to_num(weights), 0, 4e4).astype("<f2").view("<u2")
+    return ((half + 0x80) & 0xFF00).astype("<u2").view("<f2").astype(np.float64)
+
+
+# --- The coder -----------------------------------------------------------------------------------
+
 Features = Callable[[Pass], tuple[Doubles, Doubles]]
 """Returns the features of centres and of widths, shape (F, n), for the n Gaussians of a pass."""
 
@@ -227,17 +367,18 @@ class GaussianCoder:
     coder : Encoder or Decoder
     cells : ndarray of int64, shape (N, 2)
         In the order of the curve.
-    model : Model, optional
+    model : SectionModel, optional
         None for an encoder, which fits a model and stores it in the attribute `model`.
     rich : bool, optional
         Whether the encoder uses all features.
     """
 
     def __init__(
-        self, coder: Coder, cells: Integers, model: Model | None = None, rich: bool = True
+        self, coder: Coder, cells: Integers, model: SectionModel | None = None, rich: bool = True
     ) -> None:
         self.coder, self.cells, self.rich = coder, cells, rich
-        self.known, self.model = iter(model.weights) if model else None, model or Model()
+        self.known = iter(model.predictions) if model else None
+        self.model = model or SectionModel()
         self.passes, self.crowding = passes_of(cells), crowding(cells)
         self.values = np.zeros(len(cells))  # known values of the kind that is being coded
 
@@ -246,44 +387,46 @@ class GaussianCoder:
         color, ones = np.zeros_like(given.color), np.ones(len(self.cells))
         for k, values in enumerate(given.color.T):
             color[:, k] = self._numbers(partial(self._color_features, color, k), ones, values)
-        fineness = precision(color)
-        log_fineness, step = log2(fineness), SCALE_STEP / fineness
-        scale = self._numbers(partial(self._scale_features, log_fineness, step), step, given.scale)
-        s, step = scale * step, STRETCH_STEP / fineness
-        features = partial(self._stretch_features, log_fineness, s, step)
+        quantizer = Quantizer(color, steps.cell)
+        log_q, step = log2(quantizer.precision), quantizer.scale_step
+        scale = self._numbers(partial(self._scale_features, log_q, step), step, given.scale)
+        s, step = scale * step, quantizer.stretch_step
+        features = partial(self._stretch_features, log_q, s, step)
         stretch = self._numbers(features, step, given.stretch)
         length = stretch * step
-        directions = Directions(self.passes, length, turns_of(length, fineness))
+        directions = Directions(self.passes, length, quantizer.turns(length))
         if self.known is None and self.rich:
             self.model.sharpness = directions.fit(given.turn)
         turn = directions.code(self.coder, self.model.sharpness, given.turn)
-        parts = parts_of(factors_of(scale, stretch, turn, fineness), fineness, steps.cell)
+        parts = quantizer.parts(quantizer.factors(scale, stretch, turn))
         place = [self.coder.uniform(parts[:, axis], given.part[:, axis]) for axis in range(2)]
         return Symbols(self.cells, np.stack(place, axis=1), color, scale, stretch, turn)
 
     def _numbers(self, features: Features, step: Doubles, given: Integers) -> Integers:
         """Code one kind of numbers, pass by pass."""
         result = np.zeros_like(given)
-        weights = next(self.known) if self.known else self._fit(features, step, given)
+        center_weights, width_weights, tails = (
+            next(self.known) if self.known else self._fit(features, step, given)
+        )
         self.values = np.zeros(len(step))
         for part in self.passes:
             centers, widths = features(part)
             rows, unit = part.rows, step[part.rows]
-            center = in_order(weights.center[:, None] * centers) / unit
-            width = np.maximum(in_order(weights.width[:, None] * widths) / unit, MIN_WIDTH)
-            result[rows] = self.coder.numbers(center, width, weights.tails, given[rows])
+            center = sum_in_order(center_weights[:, None] * centers) / unit
+            width = np.maximum(sum_in_order(width_weights[:, None] * widths) / unit, MIN_WIDTH)
+            result[rows] = self.coder.numbers(center, width, tails, given[rows])
             self.values[rows] = result[rows] * unit
         return result
 
-    def _fit(self, features: Features, step: Doubles, given: Integers) -> Weights:
-        """Fit the weights to numbers that are all known, and store them in the model."""
+    def _fit(self, features: Features, step: Doubles, given: Integers) -> Prediction:
+        """Fit a prediction to numbers that are all known, and store it in the model."""
         self.values = given * step
         pairs = zip(*(features(part) for part in self.passes), strict=True)
         center, width = (np.ascontiguousarray(np.concatenate(kind, axis=1).T) for kind in pairs)
         order = np.concatenate([part.rows for part in self.passes])
-        weights = fit_weights(center, width, self.values[order], step[order], self.rich)
-        self.model.weights.append(weights)
-        return weights
+        found = fit_prediction(center, width, self.values[order], step[order], self.rich)
+        self.model.predictions.append(found)
+        return found
 
     def _color_features(self, color: Integers, k: int, part: Pass) -> tuple[Doubles, Doubles]:
         """Return the features of channel k: its neighbours, and the two channels before it."""
@@ -295,19 +438,23 @@ class GaussianCoder:
             width += [np.abs(other[rows]), np.abs(part.mean(other))]
         return np.stack(center), np.stack([*width, *(near[rows] for near in self.crowding[:2])])
 
-    def _scale_features(
-        self, log_fineness: Doubles, step: Doubles, part: Pass
-    ) -> tuple[Doubles, Doubles]:
+    def _scale_features(self, log_q: Doubles, step: Doubles, part: Pass) -> tuple[Doubles, Doubles]:
         """Return the features of s: Gaussians are small where they are dense."""
         rows, ones = part.rows, np.ones(len(part.rows))
-        center = [ones, log_fineness[rows], *(near[rows] for near in self.crowding)]
-        center += [part.mean(self.values), part.mean(log_fineness)]
+        center = [ones, log_q[rows], *(near[rows] for near in self.crowding)]
+        center += [part.mean(self.values), part.mean(log_q)]
         return np.stack(center), np.stack([ones, step[rows]])
 
     def _stretch_features(
-        self, log_fineness: Doubles, s: Doubles, step: Doubles, part: Pass
+        self, log_q: Doubles, s: Doubles, step: Doubles, part: Pass
     ) -> tuple[Doubles, Doubles]:
         """Return the features of l."""
         rows, ones = part.rows, np.ones(len(part.rows))
-        center = [ones, log_fineness[rows], s[rows], self.crowding[1][rows], part.mean(self.values)]
+        center = [
+            ones,
+            log_q[rows],
+            s[rows],
+            self.crowding[1][rows],
+            part.mean(self.values),
+        ]
         return np.stack(center), np.stack([ones, step[rows]])

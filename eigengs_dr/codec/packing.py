@@ -25,7 +25,7 @@ from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
 from ..image.pixels import check_encoding
 from ..raster.render import picture_of
 from ..storage.atomic import require_writable
-from .egs import MAX_SECTIONS, SUFFIX, write
+from .egs import MAX_SECTIONS, SUFFIX, write_egs
 from .quantization import Steps
 from .rounding import MIN_MSE, Comparison, planes_of, round_within
 
@@ -136,7 +136,7 @@ def pack(
     attempt, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
     seen = psnr_from_mse(attempt.error)
     stored = seen if image is not None and not maps else math.nan
-    size = write(output, attempt.packed._replace(maps=maps, psnr=stored))
+    size = write_egs(output, attempt.packed._replace(maps=maps, psnr=stored))
     rounded = Gaussians.load(output, types_of(source.mean).backend)
     after = psnr_from_mse(max(attempt.error + compared.extra_error, MIN_MSE))
     figure: float | dict[str, float] = seen

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from ..backend.types import Doubles, Floats, Integers
 from ..gaussian.covariance import log_shapes
-from .exact_math import cos_turns, exp2, in_order, sin_turns
+from .exact_math import cos_turns, exp2, sin_turns, sum_in_order
 
 MAX_SYMBOL = 1 << 23
 """Bound of the absolute value of integers; finer steps are not worth storing. Cells differ by less
-than twice the bound, which fits `eigengs_dr.codec.cells.MAX_LEVELS`."""
+than twice the bound, which fits `eigengs_dr.codec.range_coder.MAX_LEVELS`."""
 
 SCALE_STEP, STRETCH_STEP, TURN_STEP, MEAN_STEP = 1.2, 1.0, 1.0, 1.4142135623730951
 """Steps of s, l, the angle and the mean, times Q."""
@@ -68,13 +68,13 @@ class Symbols(NamedTuple):
     cell : ndarray of int64, shape (N, 2)
         Column and row of the cell of the mean.
     part : ndarray of int64, shape (N, 2)
-        Column and row of the mean in the grid of its cell, see `parts_of`.
+        Column and row of the mean in the grid of its cell, see `Quantizer.parts`.
     color : ndarray of int64, shape (N, C)
         Steps of the colours.
     scale, stretch : ndarray of int64, shape (N,)
         Steps of s and l.
     turn : ndarray of int64, shape (N,)
-        Direction, from 0 to the number from `turns_of`, minus 1.
+        Direction, from 0 to the number from `Quantizer.turns`, minus 1.
     """
 
     cell: Integers
@@ -89,37 +89,55 @@ class Symbols(NamedTuple):
         return Symbols(*(part[chosen] for part in self))
 
 
-def precision(color: Integers) -> Doubles:
-    """Return Q, shape (N,), for colours (N, C) in steps."""
-    return np.maximum(np.sqrt(in_order(np.square(color.T.astype(np.float64)))), MIN_PRECISION)
+class Quantizer:
+    """The steps of the shapes and of the places of N Gaussians, which follow from their colours.
 
+    Parameters
+    ----------
+    color : ndarray of int64, shape (N, C)
+        Steps of the colours.
+    cell : float
+        Side of a cell in pixels.
 
-def turns_of(stretch: Doubles, fineness: Doubles) -> Integers:
-    """Return the number of directions for stretches l and the Q of Gaussians, both (N,)."""
-    with np.errstate(all="ignore"):
-        ratio = exp2(2 * LOG2E * stretch)
-        turns = np.rint((ratio - 1 / ratio) * fineness * (1.5707963267948966 / TURN_STEP))
-    return np.clip(turns, 1, MAX_TURNS).astype(np.int64)
+    Attributes
+    ----------
+    precision : ndarray of float64, shape (N,)
+        Q of each Gaussian.
+    scale_step, stretch_step : ndarray of float64, shape (N,)
+        Steps of s and l.
+    """
 
+    def __init__(self, color: Integers, cell: float) -> None:
+        squares = np.square(color.T.astype(np.float64))
+        self.precision = np.maximum(np.sqrt(sum_in_order(squares)), MIN_PRECISION)
+        self.scale_step = SCALE_STEP / self.precision
+        self.stretch_step = STRETCH_STEP / self.precision
+        self.cell = cell
 
-def factors_of(scale: Integers, stretch: Integers, turn: Integers, fineness: Doubles) -> Doubles:
-    """Return the factors a, b, c, shape (N, 3), for integers and Q, by exact arithmetic."""
-    length = stretch * (STRETCH_STEP / fineness)
-    angle = turn / turns_of(length, fineness)
-    with np.errstate(all="ignore"):
-        ratio, size = exp2(2 * LOG2E * length), exp2(LOG2E * (scale * (SCALE_STEP / fineness)))
-        sinh = 0.5 * (ratio - 1 / ratio)
-        cosine = cos_turns(0.5 * angle)
-        a = np.sqrt(1 / ratio + 2 * sinh * cosine * cosine)
-        return np.stack([a * size, sinh * sin_turns(angle) / a * size, size / a], axis=1)
+    def turns(self, length: Doubles) -> Integers:
+        """Return the number of directions for stretches l, shape (N,)."""
+        with np.errstate(all="ignore"):
+            ratio = exp2(2 * LOG2E * length)
+            turns = np.rint((ratio - 1 / ratio) * self.precision * (1.5707963267948966 / TURN_STEP))
+        return np.clip(turns, 1, MAX_TURNS).astype(np.int64)
 
+    def factors(self, scale: Integers, stretch: Integers, turn: Integers) -> Doubles:
+        """Return the factors a, b, c, shape (N, 3), for integers, by exact arithmetic."""
+        length = stretch * self.stretch_step
+        angle = turn / self.turns(length)
+        with np.errstate(all="ignore"):
+            ratio, size = exp2(2 * LOG2E * length), exp2(LOG2E * (scale * self.scale_step))
+            sinh = 0.5 * (ratio - 1 / ratio)
+            cosine = cos_turns(0.5 * angle)
+            a = np.sqrt(1 / ratio + 2 * sinh * cosine * cosine)
+            return np.stack([a * size, sinh * sin_turns(angle) / a * size, size / a], axis=1)
 
-def parts_of(factor: Floats, fineness: Floats, cell: float) -> Integers:
-    """Return the number of parts of the sides of each cell, shape (N, 2)."""
-    with np.errstate(all="ignore"):
-        unit = fineness * (cell / MEAN_STEP)
-        parts = np.rint(np.stack([factor[:, 0] * unit, factor[:, 2] * unit], axis=1))
-    return np.clip(np.nan_to_num(parts, nan=1.0), 1, MAX_PARTS).astype(np.int64)
+    def parts(self, factor: Doubles) -> Integers:
+        """Return the number of parts of the sides of each cell, shape (N, 2)."""
+        with np.errstate(all="ignore"):
+            unit = self.precision * (self.cell / MEAN_STEP)
+            parts = np.rint(np.stack([factor[:, 0] * unit, factor[:, 2] * unit], axis=1))
+        return np.clip(np.nan_to_num(parts, nan=1.0), 1, MAX_PARTS).astype(np.int64)
 
 
 def quantize(arrays: dict[str, Floats], steps: Steps, dead_zone: float = 0.0) -> Symbols:
@@ -146,13 +164,13 @@ def quantize(arrays: dict[str, Floats], steps: Steps, dead_zone: float = 0.0) ->
     amplitude = np.asarray(arrays["color"], np.float64) / (steps.color * np.exp(s))[:, None]
     rounded = np.copysign(np.floor(np.maximum(np.abs(amplitude) + 0.5 - dead_zone, 0)), amplitude)
     color = _to_integers("color", rounded)
-    fineness = precision(color)
-    scale = _to_integers("shape", s * fineness / SCALE_STEP)
-    stretch = _to_integers("shape", np.hypot(u, v) * fineness / STRETCH_STEP)
-    turns = turns_of(stretch * (STRETCH_STEP / fineness), fineness)
+    quantizer = Quantizer(color, steps.cell)
+    scale = _to_integers("shape", s * quantizer.precision / SCALE_STEP)
+    stretch = _to_integers("shape", np.hypot(u, v) * quantizer.precision / STRETCH_STEP)
+    turns = quantizer.turns(stretch * quantizer.stretch_step)
     turn = np.rint(np.arctan2(v, u) / (2 * np.pi) * turns).astype(np.int64) % turns
-    factor = factors_of(scale, stretch, turn, fineness)
-    parts = parts_of(factor, fineness, steps.cell)
+    factor = quantizer.factors(scale, stretch, turn)
+    parts = quantizer.parts(factor)
     mean = np.asarray(arrays["mean"], np.float64) / steps.cell
     cell_y, part_y = _place(mean[:, 1], parts[:, 1])
     # The error in y shifts x, so that both coordinates of F (m' - m) are small.
@@ -173,11 +191,11 @@ def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Floats]:
 
     Numbers of damaged files may overflow to infinity or zero.
     """
-    fineness = precision(symbols.color)
-    factor = factors_of(symbols.scale, symbols.stretch, symbols.turn, fineness)
-    parts = parts_of(factor, fineness, steps.cell)
+    quantizer = Quantizer(symbols.color, steps.cell)
+    factor = quantizer.factors(symbols.scale, symbols.stretch, symbols.turn)
+    parts = quantizer.parts(factor)
     with np.errstate(all="ignore"):
-        size = exp2(LOG2E * (symbols.scale * (SCALE_STEP / fineness)))
+        size = exp2(LOG2E * (symbols.scale * quantizer.scale_step))
         return {
             "mean": (symbols.cell + (symbols.part + 0.5) / parts) * steps.cell,
             "factor": factor,

@@ -29,9 +29,9 @@ from ..fitting.solve import solve
 from ..gaussian.gaussians import Gaussians, like
 from ..image.space import DATA
 from ..raster.render import render
-from .cells import hilbert_encode
 from .egs import EgsContent
 from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
+from .range_coder import hilbert_encode
 
 Array = NDArray[np.floating]
 

@@ -1,11 +1,12 @@
 """Families of images: one set of Gaussians for all principal components.
 
-- ``pca``: the principal components
+- ``basis``: the principal components, `Eigenbasis`
+- ``incremental``: merging a block of images, or another state, into a state; all images in shards
+- ``truncation``: the error as a function of the number of components
 - ``components``: from an eigenbasis to shared Gaussians and their weights in all components
+- ``normal_equations``: the best colours of many images on the same shapes
 - ``eigengs``: the model `EigenGS`
 - ``encoder``: from an image to Gaussians of the model, or to coefficients
-- ``normal_equations``: the best colours of many images on the same shapes
-- ``options``: the options of a training
 - ``training``: from a folder of images to a model, with figures of held-out images
-- ``model_file``: the file of a model
+- ``files``: the files of a basis and of a model
 """

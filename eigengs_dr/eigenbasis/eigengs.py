@@ -15,26 +15,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..backend.doors import shows_progress, takes_numbers
+from ..backend.doors import door, shows_progress, takes_numbers
 from ..backend.messages import to_html
-from ..backend.types import ArrayLike, Record
-from ..gaussian.gaussians import Gaussians
+from ..backend.types import ArrayLike, Doubles, Record, Singles
+from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.io import check_image
 from ..image.pixels import EncodedImage
 from ..image.resize import resample
-from .model_file import read_members, write_model
-from .pca.truncation import TruncationCurve, curve_from_eigenvalues, name_components
+from .files import read_model, write_model
+from .truncation import TruncationCurve, curve_from_eigenvalues, name_components
 
 if TYPE_CHECKING:  # training, encoding and runs over many images are imported on demand
     from ..collection.manifest import ImageRow
     from ..collection.sources import Images
     from ..image.folder import TrainingImages
-    from .encoder import Encoder
-    from .pca.basis import Eigenbasis
+    from .basis import Eigenbasis
+    from .encoder import ModelEncoder
 
-Planes = NDArray[np.float32]
 
 SHIPPED = {"natural": Path(__file__).parent / "data" / "natural.npz"}
 """Files of the package's models, by name; see ``tools/train_natural.py``."""
@@ -62,20 +60,20 @@ class EigenGS:
         See `eigengs_dr.Eigenbasis`; empty if unknown.
     held_out : ndarray of float64, shape (n + 1,) or (0,)
         Mean PSNR in dB of PCA with 0, 1, ..., n components, for images that were held out of the
-        training; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. Empty if there were
+        training; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. Empty if there were
         none.
     figures : dict of str to float
-        See `eigengs_dr.eigenbasis.components.solve.fit_model`; not saved.
+        See `eigengs_dr.eigenbasis.components.fit_model`; not saved.
     """
 
     gaussians: Gaussians
-    weights: tuple[Planes, ...]
-    eigenvalues: tuple[NDArray[np.float64], ...]
-    mean_image: Planes
+    weights: tuple[Singles, ...]
+    eigenvalues: tuple[Doubles, ...]
+    mean_image: Singles
     low: int = 0
     low_components: int = 0
-    variance: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    held_out: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    variance: Doubles = field(default_factory=lambda: np.zeros(0))
+    held_out: Doubles = field(default_factory=lambda: np.zeros(0))
     figures: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -122,9 +120,8 @@ class EigenGS:
         BackendError
             If the backend does not work.
         """
-        from .components.solve import fit_model
-        from .options import TrainOptions
-        from .pca.basis import Eigenbasis
+        from .basis import Eigenbasis
+        from .components import TrainOptions, fit_model
 
         if not isinstance(basis, Eigenbasis):
             basis = Eigenbasis.from_images(basis, progress=False)
@@ -136,7 +133,12 @@ class EigenGS:
             iterations=iterations,
             seed=seed,
         )
-        return cls(**fit_model(basis, options, backend, progress))
+
+        def report(states: object, done: int, total: int) -> None:
+            if progress:
+                progress(done, total, {})
+
+        return cls(**fit_model(basis, options, backend, after_round=report))
 
     def __repr__(self) -> str:
         size = f"{len(self.gaussians)} Gaussians, {self.gaussians.width}x{self.gaussians.height}"
@@ -158,8 +160,8 @@ class EigenGS:
             return None
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
-    @takes_numbers
-    def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Planes, ...]:
+    @door
+    def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Singles, ...]:
         """Compute the coefficients of an image by least squares on the rendered components.
 
         The function solves ``min_a |Psi~ a - (I - Psi~_0)|^2``. If the Gaussians render the
@@ -172,7 +174,7 @@ class EigenGS:
             An image of any size; it is resampled to the size of the model.
         target_psnr : float, optional
             Use the fewest components that reach this PSNR, in dB, for the image at the size of the
-            model; see `eigengs_dr.eigenbasis.pca.truncation.TruncationCurve`. By default all.
+            model; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. By default all.
 
         Returns
         -------
@@ -191,6 +193,7 @@ class EigenGS:
         """
         return self.encoder.project(check_image(image, copy=False), target_psnr)
 
+    @door
     def reconstruct(
         self, coefficients: Sequence[ArrayLike], size: tuple[int, int] | None = None
     ) -> Gaussians:
@@ -209,9 +212,16 @@ class EigenGS:
             If there is not one array per channel, one has more than k_c coefficients, or a
             coefficient is not finite.
         """
-        return self.encoder.reconstruct(coefficients, size)
+        shapes, limits = [np.shape(values) for values in coefficients], self.components
+        if len(shapes) != len(limits) or not all(
+            len(shape) == 1 and shape[0] <= k for shape, k in zip(shapes, limits, strict=True)
+        ):
+            raise ValueError(f"coefficients have shapes {shapes}; expected up to {limits}")
+        if not all(np.isfinite(np.asarray(values, np.float32)).all() for values in coefficients):
+            raise ValueError("coefficients are not all finite in single precision; replace them")
+        return self._colored(self.encoder.mean_colors + self.encoder.sum(coefficients), size)
 
-    @takes_numbers
+    @door
     def encode(
         self,
         image: ArrayLike,
@@ -243,7 +253,9 @@ class EigenGS:
             colours.
         """
         pixels = check_image(image, copy=False)
-        return self.encoder.encode(pixels, colors, mean, target_psnr)
+        check_coding(colors, mean, target_psnr)
+        columns = self.encoder.columns(pixels, colors, mean == "dense", target_psnr)
+        return self._colored(columns, (pixels.shape[1], pixels.shape[0]))
 
     @shows_progress
     @takes_numbers
@@ -281,23 +293,27 @@ class EigenGS:
         """
         from ..collection.manifest import fingerprint
         from ..collection.run import Job, run_images
-        from .encoder import check_encoding
 
-        check_encoding(colors, mean, target_psnr)
+        check_coding(colors, mean, target_psnr)
         work = partial(_encode_all, model=self, options=(colors, mean, target_psnr))
         options = {"colors": colors, "mean": mean, "target_psnr": target_psnr}
         options |= {"model": fingerprint(self.gaussians)}
         job = Job(work, options=options, given=list(options))
         return run_images(images, output, overwrite, job, progress, client)
 
+    def _colored(self, columns: Doubles, size: tuple[int, int] | None) -> Gaussians:
+        """Return the Gaussians with other colours and background (N + 1, C), scaled to a size."""
+        result = with_colors(self.gaussians, columns, self.gaussians.space)
+        return result.scaled(*size) if size else result
+
     @takes_numbers
-    def dense_mean(self, width: int, height: int) -> Planes:
+    def dense_mean(self, width: int, height: int) -> Singles:
         """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
         return resample(np.moveaxis(self.mean_image, 0, 2), width, height)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
-        write_model(path, self)
+        write_model(path, vars(self))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> EigenGS:
@@ -319,18 +335,18 @@ class EigenGS:
         if not Path(path).is_file():
             names = ", ".join(SHIPPED)
             raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
-        return cls(**read_members(path, backend))
+        return cls(**read_model(path, backend))
 
     def __getstate__(self) -> Record:
         """Leave out the encoder, whose cached values are Dr.Jit arrays."""
         return {key: value for key, value in self.__dict__.items() if key != "encoder"}
 
     @cached_property
-    def encoder(self) -> Encoder:
-        """The `eigengs_dr.eigenbasis.encoder.Encoder` of the model, with cached values."""
-        from .encoder import Encoder
+    def encoder(self) -> ModelEncoder:
+        """The `eigengs_dr.eigenbasis.encoder.ModelEncoder` of the model, with cached values."""
+        from .encoder import ModelEncoder
 
-        return Encoder(self.gaussians, self.weights, self.mean_image, self.low)
+        return ModelEncoder(self.gaussians, self.weights, self.mean_image, self.low)
 
 
 def _encode_all(
@@ -342,4 +358,22 @@ def _encode_all(
 
 @cache  # files of the package do not change
 def _shipped(name: str, backend: str | None) -> EigenGS:
-    return EigenGS(**read_members(SHIPPED[name], backend))
+    return EigenGS(**read_model(SHIPPED[name], backend))
+
+
+def check_coding(colors: str, mean: str, target_psnr: float | None) -> None:
+    """Raise ValueError if options of `eigengs_dr.EigenGS.encode` are unknown or contradictory.
+
+    Parameters
+    ----------
+    colors, mean, target_psnr
+        See `eigengs_dr.EigenGS.encode`.
+    """
+    for name, value, valid in (
+        ("colors", colors, ("exact", "projected")),
+        ("mean", mean, ("gaussians", "dense")),
+    ):
+        if value not in valid:
+            raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(valid)}")
+    if colors == "exact" and target_psnr is not None:
+        raise ValueError("target_psnr chooses components; use it with colors 'projected'")

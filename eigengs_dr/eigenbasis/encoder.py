@@ -17,22 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 
-from ..backend.doors import class_of_doors
-from ..backend.types import ArrayLike
-from ..gaussian.gaussians import Gaussians, with_colors
+from ..backend.types import ArrayLike, Doubles, Singles
+from ..gaussian.gaussians import Gaussians
 from ..image.color import RGB_TO_YCBCR, YCBCR_OFFSET
 from ..image.resize import resample
 from ..image.space import to_planes
 from .normal_equations import NormalEquations, squared_norms
-from .pca.truncation import min_ranks_per_channel, residual_energy
-
-Planes = NDArray[np.float32]
-Columns = NDArray[np.float64]
+from .truncation import min_ranks_per_channel, residual_energy
 
 
-@class_of_doors
 @dataclass(frozen=True, eq=False)
-class Encoder:
+class ModelEncoder:
     """The functions that encode images by a model, with the values that all images share.
 
     Attributes
@@ -42,8 +37,8 @@ class Encoder:
     """
 
     gaussians: Gaussians
-    weights: tuple[Planes, ...]
-    mean_image: Planes
+    weights: tuple[Singles, ...]
+    mean_image: Singles
     low: int
 
     @cached_property
@@ -51,7 +46,7 @@ class Encoder:
         """Factorised normal equations of all Gaussians."""
         return NormalEquations(self.gaussians, self.low)
 
-    def project(self, image: Planes, target_psnr: float | None) -> tuple[Planes, ...]:
+    def project(self, image: Singles, target_psnr: float | None) -> tuple[Singles, ...]:
         """Return the coefficients of a checked image (H, W, 3); see `eigengs_dr.EigenGS.project`.
 
         A target is in dB. Because of the ridge on the diagonal of ``Psi~^T Psi~``, the actual error
@@ -60,36 +55,24 @@ class Encoder:
         pixels = resample(image, self.gaussians.width, self.gaussians.height)
         return self._coefficients(pixels, self._correlate(pixels), False, target_psnr)
 
-    def reconstruct(
-        self, coefficients: Sequence[ArrayLike], size: tuple[int, int] | None = None
-    ) -> Gaussians:
-        """Convert coefficients to Gaussians; see `eigengs_dr.EigenGS.reconstruct`."""
-        shapes = [np.shape(values) for values in coefficients]
-        limits = tuple(len(weights) for weights in self.weights)
-        if len(shapes) != len(limits) or not all(
-            len(shape) == 1 and shape[0] <= k for shape, k in zip(shapes, limits, strict=True)
-        ):
-            raise ValueError(f"coefficients have shapes {shapes}; expected up to {limits}")
-        if not all(np.isfinite(np.asarray(values, np.float32)).all() for values in coefficients):
-            raise ValueError("coefficients are not all finite in single precision; replace them")
-        return self._colored(self._mean_colors + self._sum(coefficients), size)
+    def columns(
+        self, image: Singles, colors: str, centred: bool, target_psnr: float | None
+    ) -> Doubles:
+        """Return the colours and the background of a checked image (H, W, 3), shape (N + 1, C).
 
-    def encode(self, image: Planes, colors: str, mean: str, target_psnr: float | None) -> Gaussians:
-        """Encode a checked image (H, W, 3) of any size; see `eigengs_dr.EigenGS.encode`."""
-        check_encoding(colors, mean, target_psnr)
+        If `centred`, they do not include the mean image; for the others see
+        `eigengs_dr.EigenGS.encode`.
+        """
         pixels = resample(image, self.gaussians.width, self.gaussians.height)
-        correlations, centred = self._correlate(pixels), mean == "dense"
+        correlations = self._correlate(pixels)
         if centred:
             correlations -= self._dense_mean_correlations
         if colors == "exact":
-            columns = self.equations.solve(correlations)
-        else:
-            columns = self._sum(self._coefficients(pixels, correlations, centred, target_psnr))
-            if not centred:
-                columns += self._mean_colors
-        return self._colored(columns, (image.shape[1], image.shape[0]))
+            return self.equations.solve(correlations)
+        coefficients = self._coefficients(pixels, correlations, centred, target_psnr)
+        return self.sum(coefficients) if centred else self.sum(coefficients) + self.mean_colors
 
-    def _correlate(self, pixels: Planes) -> Columns:
+    def _correlate(self, pixels: Singles) -> Doubles:
         """Return ``[A 1]^T x`` of all channels of an image of the model's size, shape (N + 1, C).
 
         The conversion of RGB pixels D is affine: ``A^T (M D + o) = M A^T D + o A^T 1``. Converting
@@ -103,29 +86,24 @@ class Encoder:
         black = np.outer(np.append(self.equations.coverage, area), YCBCR_OFFSET)
         return correlations @ RGB_TO_YCBCR.T + black
 
-    def _colored(self, columns: Columns, size: tuple[int, int] | None) -> Gaussians:
-        """Return the shapes of the model with new colours and background, scaled to a size."""
-        result = with_colors(self.gaussians, columns, self.gaussians.space)
-        return result.scaled(*size) if size else result
-
     @cached_property
-    def _mean_colors(self) -> Columns:
+    def mean_colors(self) -> Doubles:
         """Colours and background of the mean image, shape (N + 1, C)."""
         arrays = self.gaussians.to_arrays()
         return np.vstack([arrays["color"], arrays["background"]]).astype(np.float64)
 
     @cached_property
-    def _mean_product(self) -> Columns:
+    def _mean_product(self) -> Doubles:
         """Correlations of the rendered mean image with all Gaussians, shape (N + 1, C)."""
-        return self.equations.product(self._mean_colors)
+        return self.equations.product(self.mean_colors)
 
     @cached_property
-    def _dense_mean_correlations(self) -> Columns:
+    def _dense_mean_correlations(self) -> Doubles:
         """Correlations of the pixels of the mean image, shape (N + 1, C)."""
         return self.equations.correlate(self.mean_image)
 
     @cached_property
-    def _factors(self) -> list[Columns]:
+    def _factors(self) -> list[Doubles]:
         """Cholesky factors L of ``Psi~^T Psi~``, one for each channel."""
         factors = []
         for rows in self.weights:
@@ -138,8 +116,8 @@ class Encoder:
         return factors
 
     def _coefficients(
-        self, pixels: Planes, correlations: Columns, centred: bool, target_psnr: float | None
-    ) -> tuple[Planes, ...]:
+        self, pixels: Singles, correlations: Doubles, centred: bool, target_psnr: float | None
+    ) -> tuple[Singles, ...]:
         """Solve least squares on the rendered components for an image of the model's size.
 
         `centred` correlations do not include the mean image.
@@ -157,7 +135,7 @@ class Encoder:
                 lengths = squared_norms(planes - self.mean_image)
             else:
                 lengths = squared_norms(planes)
-                lengths = self.equations.error(self._mean_colors, correlations, lengths)
+                lengths = self.equations.error(self.mean_colors, correlations, lengths)
             pairs = zip(lengths, halves, strict=True)
             residuals = [residual_energy(total, y**2) for total, y in pairs]
             counts = min_ranks_per_channel(residuals, planes.size, target_psnr)
@@ -166,7 +144,7 @@ class Encoder:
             for factor, y, k in zip(self._factors, halves, counts, strict=True)
         )
 
-    def _sum(self, coefficients: Sequence[ArrayLike]) -> Columns:
+    def sum(self, coefficients: Sequence[ArrayLike]) -> Doubles:
         """Return ``sum_j a_j psi_nj`` of each channel, shape (N + 1, C)."""
         columns = np.zeros((self.weights[0].shape[1], len(self.weights)))
         for c, (weights, given) in enumerate(zip(self.weights, coefficients, strict=True)):
@@ -176,28 +154,10 @@ class Encoder:
         return columns
 
 
-def _solve(lower: Columns, right: NDArray, transposed: bool = False) -> Columns:
+def _solve(lower: Doubles, right: NDArray, transposed: bool = False) -> Doubles:
     """Solve ``L x = b`` or ``L^T x = b``, which may be empty."""
     if not len(right):
         return right.astype(np.float64)
     return solve_triangular(
         lower, right, trans="T" if transposed else "N", lower=True, check_finite=False
     )
-
-
-def check_encoding(colors: str, mean: str, target_psnr: float | None) -> None:
-    """Raise ValueError if options of `eigengs_dr.EigenGS.encode` are unknown or contradictory.
-
-    Parameters
-    ----------
-    colors, mean, target_psnr
-        See `eigengs_dr.EigenGS.encode`.
-    """
-    for name, value, valid in (
-        ("colors", colors, ("exact", "projected")),
-        ("mean", mean, ("gaussians", "dense")),
-    ):
-        if value not in valid:
-            raise ValueError(f"{name} {value!r} is unknown; use one of {', '.join(valid)}")
-    if colors == "exact" and target_psnr is not None:
-        raise ValueError("target_psnr chooses components; use it with colors 'projected'")

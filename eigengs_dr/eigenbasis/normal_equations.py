@@ -11,9 +11,9 @@ from __future__ import annotations
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -23,6 +23,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from ..backend.arrays import types_of, upload
 from ..backend.recording import freeze_program
+from ..backend.types import Doubles, Singles
 from ..gaussian.gaussians import Gaussians
 from ..image.strips import available_cores
 from ..raster.adjoint import adjoint
@@ -63,16 +64,13 @@ RIDGE = 1e-4
 colours of Gaussians that overlap strongly, without a visible effect."""
 
 
-@dataclass(frozen=True)
-class Block:
+class FactoredBlock(NamedTuple):
     """Consecutive Gaussians whose colours are solved for together.
 
     Attributes
     ----------
     rows : slice
         Range of the Gaussians.
-    system : csr_array of float64, shape (n, n)
-        ``A^T A + ridge``.
     factor : SuperLU
         Factorisation of ``A^T A + ridge`` in single precision, which halves the memory that is read
         for every image; its rounding error is below the ridge.
@@ -81,13 +79,13 @@ class Block:
     """
 
     rows: slice
-    system: csr_array
     factor: SuperLU
-    background_response: NDArray[np.float64]
+    background_response: Doubles
 
-    def divide(self, sums: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return ``(A^T A + ridge)^-1`` times a column (n,) or columns (n, M)."""
-        return self.factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
+
+def _divide(factor: SuperLU, sums: Doubles) -> Doubles:
+    """Return ``(A^T A + ridge)^-1`` times a column (n,) or columns (n, M)."""
+    return factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
 
 
 @cache
@@ -144,7 +142,7 @@ class NormalEquations:
         self.adjoint = programs.enter_context(freeze_program(adjoint))
         weakref.finalize(self, programs.close)
 
-    def _block(self, rows: slice) -> Block:
+    def _block(self, rows: slice) -> FactoredBlock:
         """Factorise the equations of some Gaussians."""
         gram = self.gram[rows, rows]
         ridge = max(RIDGE * gram.diagonal().mean(), 1e-12)
@@ -163,12 +161,11 @@ class NormalEquations:
                 "differ more"
             ) from None
         coverage = self.coverage[rows]
-        block = Block(rows, system, factor, 0 * coverage)
-        response = block.divide(coverage)  # with one step of iterative refinement
-        response = response + block.divide(coverage - system @ response)
-        return replace(block, background_response=response)
+        response = _divide(factor, coverage)  # with one step of iterative refinement
+        response = response + _divide(factor, coverage - system @ response)
+        return FactoredBlock(rows, factor, response)
 
-    def correlate(self, images: NDArray[np.float32]) -> NDArray[np.float64]:
+    def correlate(self, images: Singles) -> Doubles:
         """Return ``A^T D`` and, in the last row, ``1^T D``.
 
         Parameters
@@ -195,7 +192,7 @@ class NormalEquations:
         result[-1] = images.sum(axis=1).sum(axis=1, dtype=np.float64)
         return result
 
-    def _multiply(self, planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _multiply(self, planes: Singles) -> Singles:
         """Return ``A^T D`` of many planes, shape (N, M), by sparse products."""
         flat = planes.reshape(len(planes), -1)
         columns = np.empty(flat.shape[::-1], np.float32)
@@ -203,7 +200,7 @@ class NormalEquations:
             columns[first : first + STRIP_PIXELS] = flat[:, first : first + STRIP_PIXELS].T
         return np.vstack(list(_threads().map(lambda share: share @ columns, self.shares)))
 
-    def _adjoint(self, planes: NDArray[np.float32], result: NDArray[np.float64]) -> None:
+    def _adjoint(self, planes: Singles, result: Doubles) -> None:
         """Write ``A^T D`` of few planes to an array (N, M), computed by Dr.Jit."""
         types = types_of(self.packed)
         with dr.suspend_grad():
@@ -218,7 +215,7 @@ class NormalEquations:
                 for column, row in zip(range(first, first + len(group)), rows, strict=False):
                     result[:, column] = row.numpy()
 
-    def solve(self, correlations: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(self, correlations: Doubles) -> Doubles:
         """Return the least-squares coefficients for the result of `correlate`.
 
         Parameters
@@ -239,13 +236,13 @@ class NormalEquations:
         background = (total - response @ sums) / free if free > 1e-6 * pixels else 0 * total
         coefficients = np.zeros(correlations.shape)
         coefficients[-1] = background
-        coefficients[first.rows] = first.divide(sums) - np.outer(response, background)
+        coefficients[first.rows] = _divide(first.factor, sums) - np.outer(response, background)
         for block in others:
             residual = correlations - self.product(coefficients)
-            coefficients[block.rows] = block.divide(residual[block.rows])
+            coefficients[block.rows] = _divide(block.factor, residual[block.rows])
         return coefficients
 
-    def product(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    def product(self, coefficients: Doubles) -> Doubles:
         """Return ``[A 1]^T [A 1] x`` for coefficients x of shape (N + 1, M)."""
         colors, background = coefficients[:-1], coefficients[-1:]
         pixels = self.width * self.height
@@ -257,11 +254,8 @@ class NormalEquations:
         )
 
     def error(
-        self,
-        coefficients: NDArray[np.float64],
-        correlations: NDArray[np.float64],
-        squared_norms: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+        self, coefficients: Doubles, correlations: Doubles, squared_norms: Doubles
+    ) -> Doubles:
         """Return ``|A c + b 1 - D|^2`` of M images from inner products, without rendering.
 
         Parameters
@@ -279,7 +273,7 @@ class NormalEquations:
         return np.maximum(error, 0)
 
 
-def squared_norms(planes: NDArray[np.float32]) -> NDArray[np.float64]:
+def squared_norms(planes: Singles) -> Doubles:
     """Return ``|D|^2`` of every plane D, shape (M,), for planes (M, H, W)."""
     return np.einsum("nij,nij->n", planes, planes, dtype=np.float64)
 
@@ -330,11 +324,7 @@ def weight_matrix(gaussians: Gaussians) -> csr_array:
 
 
 def _pixels_inside(
-    mean: NDArray[np.float64],
-    factor: NDArray[np.float64],
-    width: int,
-    height: int,
-    cutoff: float,
+    mean: Doubles, factor: Doubles, width: int, height: int, cutoff: float
 ) -> tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.int32]]:
     """List (Gaussian, x, y) of the pixels inside each ellipse, row by row.
 

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..backend.interrupts import defer_interrupts
+from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import warn
-from ..backend.types import Record
+from ..backend.types import Record, Singles
 from ..image.folder import list_images
 from ..image.io import ImageError, check_image
 from ..image.metrics import psnr
@@ -24,11 +23,10 @@ from ..image.resize import center_crop
 from ..paper.joint_training import State
 from ..raster.render import render
 from ..storage.checkpoint import Checkpoint, open_checkpoint
-from .components.solve import fit_model
+from .basis import Eigenbasis
+from .components import TrainOptions, fit_model
 from .eigengs import EigenGS
-from .options import TrainOptions
-from .pca.basis import Eigenbasis
-from .pca.truncation import TruncationCurve
+from .truncation import TruncationCurve
 
 HELD_OUT = 10
 """One in this number of images is held out of the training and measured."""
@@ -39,20 +37,14 @@ MAX_HELD_OUT = 100
 SAVE_SECONDS = 10.0
 """Seconds between two checkpoints of the shapes."""
 
-StageProgress = Callable[[str, int, int], None]
-
-
-class Interrupted(Exception):
-    """Ctrl-C was pressed; the message says whether anything is saved."""
-
 
 class Training(NamedTuple):
-    """Result of `train`: the model, the basis that it renders, and figures.
+    """Result of `train_model`: the model, the basis that it renders, and figures.
 
     The figures are ``seconds``, ``pca_seconds``, ``shape_seconds``, ``weight_seconds`` (of the last
     run only if ``resumed``), ``images``, ``iterations``, ``components`` (of each channel),
     ``gaussians``, ``frequency_aware``, ``psnr_held_out`` (`held_out` of the model), those of
-    `eigengs_dr.eigenbasis.components.solve.fit_model`, and the mean psnr_ycbcr of held-out images:
+    `eigengs_dr.eigenbasis.components.fit_model`, and the mean psnr_ycbcr of held-out images:
     of PCA (``psnr_pca``), of projected colours (``psnr_init``) and of exact colours
     (``psnr_solved``).
     """
@@ -62,12 +54,12 @@ class Training(NamedTuple):
     figures: Record
 
 
-def train(
+def train_model(
     folder: str | os.PathLike[str],
     output: str | os.PathLike[str],
     settings: TrainOptions,
     backend: str | None = None,
-    progress: StageProgress = lambda stage, done, total: None,
+    progress: Callable[[int, int, Record], None] = lambda done, total, row: None,
     client: object = None,
 ) -> Training:
     """Train a model on a folder of images, and write it.
@@ -84,7 +76,8 @@ def train(
     settings : TrainOptions
     backend : {"llvm", "cuda"}, optional
     progress : callable, optional
-        ``progress(stage, done, total)``.
+        ``progress(done, total, row)``; the row has the ``stage``: "components", "weights", "shapes"
+        or "measure".
     client : distributed.Client, optional
         Compute components on the workers of this Dask cluster, see
         `eigengs_dr.Eigenbasis.from_images`. The images must be on a shared file system.
@@ -92,7 +85,8 @@ def train(
     Raises
     ------
     Interrupted
-        After Ctrl-C.
+        After Ctrl-C; its result is the folder from which the same call resumes, or None if nothing
+        is saved.
     ClusterError
         If the cluster cannot be used, or is lost; the same call resumes.
     ValueError
@@ -114,7 +108,7 @@ def train(
         files = [name if is_url(name) else Path(folder) / name for name in checkpoint.files]
         held_out = files[HELD_OUT - 1 :: HELD_OUT][:MAX_HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
-        run = Run(checkpoint, settings, backend, progress, interrupted, held_out, client)
+        run = _Run(checkpoint, settings, backend, progress, interrupted, held_out, client)
         try:
             basis = _basis(training, run)
             pca_seconds = time.perf_counter() - started
@@ -141,33 +135,36 @@ def train(
     return Training(model, basis, figures)
 
 
-class Run(NamedTuple):
+class _Run(NamedTuple):
     """State that all stages of a training share."""
 
     checkpoint: Checkpoint
     settings: TrainOptions
     backend: str | None
-    progress: StageProgress
+    progress: Callable[[int, int, Record], None]
     interrupted: Callable[[], bool]
     held_out: Sequence[Path | str]
-    client: object = None
+    client: object
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        """Report progress, and stop after Ctrl-C."""
+        self.progress(done, total, {"stage": stage})
+        self.stop_if_interrupted()
 
     def stop_if_interrupted(self) -> None:
         """Raise `Interrupted` after Ctrl-C."""
-        if self.interrupted():
-            saved = self.checkpoint.holds_work
-            raise Interrupted("repeat the command to continue" if saved else "nothing is saved")
+        if not self.interrupted():
+            return
+        if self.checkpoint.holds_work:
+            raise Interrupted(self.checkpoint.folder, "repeat the command to continue")
+        raise Interrupted(None, "nothing is saved")
 
 
-def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
+def _basis(files: list[Path | str], run: _Run) -> Eigenbasis:
     """Compute the components, or read them from the checkpoint, which also stores shards."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():
         return Eigenbasis.load(path)
-
-    def advance(done: int, total: int | None, row: Record) -> None:
-        run.progress("components", done, len(files))
-        run.stop_if_interrupted()
 
     basis = Eigenbasis.from_images(
         files,
@@ -175,7 +172,7 @@ def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
         settings.components,
         settings.energy,
         settings.space,
-        advance,
+        lambda done, total, row: run.report("components", done, len(files)),
         run.client,
         checkpoint.folder,
     )
@@ -191,18 +188,15 @@ def _basis(files: list[Path | str], run: Run) -> Eigenbasis:
     return basis
 
 
-def _model(basis: Eigenbasis, run: Run) -> EigenGS:
+def _model(basis: Eigenbasis, run: _Run) -> EigenGS:
     """Fit Gaussians to the components, and save checkpoints."""
     checkpoint, curve = run.checkpoint, _curve(basis, run)
-    run.progress("weights", 0, 1)
-    run.stop_if_interrupted()
+    run.report("weights", 0, 1)
     saved = time.perf_counter()
 
-    def advance(step: int, steps: int, row: Record) -> None:
-        run.progress("shapes", step, steps)
-
-    def save(states: list[State]) -> None:
+    def save(states: list[State], step: int, steps: int) -> None:
         nonlocal saved
+        run.progress(step, steps, {"stage": "shapes"})
         if run.interrupted() or time.perf_counter() - saved > SAVE_SECONDS:
             saved = time.perf_counter()
             for band, state in enumerate(states):
@@ -212,18 +206,18 @@ def _model(basis: Eigenbasis, run: Run) -> EigenGS:
     states: list[State] = []
     while (state := checkpoint.load(f"shapes-{len(states)}")) is not None:
         states.append(state)
-    members = fit_model(basis, run.settings, run.backend, advance, states, save)
-    return EigenGS(**members, held_out=np.zeros(0) if curve is None else curve.psnr)
+    fields = fit_model(basis, run.settings, run.backend, states, save)
+    return EigenGS(**fields, held_out=np.zeros(0) if curve is None else curve.psnr)
 
 
-def _curve(basis: Eigenbasis, run: Run) -> TruncationCurve | None:
+def _curve(basis: Eigenbasis, run: _Run) -> TruncationCurve | None:
     """Return the truncation curve of the held-out images, None if none can be read."""
     images = _readable(basis, run)
     first = next(images, None)
     return None if first is None else basis.truncation_curve(chain([first], images))
 
 
-def _evaluate(model: EigenGS, basis: Eigenbasis, run: Run) -> dict[str, float]:
+def _evaluate(model: EigenGS, basis: Eigenbasis, run: _Run) -> dict[str, float]:
     """Measure the held-out images, for the figures of `Training`, and warn about failures."""
     rows: list[dict[str, float]] = []
     errors: list[str] = []
@@ -241,12 +235,12 @@ def _evaluate(model: EigenGS, basis: Eigenbasis, run: Run) -> dict[str, float]:
 
 
 def _readable(
-    basis: Eigenbasis, run: Run, errors: list[str] | None = None, stage: str = ""
-) -> Iterator[NDArray[np.float32]]:
+    basis: Eigenbasis, run: _Run, errors: list[str] | None = None, stage: str = ""
+) -> Iterator[Singles]:
     """Read the held-out images at the size of a basis; skip those that cannot be read."""
     for done, path in enumerate(run.held_out):
         if stage:
-            run.progress(stage, done, len(run.held_out))
+            run.progress(done, len(run.held_out), {"stage": stage})
         run.stop_if_interrupted()
         try:
             image = center_crop(check_image(path, copy=False), basis.width, basis.height)

@@ -8,7 +8,7 @@ loss is the mean squared error of the rendered components, with each channel sca
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_in, types_of, upload
 from ..backend.recording import freeze_program
 from ..backend.selection import select
-from ..backend.types import Float, Rows
+from ..backend.types import Float, Rows, Singles
 from ..fitting.place import random_shapes
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
@@ -29,9 +29,7 @@ from ..raster.kernels import residual
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import bin_gaussians, to_tiles
 from .adan import Adan
-from .cholesky import Cholesky
-
-Planes = NDArray[np.float32]
+from .gaussianimage import Cholesky
 
 State = dict[str, NDArray]
 """The state of a training as plain arrays, for a checkpoint."""
@@ -39,30 +37,34 @@ State = dict[str, NDArray]
 CHOLESKY = Cholesky()
 
 
-class Components(Protocol):
-    """Components and the number of their Gaussians, as `eigengs_dr.eigenbasis` divides them."""
+class Band(NamedTuple):
+    """Components, and the number of Gaussians that represent them.
 
-    @property
-    def number(self) -> int:
-        """Number of Gaussians."""
+    Attributes
+    ----------
+    number : int
+    components : tuple of C ndarrays of float32, shape (k_c, H, W)
+        A channel may have none.
+    """
 
-    @property
-    def components(self) -> tuple[Planes, ...]:
-        """Components of each channel, (k_c, H, W)."""
+    number: int
+    components: tuple[Singles, ...]
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
+        height, width = self.components[0].shape[1:]
+        return width, height
 
 
-def joint_shapes(state: State, band: Components, backend: str | None = None) -> Gaussians:
+def joint_shapes(state: State, band: Band, backend: str | None = None) -> Gaussians:
     """Return the Gaussians of a state, with one channel of zeros, in the space "data"."""
     types = types_in(select(backend))
     rows = [upload(types.Float, row) for row in state["rows"][0, :NUM_SHAPE_PARAMS]]
     return decode_shapes(rows, band.size)
 
 
-def joint_weights(state: State, band: Components) -> list[Planes]:
+def joint_weights(state: State, band: Band) -> list[Singles]:
     """Return the weights of the components of a state, with the scaling undone.
 
     The scaled weight ``w_nj`` of Gaussian n in component j and the bounds of the channel give
@@ -81,7 +83,7 @@ def joint_weights(state: State, band: Components) -> list[Planes]:
     ]
 
 
-def _bounds(band: Components) -> list[tuple[np.float32, np.float32]]:
+def _bounds(band: Band) -> list[tuple[np.float32, np.float32]]:
     """Return the smallest and largest value of all components of each channel."""
     none = np.zeros(1, np.float32)
     return [(p.min(), p.max()) for p in (c if len(c) else none for c in band.components)]
@@ -120,9 +122,12 @@ evaluated more often."""
 
 OPTIMIZER = Adan()
 
+RADIUS = kernel_radius(CUTOFF)
+"""Radius of all kernels."""
+
 
 def train_jointly(
-    band: Components,
+    band: Band,
     seed: int,
     steps: int,
     backend: str | None = None,
@@ -141,7 +146,7 @@ def train_jointly(
 
     Parameters
     ----------
-    band : Components
+    band : Band
     seed : int
         Seed of the random start.
     steps : int
@@ -176,7 +181,7 @@ def train_jointly(
     return _train(band, state or _start(band, seed, backend), steps, backend)
 
 
-def _start(band: Components, seed: int, backend: str | None) -> State:
+def _start(band: Band, seed: int, backend: str | None) -> State:
     """Draw a random initial state, with moments of 0."""
     generator = np.random.default_rng(seed)
     count = band.number
@@ -192,7 +197,7 @@ def _start(band: Components, seed: int, backend: str | None) -> State:
     return {"step": np.array(0), "rows": rows}
 
 
-def _train(band: Components, state: State, steps: int, backend: str | None) -> Iterator[State]:
+def _train(band: Band, state: State, steps: int, backend: str | None) -> Iterator[State]:
     """Take the remaining steps."""
     types, size, start = types_in(select(backend)), band.size, state["rows"]
     shape = _upload(types, start[:, :NUM_SHAPE_PARAMS])
@@ -205,8 +210,7 @@ def _train(band: Components, state: State, steps: int, backend: str | None) -> I
         to_tiles(types, np.moveaxis(planes, 0, 2), Grid(*size))
         for planes in _split(np.concatenate(scaled), axis=0)
     ]
-    radius, number = kernel_radius(CUTOFF), sum(planes.size for planes in band.components)
-    scale = dr.opaque(types.Float, 2 / number)
+    scale = dr.opaque(types.Float, 2 / sum(planes.size for planes in band.components))
     with freeze_program(_move_group) as move, freeze_program(_move_shape) as move_shape:
         for step in range(int(state["step"]), steps):
             rate = dr.opaque(types.Float, RATE * 0.5 ** (step // HALVING_STEPS))
@@ -219,7 +223,7 @@ def _train(band: Components, state: State, steps: int, backend: str | None) -> I
             slopes = [dr.opaque(types.Float, 0, dr.width(v)) for v in values]
             for k, target in enumerate(targets):
                 groups[k], slopes = move(
-                    groups[k], target, values, lists, radius, scale, slopes, rate, time
+                    groups[k], target, values, lists, scale, slopes, rate, time
                 )
             shape = move_shape(shape, slopes, size, rate, time)
             if (step + 1) % STATE_STEPS == 0 or step + 1 == steps:
@@ -233,7 +237,6 @@ def _move_group(
     target: Float,
     shape: list,
     lists: TileLists,
-    radius: float,
     scale: Float,
     slopes: list,
     rate: Float,
@@ -243,8 +246,8 @@ def _move_group(
     moments: Sequence[Rows]
     rows, *moments = group
     packed = pack_parameters([*shape, *rows])
-    delta, _ = residual(packed, [type(target)(0)] * GROUP_COMPONENTS, lists, radius, target)
-    gradient = [g * scale for g in adjoint(packed, delta, GROUP_COMPONENTS, lists, radius)]
+    delta, _ = residual(packed, [type(target)(0)] * GROUP_COMPONENTS, lists, RADIUS, target)
+    gradient = [g * scale for g in adjoint(packed, delta, GROUP_COMPONENTS, lists, RADIUS)]
     added = [s + g for s, g in zip(slopes, gradient[:NUM_SHAPE_PARAMS], strict=True)]
     weight_gradient = type(rows)(gradient[NUM_SHAPE_PARAMS:])
     rows, moments = OPTIMIZER.step(rows, weight_gradient, tuple(moments), rate, time)
@@ -267,17 +270,17 @@ def _move_shape(
     return [rows, *moments]
 
 
-def _upload(types: ArrayTypes, rows: Planes) -> list:
+def _upload(types: ArrayTypes, rows: Singles) -> list:
     """Copy values, moments and gradients of `Adan`, shape (5, R, N), to the device."""
     return [types.FloatX([upload(types.Float, row) for row in part]) for part in rows]
 
 
-def _download(parts: list) -> Planes:
+def _download(parts: list) -> Singles:
     """Copy the state of an optimiser to NumPy; the inverse of `_upload`."""
     return np.stack([dr.detach(part).numpy() for part in parts])
 
 
-def _split(array: Planes, axis: int) -> Iterator[Planes]:
+def _split(array: Singles, axis: int) -> Iterator[Singles]:
     """Yield groups of `GROUP_COMPONENTS` components, the last one padded with zeros.
 
     The padding remains 0, because a zero component with zero weights has no gradient.

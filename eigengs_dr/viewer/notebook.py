@@ -9,8 +9,8 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from ..eigenbasis.basis import Eigenbasis
 from ..eigenbasis.eigengs import EigenGS
-from ..eigenbasis.pca.basis import Eigenbasis
 from ..fitting.fit import Fit
 from ..gaussian.gaussians import Gaussians
 from ..image.resize import resample

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.types import ArrayLike
+from ..eigenbasis.basis import Eigenbasis
 from ..eigenbasis.eigengs import EigenGS
-from ..eigenbasis.pca.basis import Eigenbasis
-from ..eigenbasis.pca.truncation import CHANNELS
+from ..eigenbasis.truncation import CHANNELS
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.io import check_data, check_image, to_8bit

@@ -7,8 +7,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import eigengs_dr as eg
+from eigengs_dr.eigenbasis.basis import Eigenbasis
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
 
 
 def family(count=40, side=32, seed=0):

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis.basis import Eigenbasis
 from eigengs_dr.image.io import check_image
 from eigengs_dr.image.space import to_planes
 

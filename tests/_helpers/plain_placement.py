@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.codec.cells import hilbert_encode
+from eigengs_dr.codec.range_coder import hilbert_encode
 from eigengs_dr.fitting.placement.adaptive import MAX_STRETCH, RELATIVE_SIZE
 from eigengs_dr.fitting.placement.filters import TRUNCATION, Canvas
 from eigengs_dr.gaussian.covariance import factor_from_covariance

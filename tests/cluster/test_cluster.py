@@ -40,10 +40,9 @@ from eigengs_dr.cluster.executor import connect
 from eigengs_dr.cluster.local import local_cluster
 from eigengs_dr.cluster.worker import Shared, package_versions, run_task, share
 from eigengs_dr.collection.manifest import NAME, read_manifest
-from eigengs_dr.eigenbasis import training
-from eigengs_dr.eigenbasis.options import TrainOptions
-from eigengs_dr.eigenbasis.pca import stream
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis import incremental, training
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.components import TrainOptions
 from eigengs_dr.image.io import save_image
 
 
@@ -235,7 +234,7 @@ def test_importing_the_package_imports_no_dask():
 @pytest.fixture
 def images(monkeypatch):
     """Images for four shards; workers take the sizes from the tasks."""
-    monkeypatch.setattr(stream, "SHARD", 16)
+    monkeypatch.setattr(incremental, "SHARD", 16)
     return family(60)
 
 
@@ -259,12 +258,12 @@ def test_training(client, tmp_path, images, monkeypatch):
     settings = TrainOptions(size=SIZE, components=6, gaussians=40)
     stages = []
 
-    def progress(stage, done, total):
-        stages.append((stage, done, total))
+    def progress(done, total, row):
+        stages.append((row["stage"], done, total))
 
     monkeypatch.chdir(tmp_path)
-    far = training.train("photos", "a.npz", settings, progress=progress, client=client)
-    here = training.train(tmp_path / "photos", tmp_path / "b.npz", settings)
+    far = training.train_model("photos", "a.npz", settings, progress=progress, client=client)
+    here = training.train_model(tmp_path / "photos", tmp_path / "b.npz", settings)
     assert_same(far.basis, here.basis)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert ("components", 54, 54) in stages

@@ -6,14 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from eigengs_dr.codec.cells import (
+from eigengs_dr.codec.range_coder import (
     EVENNESS,
     MAX_LEVELS,
+    Decoder,
+    Encoder,
     code_cells,
     hilbert_encode,
     morton_encode,
 )
-from eigengs_dr.codec.range_coder import Decoder, Encoder
 
 
 def coded(cells, *arguments):

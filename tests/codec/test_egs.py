@@ -18,8 +18,8 @@ from _helpers.errors import file_refused
 from _helpers.packed import STEPS, peak
 from _helpers.sets import COUNT, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
+from eigengs_dr.codec.gaussian_model import MIN_RICH_COUNT
 from eigengs_dr.codec.quantization import Steps, Symbols, quantize
-from eigengs_dr.codec.weights import MIN_RICH_COUNT
 
 FILES = Path(__file__).parent / "files"
 
@@ -29,7 +29,7 @@ FILES = Path(__file__).parent / "files"
 @pytest.mark.parametrize(("version", "digest"), [(5, "707bbef3543e2775"), (6, "c1ec74c014406d83")])
 def test_stored_files_keep_their_numbers(version, digest):
     """All probabilities are the same to the last bit, in every version and on every machine."""
-    content = packed.read(FILES / f"version{version}.egs")
+    content = packed.read_egs(FILES / f"version{version}.egs")
     assert len(content.sections) == (1 if content.maps else 2)
     integers = np.column_stack(content.all_symbols()).astype("<i8")
     assert sha256(integers.tobytes()).hexdigest().startswith(digest)
@@ -53,9 +53,9 @@ def rows_of(symbols):
 def test_files_come_back(tmp_path_factory, scene, sections):
     path = tmp_path_factory.mktemp("any") / "x.egs"
     before = content(scene, sections=sections)
-    packed.write(path, before)
+    packed.write_egs(path, before)
     for count in (None, *range(1, len(sections) + 1)):
-        found = packed.read(path, count)
+        found = packed.read_egs(path, count)
         assert len(found.sections) == (count or len(sections))
         for one, other in zip(found.sections, before.sections, strict=False):
             assert rows_of(one) == rows_of(other)
@@ -69,13 +69,13 @@ def test_files_do_not_depend_on_the_order_of_splats(spread):
     scene = random_scene()
     scene = scene._replace(mean=scene.mean * spread)
     order = np.random.default_rng(1).permutation(COUNT)
-    assert packed.to_bytes(content(scene)) == packed.to_bytes(content(scene.permuted(order)))
+    assert packed.egs_bytes(content(scene)) == packed.egs_bytes(content(scene.permuted(order)))
 
 
 def test_equal_splats_take_few_bits():
     """Beside their places in cells and directions, which have no model: at least a byte."""
     same = Symbols(*(np.repeat(part[:1], 8000, axis=0) for part in content().sections[0]))
-    assert 8000 < len(packed.to_bytes(content()._replace(sections=[same]))) < 11000
+    assert 8000 < len(packed.egs_bytes(content()._replace(sections=[same]))) < 11000
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
@@ -83,14 +83,14 @@ def test_equal_splats_take_few_bits():
 def test_files_of_many_and_of_few_gaussians_come_back(path, count, channels):
     """They differ in what the model of the probabilities may use."""
     before = content(random_scene(0, count, (200, 200), channels), sections=(count,))
-    packed.write(path, before)
-    assert rows_of(packed.read(path).sections[0]) == rows_of(before.sections[0])
+    packed.write_egs(path, before)
+    assert rows_of(packed.read_egs(path).sections[0]) == rows_of(before.sections[0])
 
 
 def test_reading_stops_after_the_sections_that_are_asked_for(path):
     before = content(sections=(5, 9, COUNT - 14))
-    whole = packed.to_bytes(before)
-    first = len(packed.to_bytes(before._replace(sections=before.sections[:1])))
+    whole = packed.egs_bytes(before)
+    first = len(packed.egs_bytes(before._replace(sections=before.sections[:1])))
     path.write_bytes(whole)
     assert len(eg.Gaussians.load(path, sections=2)) == 14
     path.write_bytes(whole[: first + 40])
@@ -121,7 +121,7 @@ def check_refused(path, data, words=""):
 
 
 def test_files_cut_off_anywhere(path):
-    whole = packed.to_bytes(content(sections=(9, COUNT - 9)))
+    whole = packed.egs_bytes(content(sections=(9, COUNT - 9)))
     for length in range(0, len(whole), 3):
         check_refused(path, whole[:length])
     check_refused(path, whole + b"\0", "data follow")
@@ -132,7 +132,7 @@ def test_files_cut_off_anywhere(path):
 def test_files_with_damaged_bytes(tmp_path_factory, data):
     """The checksums find every change."""
     path = tmp_path_factory.mktemp("any") / "x.egs"
-    whole = bytearray(packed.to_bytes(content()))
+    whole = bytearray(packed.egs_bytes(content()))
     for _ in range(40):
         damaged = whole.copy()
         damaged[data.draw(st.integers(0, len(whole) - 1))] ^= data.draw(st.integers(1, 255))
@@ -142,7 +142,7 @@ def test_files_with_damaged_bytes(tmp_path_factory, data):
 def header(**changed):
     names = ["magic", "version", "space", "channels", "levels", "sections"]
     names += ["width", "height", "x", "y", *Steps._fields, "cutoff", "psnr"]
-    values = packed._HEADER.unpack(packed.to_bytes(content())[: packed._HEADER.size])
+    values = packed._HEADER.unpack(packed.egs_bytes(content())[: packed._HEADER.size])
     head = packed._HEADER.pack(*{**dict(zip(names, values, strict=True)), **changed}.values())
     channels = changed.get("channels", 3)
     head += np.zeros(channels, "<f4").tobytes()
@@ -150,7 +150,7 @@ def header(**changed):
 
 
 def body(splats=COUNT, data=None, length=None):
-    whole = packed.to_bytes(content())
+    whole = packed.egs_bytes(content())
     data = whole[len(header()) + packed.HEAD.size :] if data is None else data
     check = packed.section_check(splats, data)
     return packed.HEAD.pack(splats, len(data) if length is None else length, check) + data
@@ -213,7 +213,7 @@ def test_codes_of_any_bytes(tmp_path_factory, data, rich):
     for content in (data, PLAIN + data):
         path.write_bytes(header() + hostile(packed.RICH * rich, content))
         try:
-            found = packed.read(path)
+            found = packed.read_egs(path)
         except ValueError:
             continue
         assert len(found.sections[0].cell) == COUNT
@@ -230,7 +230,9 @@ def test_a_file_of_few_bytes_for_each_gaussian_is_refused_before_it_is_decoded(p
 
 def test_what_decoding_takes_is_what_the_bound_says(path):
     for channels in (1, 16):
-        packed.write(path, content(random_scene(0, 2000, (900, 900), channels), sections=(2000,)))
-        packed.read(path)  # which keeps tables
+        packed.write_egs(
+            path, content(random_scene(0, 2000, (900, 900), channels), sections=(2000,))
+        )
+        packed.read_egs(path)  # which keeps tables
         bound = packed.DECODING + packed.DECODING_CHANNEL * channels
-        assert 0.5 < peak(lambda: packed.read(path)) / (2000 * bound) < 1.5
+        assert 0.5 < peak(lambda: packed.read_egs(path)) / (2000 * bound) < 1.5

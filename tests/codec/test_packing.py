@@ -37,7 +37,7 @@ def test_the_budget_holds_and_is_used(receipts, budget):
     assert before - after == pytest.approx(receipt.psnr_drop, abs=1e-3)
     assert 0.7 * budget < before - after <= budget + 1e-3
     assert receipt.psnr == pytest.approx(after, abs=1e-3)
-    assert packed.read(file).psnr == np.float32(receipt.psnr)
+    assert packed.read_egs(file).psnr == np.float32(receipt.psnr)
     assert receipt.bytes == file.stat().st_size
     assert receipt.bits_per_pixel == 8 * receipt.bytes / 32**2
     np.testing.assert_array_equal(picture_of(found), picture_of(receipt.gaussians))
@@ -70,7 +70,7 @@ def test_without_an_image_the_rendering_is_kept(path):
     error = np.mean(np.square(np.subtract(*map(rgb_to_ycbcr, pictures))))
     assert 0.5 * ALLOWED < error <= 1.001 * ALLOWED
     assert receipt.psnr == pytest.approx(-10 * np.log10(error), abs=1e-2)
-    assert math.isnan(packed.read(path).psnr)
+    assert math.isnan(packed.read_egs(path).psnr)
 
 
 def test_light_is_compared_as_it_is_shown(path):

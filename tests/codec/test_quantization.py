@@ -8,7 +8,7 @@ from _helpers.log_shapes import factors_from_log_shapes
 from _helpers.packed import STEPS
 from _helpers.sets import few, scenes
 from eigengs_dr.codec import quantization as qz
-from eigengs_dr.codec.quantization import MAX_SYMBOL, Steps, precision, quantize
+from eigengs_dr.codec.quantization import MAX_SYMBOL, Quantizer, Steps, quantize
 from eigengs_dr.gaussian.covariance import log_shapes
 
 
@@ -23,7 +23,8 @@ def test_shapes_of_extreme_splats():
 @given(scenes())
 def test_rounding_moves_by_half_a_step(scene):
     symbols = quantize(scene._asdict(), STEPS)
-    found, q = qz.dequantize(symbols, STEPS), precision(symbols.color)
+    quantizer = Quantizer(symbols.color, STEPS.cell)
+    found, q = qz.dequantize(symbols, STEPS), quantizer.precision
     near, far = log_shapes(found["factor"]), log_shapes(scene.factor)
     long = [np.hypot(shape[:, 1], shape[:, 2]) for shape in (near, far)]
     assert (np.abs(near - far)[:, 0] * q <= 0.5 * qz.SCALE_STEP + 1e-4 * q).all()
@@ -31,7 +32,7 @@ def test_rounding_moves_by_half_a_step(scene):
     a, b, c = found["factor"].T
     x, y = (found["mean"] - scene.mean).T
     # A mean in a cell without a grid is half a cell off; otherwise half a step of F m.
-    grid = qz.parts_of(found["factor"], q, STEPS.cell)
+    grid = quantizer.parts(found["factor"])
     for away, side, parts in ((a * x + b * y, a, grid[:, 0]), (c * y, c, grid[:, 1])):
         assert (np.abs(away) <= 0.5 * STEPS.cell * side / parts * 1.01 + 1e-3 * side).all()
     unit = STEPS.color * np.exp(far[:, :1])

@@ -8,10 +8,15 @@ from _helpers.command import said
 from _helpers.errors import file_refused
 from _helpers.families import family, fidelity, rendered, small_basis, small_model, splits
 from _helpers.sets import check_equal
-from eigengs_dr.eigenbasis import model_file as modelfile
+from eigengs_dr.eigenbasis.files import (
+    MODEL_FORMAT,
+    MODEL_LAYOUT,
+    MODEL_VERSION,
+    model_arrays,
+)
 from eigengs_dr.storage import npz as archive
 
-FLOATS = [key for key, field in modelfile.LAYOUT.items() if field.kind[0] == "f"]
+FLOATS = [key for key, field in MODEL_LAYOUT.items() if field.kind[0] == "f"]
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +26,7 @@ def model(trained):
 
 @pytest.fixture(scope="module")
 def members(model):
-    return modelfile.to_members(model)
+    return model_arrays(vars(model))
 
 
 @pytest.fixture
@@ -34,7 +39,7 @@ def check_refused(path, words=""):
         eg.EigenGS.load(path)
 
 
-def write(path, members, version=modelfile.VERSION, name=modelfile.FORMAT):
+def write(path, members, version=MODEL_VERSION, name=MODEL_FORMAT):
     archive.write(path, name, version, members)
 
 
@@ -145,9 +150,9 @@ def test_truncated_and_other_files(model, members, path):
     for share in (0, 1e-3, 0.3, 0.7, 0.99):
         path.write_bytes(content[: int(share * len(content))])
         check_refused(path)
-    write(path, members, version=modelfile.VERSION + 1)
+    write(path, members, version=MODEL_VERSION + 1)
     check_refused(path, "upgrade")
-    write(path, members, version=modelfile.VERSION - 1)
+    write(path, members, version=MODEL_VERSION - 1)
     check_refused(path, "make the file again")
     model.gaussians.save(path)
     check_refused(path, "format is 'eigengs_dr.gaussians'")

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from _helpers.photos import SMALL, random_fields
-from eigengs_dr.eigenbasis import training
+from eigengs_dr.backend.interrupts import Interrupted
+from eigengs_dr.eigenbasis import incremental, training
+from eigengs_dr.eigenbasis.components import TrainOptions
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.eigenbasis.options import TrainOptions
-from eigengs_dr.eigenbasis.pca import stream
-from eigengs_dr.eigenbasis.training import Interrupted, train
+from eigengs_dr.eigenbasis.training import train_model
 from eigengs_dr.image.io import ImageError
 
 
@@ -30,8 +30,11 @@ def checkpoint_of(output):
 
 def test_end_to_end(folder, output):
     stages = []
-    trained = train(
-        folder, output, settings(), progress=lambda stage, *counts: stages.append((stage, *counts))
+    trained = train_model(
+        folder,
+        output,
+        settings(),
+        progress=lambda done, total, row: stages.append((row["stage"], done, total)),
     )
     figures = trained.figures
     assert (figures["images"], figures["components"], figures["gaussians"]) == (22, [6] * 3, 60)
@@ -57,7 +60,7 @@ def test_end_to_end(folder, output):
     ids=lambda changed: " ".join(changed),
 )
 def test_other_settings(folder, output, changed):
-    figures = train(folder, output, settings(**changed)).figures
+    figures = train_model(folder, output, settings(**changed)).figures
     assert figures["psnr_solved"] > figures["psnr_init"] > 15
     assert figures["frequency_aware"] == changed.get("frequency_aware", False)
     assert (figures["components"][0] < 6) == ("energy" in changed)
@@ -68,26 +71,26 @@ def test_a_model_that_cannot_be_written(folder, output):
     """The work is kept."""
     output.mkdir()
     with pytest.raises(OSError, match=r"model\.npz"):
-        train(folder, output, settings())
+        train_model(folder, output, settings())
     assert {path.name for path in output.parent.iterdir()} == {
         "model.npz",
         "model.npz.checkpoint",
         "photos",
     }
     output.rmdir()
-    assert train(folder, output, settings()).figures["resumed"]
+    assert train_model(folder, output, settings()).figures["resumed"]
 
 
 def test_no_folder_to_write_into(folder, tmp_path):
     with pytest.raises(OSError, match="gone"):
-        train(folder, tmp_path / "gone" / "model.npz", settings())
+        train_model(folder, tmp_path / "gone" / "model.npz", settings())
 
 
 def test_unreadable_images_are_skipped(folder, output):
     for name in ("003.png", "009.png"):  # one to train on, one held out
         (folder / name).write_bytes(b"no picture")
     with pytest.warns(UserWarning) as notes:
-        figures = train(folder, output, settings()).figures
+        figures = train_model(folder, output, settings()).figures
     told = [str(note.message) for note in notes]
     assert "1 of 22 images were skipped: 003.png" in told[0]
     assert "1 of 2 held-out images were skipped" in told[1]
@@ -99,20 +102,20 @@ def test_nothing_but_unreadable_images(folder, output):
     for path in folder.iterdir():
         path.write_bytes(b"no picture")
     with pytest.raises(ImageError, match="none of 22 images"):
-        train(folder, output, settings())
+        train_model(folder, output, settings())
     assert list(output.parent.iterdir()) == [folder]
 
 
 def test_images_of_other_sizes(folder, output):
     with pytest.warns(UserWarning, match="resized to 20x12"):
-        figures = train(folder, output, settings(size=(20, 12))).figures
+        figures = train_model(folder, output, settings(size=(20, 12))).figures
     assert figures["psnr_solved"] > figures["psnr_init"] > 15
     assert EigenGS.load(output).mean_image.shape == (3, 12, 20)
 
 
 @pytest.mark.parametrize("count", [1, 4])
 def test_fewer_splats_than_components(folder, output, count):
-    assert train(folder, output, settings(gaussians=count)).figures["psnr_solved"] > 10
+    assert train_model(folder, output, settings(gaussians=count)).figures["psnr_solved"] > 10
 
 
 @pytest.mark.parametrize(
@@ -142,7 +145,9 @@ def test_wrong_settings_are_refused(changed, words):
 def test_train_to_a_target(trained, tmp_path):
     folder, full = trained
     target = float(full.model.held_out[8]) - 1e-6
-    result = train(folder / "photos", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=target))
+    result = train_model(
+        folder / "photos", tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=target)
+    )
     counts = result.basis.truncation_curve().counts[-1]
     assert counts.tolist() == full.basis.truncation_curve().counts[8].tolist()
     np.testing.assert_allclose(result.model.held_out, full.model.held_out[:9], atol=1e-6)
@@ -154,14 +159,14 @@ def test_train_without_images_for_a_target(tmp_path):
     photos = random_fields(tmp_path / "few", 5)
     with pytest.raises(ValueError, match="needs held-out images"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        train(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20))
+        train_model(photos, tmp_path / "m.npz", TrainOptions(**SMALL, target_psnr=20))
     assert [path.name for path in tmp_path.iterdir()] == ["few"]
 
 
 @pytest.fixture
 def in_pieces(monkeypatch):
     """Shards of five images, and a checkpoint of every state of the shapes."""
-    monkeypatch.setattr(stream, "SHARD", 5)
+    monkeypatch.setattr(incremental, "SHARD", 5)
     monkeypatch.setattr(training, "SAVE_SECONDS", 0)
 
 
@@ -180,9 +185,9 @@ def killed_at(stage, call):
     """Progress that ends a training at the n-th report of a stage."""
     seen = []
 
-    def progress(found, done, total):
-        seen.append(found)
-        if found == stage and seen.count(stage) == call:
+    def progress(done, total, row):
+        seen.append(row["stage"])
+        if row["stage"] == stage and seen.count(stage) == call:
             raise Killed
 
     return progress
@@ -191,7 +196,7 @@ def killed_at(stage, call):
 def kill(folder, output, stage, call=1, **changed):
     """Train until a stage, and no further."""
     with pytest.raises(Killed):
-        train(folder, output, settings(**changed), progress=killed_at(stage, call))
+        train_model(folder, output, settings(**changed), progress=killed_at(stage, call))
     assert not output.exists()
 
 
@@ -220,34 +225,33 @@ STOPS = [
 )
 def test_killed_in_every_stage(folder, output, tmp_path, in_pieces, changed, more_stops):
     changed = changed | LONG
-    train(folder, tmp_path / "whole.npz", settings(**changed))
+    train_model(folder, tmp_path / "whole.npz", settings(**changed))
     for stage, call in [*STOPS, *more_stops, ("measure", 2)]:
         kill(folder, output, stage, call, **changed)
         assert checkpoint_of(output).exists() == ((stage, call) != STOPS[0])
-    assert train(folder, output, settings(**changed)).figures["resumed"]
+    assert train_model(folder, output, settings(**changed)).figures["resumed"]
     assert_same_models(tmp_path / "whole.npz", output)
     assert not checkpoint_of(output).exists()
 
 
 def test_killed_by_the_system(folder, output, tmp_path, in_pieces):
-    train(folder, tmp_path / "whole.npz", settings(**LONG))
+    train_model(folder, tmp_path / "whole.npz", settings(**LONG))
     script = f"""
 import os, signal
-from eigengs_dr.eigenbasis import training
-from eigengs_dr.eigenbasis.pca import stream
-stream.SHARD, training.SAVE_SECONDS = 5, 0
+from eigengs_dr.eigenbasis import incremental, training
+incremental.SHARD, training.SAVE_SECONDS = 5, 0
 seen = []
-def progress(stage, done, total):
-    seen.append(stage)
+def progress(done, total, row):
+    seen.append(row["stage"])
     if seen.count("shapes") == 3:
         os.kill(os.getpid(), signal.SIGKILL)
-training.train(
+training.train_model(
     {str(folder)!r}, {str(output)!r}, training.{settings(**LONG)!r}, None, progress)
 """
     process = subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parents[2])
     assert process.returncode == -signal.SIGKILL
     assert not output.exists()
-    assert train(folder, output, settings(**LONG)).figures["resumed"]
+    assert train_model(folder, output, settings(**LONG)).figures["resumed"]
     assert_same_models(tmp_path / "whole.npz", output)
 
 
@@ -258,17 +262,18 @@ training.train(
 def test_ctrl_c(folder, output, in_pieces, stage, call, kept):
     seen = []
 
-    def press(found, done, total):
-        seen.append(found)
-        if found == stage and seen.count(stage) == call:
+    def press(done, total, row):
+        seen.append(row["stage"])
+        if row["stage"] == stage and seen.count(stage) == call:
             os.kill(os.getpid(), signal.SIGINT)
 
     advice = "repeat the command to continue" if kept else "nothing is saved"
-    with pytest.raises(Interrupted, match=advice):
-        train(folder, output, settings(**LONG), progress=press)
+    with pytest.raises(Interrupted, match=advice) as stopped:
+        train_model(folder, output, settings(**LONG), progress=press)
+    assert stopped.value.result == (checkpoint_of(output) if kept else None)
     assert checkpoint_of(output).exists() == kept
     assert not output.exists()
-    assert train(folder, output, settings(**LONG)).figures["resumed"] == kept
+    assert train_model(folder, output, settings(**LONG)).figures["resumed"] == kept
 
 
 @pytest.mark.parametrize(
@@ -283,18 +288,18 @@ def test_other_settings_than_the_checkpoint(folder, output, in_pieces, other, ch
     kill(folder, output, "weights", **LONG)
     (folder.parent / "000.png").write_bytes((folder / "000.png").read_bytes())
     with pytest.raises(ValueError, match=words) as caught:
-        train(folder.parent / other, output, settings(**{**LONG, **changed}))
+        train_model(folder.parent / other, output, settings(**{**LONG, **changed}))
     assert str(checkpoint_of(output)) in str(caught.value)
     assert "delete" in str(caught.value)
-    assert train(folder, output, settings(**LONG)).figures["resumed"]
+    assert train_model(folder, output, settings(**LONG)).figures["resumed"]
 
 
 def test_a_folder_that_grew_meanwhile(folder, output, tmp_path, in_pieces):
-    train(folder, tmp_path / "whole.npz", settings())
+    train_model(folder, tmp_path / "whole.npz", settings())
     kill(folder, output, "components", 8)
     (folder / "000a.png").write_bytes((folder / "003.png").read_bytes())
     with pytest.warns(UserWarning, match="the original 24"):
-        train(folder, output, settings())
+        train_model(folder, output, settings())
     assert_same_models(tmp_path / "whole.npz", output)
 
 
@@ -313,14 +318,14 @@ def test_damaged_checkpoint(folder, output, in_pieces, stage, call, name):
     for damaged in (b"", content[: len(content) // 2]):
         file.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"model\.npz\.checkpoint") as caught:
-            train(folder, output, settings(**LONG))
+            train_model(folder, output, settings(**LONG))
         assert "\n" not in str(caught.value)
 
 
 def test_a_file_in_place_of_the_checkpoint(folder, output):
     checkpoint_of(output).write_text("mine")
     with pytest.raises(ValueError, match="not a readable checkpoint"):
-        train(folder, output, settings())
+        train_model(folder, output, settings())
     assert checkpoint_of(output).read_text() == "mine"
 
 
@@ -328,8 +333,8 @@ def test_only_unreadable_images_are_left(folder, output, tmp_path, in_pieces):
     for path in sorted(folder.iterdir())[8:]:
         path.write_bytes(b"no picture")
     with pytest.warns(UserWarning, match="skipped"):
-        train(folder, tmp_path / "whole.npz", settings())
+        train_model(folder, tmp_path / "whole.npz", settings())
     kill(folder, output, "components", 12)
     with pytest.warns(UserWarning, match="skipped"):
-        train(folder, output, settings())
+        train_model(folder, output, settings())
     assert_same_models(tmp_path / "whole.npz", output)

@@ -15,10 +15,8 @@ from eigengs_dr.fitting.optimizer import Adam
 from eigengs_dr.fitting.place import Adaptive, Grid, gaussians_at
 from eigengs_dr.fitting.variables import Relative
 from eigengs_dr.paper.adan import Adan
-from eigengs_dr.paper.cholesky import Cholesky
 from eigengs_dr.paper.eigengs import EIGENGS, EigenGSMethod
-from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
-from eigengs_dr.paper.placement import RandomColors
+from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE, Cholesky, RandomColors
 
 NAMES = {
     value.__name__: value

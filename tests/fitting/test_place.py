@@ -15,7 +15,7 @@ from eigengs_dr.fitting.place import (
     grid_of,
     random_shapes,
 )
-from eigengs_dr.paper.placement import RandomColors
+from eigengs_dr.paper.gaussianimage import RandomColors
 
 places = pytest.mark.parametrize("place", [Adaptive(), Grid(), Random(), RandomColors()], ids=repr)
 

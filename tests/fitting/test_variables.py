@@ -11,7 +11,7 @@ from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.variables import Relative
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
-from eigengs_dr.paper.cholesky import CHOLESKY_BOUND, MIN_DIAGONAL, Cholesky
+from eigengs_dr.paper.gaussianimage import CHOLESKY_BOUND, MIN_DIAGONAL, Cholesky
 
 RELATIVE, CHOLESKY = Relative(), Cholesky()
 both = pytest.mark.parametrize("coordinates", [RELATIVE, CHOLESKY], ids=["relative", "cholesky"])

@@ -11,8 +11,8 @@ from sklearn.decomposition import PCA
 
 from _helpers.errors import one_line
 from _helpers.low_rank import HEIGHT, PIXELS, SIZE, WIDTH, basis_of, family, planes
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
-from eigengs_dr.eigenbasis.pca.incremental import empty_state, merge
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.incremental import empty_state, merge
 from eigengs_dr.image.io import ImageError
 from eigengs_dr.image.resize import resample
 

@@ -8,8 +8,9 @@ import pytest
 
 from _helpers.low_rank import SIZE, family
 from eigengs_dr.backend.executor import Done
-from eigengs_dr.eigenbasis.pca import incremental, stream
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis import incremental
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.incremental import Stream, find_states
 from eigengs_dr.image.io import ImageError, save_image
 
 
@@ -28,13 +29,14 @@ class Backwards:
             yield Done(task, function(task, shared))
 
 
-def find(images, components=20, **options):
+def find(images, components=20, progress=None, **options):
     ranks = [incremental.rank_for(components)] * 3
-    return stream.find_states(images, SIZE, "ycbcr", ranks, **options)
+    stream = Stream(SIZE, "ycbcr", ranks, incremental.block_length(SIZE), progress)
+    return find_states(images, stream, **options)
 
 
 def assert_same_states(first, second):
-    np.testing.assert_equal([s.arrays() for s in second], [s.arrays() for s in first])
+    np.testing.assert_equal([vars(s) for s in second], [vars(s) for s in first])
 
 
 @pytest.mark.parametrize("number", [20, 21, 40, 59, 61, 101, 139])

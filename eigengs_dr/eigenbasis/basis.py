@@ -9,19 +9,17 @@ from operator import index
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...backend.doors import shows_progress, takes_numbers
-from ...backend.messages import to_html, warn
-from ...backend.types import ArrayLike
-from ...image.folder import TrainingImages
-from ...image.io import check_image
-from ...image.pixels import check_size
-from ...image.resize import resample
-from ...image.space import space_of, to_planes
-from .basis_file import ENERGY_TOLERANCE, read_basis, write_basis
-from .incremental import orient, rank_for
-from .stream import find_states
+from ..backend.doors import shows_progress, takes_numbers
+from ..backend.messages import to_html, warn
+from ..backend.types import ArrayLike, Doubles, Singles
+from ..image.folder import TrainingImages
+from ..image.io import check_image
+from ..image.pixels import check_size
+from ..image.resize import resample
+from ..image.space import space_of, to_planes
+from .files import ENERGY_TOLERANCE, read_basis, write_basis
+from .incremental import Stream, block_length, find_states, orient, rank_for
 from .truncation import (
     CHANNELS,
     TruncationCurve,
@@ -57,10 +55,10 @@ class Eigenbasis:
         Colour space of the C = 3 channels.
     """
 
-    mean: NDArray[np.float32]
-    components: tuple[NDArray[np.float32], ...]
-    eigenvalues: tuple[NDArray[np.float64], ...]
-    variance: NDArray[np.float64]
+    mean: Singles
+    components: tuple[Singles, ...]
+    eigenvalues: tuple[Doubles, ...]
+    variance: Doubles
     count: int
     space: str
 
@@ -126,7 +124,8 @@ class Eigenbasis:
         """
         size, limits = check_size(size), check_components(components, energy)
         ranks = [rank_for(k) for k in limits]
-        states = find_states(images, size, space, ranks, progress, client, checkpoint)
+        stream = Stream(size, space, ranks, block_length(size), progress)
+        states = find_states(images, stream, client, checkpoint)
         count, shape = states[0].count, (size[1], size[0])
         if energy is None and count <= max(limits):
             images_give = "1 image gives" if count == 1 else f"{count} images give"
@@ -160,7 +159,7 @@ class Eigenbasis:
         """Height in pixels."""
         return self.mean.shape[1]
 
-    def project(self, image: ArrayLike) -> tuple[NDArray[np.float32], ...]:
+    def project(self, image: ArrayLike) -> tuple[Singles, ...]:
         """Return the coefficients w_j of an image, a tuple of C float32 arrays of shape (k_c,).
 
         The image, (H, W, 3), (H, W, 1) or (H, W), may have any size and is resampled to the basis.
@@ -168,7 +167,7 @@ class Eigenbasis:
         """
         return self._coefficients(self._centred(image))
 
-    def reconstruct(self, coefficients: Sequence[ArrayLike]) -> NDArray[np.float32]:
+    def reconstruct(self, coefficients: Sequence[ArrayLike]) -> Singles:
         """Return the image for C arrays of coefficients, shape (k_c,), as `project` returns them.
 
         The image is RGB, not clamped, float32, shape (H, W, 3). The method raises ValueError unless
@@ -181,7 +180,7 @@ class Eigenbasis:
         pairs = zip(weights, self.components, strict=True)
         return _rgb(self.mean + np.stack([np.tensordot(w, c, 1) for w, c in pairs]), self.space)
 
-    def energy(self) -> tuple[NDArray[np.float64], ...]:
+    def energy(self) -> tuple[Doubles, ...]:
         """Return the share of the variance of the first 1, 2, ..., k_c components.
 
         The result is a tuple of C float64 arrays of shape (k_c,), ascending, at most 1.
@@ -222,7 +221,7 @@ class Eigenbasis:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
-        write_basis(path, self)
+        write_basis(path, vars(self))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Eigenbasis:
@@ -238,17 +237,17 @@ class Eigenbasis:
         """
         return cls(**read_basis(path))
 
-    def _centred(self, image: ArrayLike) -> NDArray[np.float32]:
+    def _centred(self, image: ArrayLike) -> Singles:
         """Resample and convert an image, and subtract the mean; shape (C, H, W)."""
         pixels = resample(check_image(image), self.width, self.height)
         planes = to_planes(pixels, self.space) - self.mean.reshape(len(self.mean), -1)
         return planes.reshape(self.mean.shape)
 
-    def _coefficients(self, planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+    def _coefficients(self, planes: Singles) -> tuple[Singles, ...]:
         pairs = zip(self.components, planes, strict=True)
         return tuple(np.tensordot(components, plane) for components, plane in pairs)
 
-    def _residuals(self, image: ArrayLike) -> list[NDArray[np.float64]]:
+    def _residuals(self, image: ArrayLike) -> list[Doubles]:
         """Return the squared error of each channel after 0, 1, ..., k_c components."""
         planes = self._centred(image)
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
@@ -256,7 +255,7 @@ class Eigenbasis:
         return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
 
 
-def _rgb(planes: NDArray[np.float32], space: str) -> NDArray[np.float32]:
+def _rgb(planes: Singles, space: str) -> Singles:
     """Convert planes (C, H, W) of a colour space to RGB (H, W, 3)."""
     image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
     return np.asarray(space_of(space).decode_image(image))

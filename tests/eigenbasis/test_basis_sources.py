@@ -7,7 +7,7 @@ import pytest
 
 from _helpers.errors import one_line
 from _helpers.low_rank import SIZE, assert_same, family
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis.basis import Eigenbasis
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.io import check_image, save_image
 

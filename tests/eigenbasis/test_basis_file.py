@@ -6,8 +6,8 @@ import pytest
 from _helpers.errors import file_refused
 from _helpers.files import members_of
 from _helpers.low_rank import HEIGHT, WIDTH, assert_same, basis_of
-from eigengs_dr.eigenbasis.pca import basis_file as basisfile
-from eigengs_dr.eigenbasis.pca.basis import Eigenbasis
+from eigengs_dr.eigenbasis.basis import Eigenbasis
+from eigengs_dr.eigenbasis.files import BASIS_FORMAT, BASIS_VERSION
 from eigengs_dr.storage import npz as archive
 
 
@@ -53,7 +53,7 @@ def test_files_that_do_not_fit_together(tmp_path, changed, complaint):
     path = tmp_path / "a.npz"
     basis_of("rgb").save(path)
     arrays = {k: v for k, v in (members_of(path) | changed).items() if v is not None}
-    archive.write(path, basisfile.FORMAT, basisfile.VERSION, arrays)
+    archive.write(path, BASIS_FORMAT, BASIS_VERSION, arrays)
     with file_refused(path, complaint):
         Eigenbasis.load(path)
 

@@ -5,9 +5,8 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, small_basis, small_model, splits
-from eigengs_dr.eigenbasis.components.solve import fit_model
+from eigengs_dr.eigenbasis.components import TrainOptions, fit_model
 from eigengs_dr.eigenbasis.normal_equations import NormalEquations
-from eigengs_dr.eigenbasis.options import TrainOptions
 
 
 @splits
@@ -63,7 +62,9 @@ def test_bands_start_apart(backend):
     options = TrainOptions(
         (SIDE, SIDE), gaussians=20, frequency_aware=True, preset="eigengs", iterations=1
     )
-    fit_model(small_basis(), options, backend, save=lambda states: seen.append(states[-1]))
+    fit_model(
+        small_basis(), options, backend, after_round=lambda states, *_: seen.append(states[-1])
+    )
     first, second = (state["rows"][0, :5, :2] for state in seen)
     assert not np.array_equal(first, second)
 

@@ -7,11 +7,11 @@ import pytest
 from _helpers.reference import render_plain
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.backend.selection import select
-from eigengs_dr.eigenbasis.components.bands import FrequencyBand
 from eigengs_dr.gaussian.gaussians import Gaussians
 from eigengs_dr.paper.joint_training import (
     HALVING_STEPS,
     RATE,
+    Band,
     decode_shapes,
     joint_shapes,
     joint_weights,
@@ -41,7 +41,7 @@ def band(counts=COUNTS, seed=0, splats=SPLATS):
         np.array([wave(c) for _ in range(k)], np.float32).reshape(k, HEIGHT, WIDTH)
         for c, k in enumerate(counts)
     )
-    return FrequencyBand(splats, planes, tuple(np.ones(k) for k in counts))
+    return Band(splats, planes)
 
 
 def train(backend, steps, waves=None, state=None):

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 import eigengs_dr as eg
 from _helpers.families import family, fidelity, small_basis
-from eigengs_dr.eigenbasis.pca.truncation import (
+from eigengs_dr.eigenbasis.truncation import (
     curve_from_eigenvalues,
     curve_from_residuals,
     min_ranks_per_channel,

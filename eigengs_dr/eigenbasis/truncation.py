@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.messages import warn
-from ...backend.types import Doubles
+from ..backend.messages import warn
+from ..backend.types import Doubles
 
 MIN_MSE = 1e-12
 """Lower bound of mean squared errors, 120 dB; smaller errors are rounding of single precision."""
@@ -180,7 +180,7 @@ def check_target(target_psnr: float) -> None:
         raise ValueError(f"target_psnr is {target_psnr}; expected a number above 0, in dB")
 
 
-def _decibels(error: NDArray[np.float64] | float) -> Doubles:
+def _decibels(error: Doubles | float) -> Doubles:
     return -10 * np.log10(np.maximum(error, MIN_MSE))
 
 
