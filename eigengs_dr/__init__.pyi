@@ -3,12 +3,10 @@
 from . import paper as paper
 from . import plugins as plugins
 from .backend.executor import ClusterError
+from .backend.interrupts import Interrupted
 from .backend.recording import exclusive
 from .backend.selection import BackendError
-from .blocks.fit_large import LargeFit, fit_large
 from .codec.packing import pack
-from .collection.fit_many import fit_many
-from .collection.manifest import ImageRow, RunInterrupted
 from .eigenbasis.eigengs import EigenGS
 from .eigenbasis.pca.basis import Eigenbasis
 from .fitting.coarse import COARSE_TO_FINE, Coarse
@@ -21,6 +19,9 @@ from .gaussian.gaussians import Gaussians, concatenate, from_tensors, to_tensors
 from .image.io import load_image, sample, save_image
 from .image.metrics import ms_ssim, psnr, ssim
 from .image.pixels import ImageError
+from .many.fit_large import LargeFit, fit_large
+from .many.fit_many import fit_many
+from .many.manifest import ImageRow
 from .plugins import register_plugins
 from .raster.render import picture_of, render, tile_lists
 from .scene.convert import convert_scene
@@ -42,11 +43,11 @@ __all__ = [
     "Goal",
     "ImageError",
     "ImageRow",
+    "Interrupted",
     "LargeFit",
     "Loss",
     "Map",
     "Method",
-    "RunInterrupted",
     "concatenate",
     "convert_scene",
     "exclusive",

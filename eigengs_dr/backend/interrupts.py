@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 NAME = "eigengs-dr"
 """Name of the program; every line on standard error starts with it."""
@@ -34,6 +35,21 @@ Handler = Callable[[int, FrameType | None], object] | int | None
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Signals that ask a program to end: Ctrl-C sends SIGINT, schedulers and ``kill`` send SIGTERM."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """The error of a call that Ctrl-C or SIGTERM ended between two steps or pieces.
+
+    Attributes
+    ----------
+    result : Any
+        What the call has done: the rows of `eigengs_dr.fit_many`, or the row of
+        `eigengs_dr.fit_large`, whose status is the stage and whose blocks are in its folder.
+    """
+
+    def __init__(self, result: Any, message: str) -> None:
+        super().__init__(message)
+        self.result = result
 
 
 def is_program() -> bool:

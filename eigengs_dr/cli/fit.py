@@ -249,8 +249,8 @@ def _method(preset: str, init: str | None) -> Method:
 
 def _default_count(path: Path | str) -> int:
     """Return the default number of Gaussians for an image, from the header of its file."""
-    from ..blocks.windows import image_size
     from ..fitting.options import DEFAULT_COUNT, default_count
+    from ..many.windows import image_size
 
     size = image_size(path)
     return DEFAULT_COUNT if size is None else default_count(size[0] * size[1])
@@ -464,8 +464,8 @@ def _fit_several(
             rows = eg.fit_many(
                 files, folder, overwrite=overwrite, progress=note, client=client, **given
             )
-        except eg.RunInterrupted as stop:
-            rows = stop.rows
+        except eg.Interrupted as stop:
+            rows = stop.result
             done = f"{len(rows)} of {len(files)} images are done"
             print_message(f"interrupted; {done}; repeat the command to fit the others")
     space, seconds = settings.space or "ycbcr", time.perf_counter() - started
@@ -553,7 +553,7 @@ def _check_memory(
     ValueError
         If this process may not use enough memory.
     """
-    from ..blocks.windows import image_size
+    from ..many.windows import image_size
     from . import memory
 
     size = image_size(path)
@@ -579,14 +579,14 @@ def _fit_by_blocks(
     choices = {name: getattr(settings, name) for name in names}
     with bar(run.quiet) as show:
 
-        def progress(done: int, total: int, row: Record) -> None:
-            show(f"{Path(path).name}: {row['stage']}", done, total)
+        def progress(done: int, total: int, row: eg.ImageRow) -> None:
+            show(f"{Path(path).name}: {row.status}", done, total)
 
         try:
             result = eg.fit_large(
                 path, output, block=side, progress=progress, client=client, **choices
             )
-        except KeyboardInterrupt:
+        except eg.Interrupted:
             print_message(
                 f"interrupted; finished blocks are in {output}.checkpoint; repeat the command to "
                 "continue"

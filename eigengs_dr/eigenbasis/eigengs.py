@@ -28,9 +28,8 @@ from .model_file import read_members, write_model
 from .pca.truncation import TruncationCurve, curve_from_eigenvalues, name_components
 
 if TYPE_CHECKING:  # training, encoding and runs over many images are imported on demand
-    from ..collection.manifest import ImageRow
-    from ..collection.sources import Images
     from ..image.folder import TrainingImages
+    from ..many.manifest import ImageRow, Images
     from .encoder import Encoder
     from .pca.basis import Eigenbasis
 
@@ -276,11 +275,11 @@ class EigenGS:
 
         Raises
         ------
-        ValueError, OSError, RunInterrupted
+        ValueError, OSError, Interrupted
             See `encode` and `eigengs_dr.fit_many`.
         """
-        from ..collection.manifest import fingerprint
-        from ..collection.run import Job, run_images
+        from ..many.manifest import fingerprint
+        from ..many.run import Job, run_images
         from .encoder import check_encoding
 
         check_encoding(colors, mean, target_psnr)

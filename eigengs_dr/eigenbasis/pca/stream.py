@@ -21,7 +21,7 @@ import numpy as np
 from ...backend.executor import completed
 from ...backend.messages import warn
 from ...backend.types import Values
-from ...cluster.client import executor_for
+from ...cluster import executor_for
 from ...image.folder import ReadProgress, TrainingImages, list_images, read_blocks
 from ...image.pixels import ImageError
 from ...image.remote import is_url
