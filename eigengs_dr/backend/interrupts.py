@@ -38,13 +38,12 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
-    """The error of a call that Ctrl-C or SIGTERM ended between two steps or pieces.
+    """Ctrl-C or SIGTERM ended a call between two steps.
 
     Attributes
     ----------
-    result : Any
-        What the call has done: the rows of `eigengs_dr.fit_many`, or the row of
-        `eigengs_dr.fit_large`, whose status is the stage and whose blocks are in its folder.
+    result : object
+        What the call has finished; its documentation says of which type.
     """
 
     def __init__(self, result: Any, message: str) -> None:

@@ -79,43 +79,25 @@ class BlockSettings(NamedTuple):
         return self.options.space or "ycbcr"
 
 
-class PlaceTask(NamedTuple):
-    """A block whose Gaussians are to be placed.
+class BlockTask(NamedTuple):
+    """The work on a block.
 
     Attributes
     ----------
     window : Window
-        The pixels.
+        The pixels: those of the window of the block, or of its core to measure errors.
     block : Block
-    gaussians : int
-        From 1 to the number of pixels of the core.
-    old : dict of str to ndarray, or None
-        The density according to a fit: mean (N, 2) and factor (N, 3) of the Gaussians in the
-        window, in pixels of the window, and the ratio (N, 1), see
-        `eigengs_dr.fitting.placement.density.density_ratio`. By default the density depends on
+    arrays : dict of str to ndarray of float32, or None
+        Gaussians in pixels of `window`. A fit begins with mean (N, 2) and factor (N, 3) of those
+        whose means lie in the window, and optionally their color (N, C); otherwise the initial
+        colours are solved for. A placement takes the density of an earlier fit, if there is one:
+        mean, factor, and the ratio (N, 1), see
+        `eigengs_dr.fitting.placement.density.density_ratio`; otherwise the density depends on
         second derivatives only.
-    """
-
-    window: Window
-    block: Block
-    gaussians: int = 0
-    old: Arrays | None = None
-
-
-class FitTask(NamedTuple):
-    """A block whose Gaussians are to be fitted.
-
-    Attributes
-    ----------
-    window : Window
-        The pixels.
-    block : Block
-    arrays : dict of str to ndarray of float32
-        Initial mean (N, 2) and factor (N, 3) of the Gaussians whose means lie in the window, in
-        pixels of the window, and optionally their color (N, C); otherwise the initial colours are
-        solved for.
+    gaussians : int
+        Number of Gaussians to place, from 1 to the number of pixels of the core.
     members : slice
-        The Gaussians that belong to the block.
+        The Gaussians of a fit that belong to the block.
     fixed : dict of str to ndarray, or None
         Mean, factor and color of other Gaussians that touch the window.
     iterations : int
@@ -126,14 +108,15 @@ class FitTask(NamedTuple):
 
     window: Window
     block: Block
-    arrays: Arrays
-    members: slice
-    fixed: Arrays | None
-    iterations: int
-    part: range
+    arrays: Arrays | None = None
+    gaussians: int = 0
+    members: slice = slice(0)
+    fixed: Arrays | None = None
+    iterations: int = 0
+    part: range = range(0)
 
 
-def measure_extent(task: PlaceTask, settings: BlockSettings) -> Extent:
+def measure_extent(task: BlockTask, settings: BlockSettings) -> Extent:
     """Return the extent of the values of a block, and reject invalid pixels."""
     pixels, space = task.window.read()[task.block.core], settings.space
     bright = BRIGHT.get(space)
@@ -144,7 +127,7 @@ def measure_extent(task: PlaceTask, settings: BlockSettings) -> Extent:
     return Extent.of(values_in(pixels, space))
 
 
-def survey(task: PlaceTask, settings: BlockSettings) -> NDArray[np.float64]:
+def survey(task: BlockTask, settings: BlockSettings) -> NDArray[np.float64]:
     """Return the number of Gaussians that a block needs, relative to others, and its sums.
 
     These are the integral of the density over the core, and the sum of the values of each channel.
@@ -157,7 +140,7 @@ def survey(task: PlaceTask, settings: BlockSettings) -> NDArray[np.float64]:
     return np.append(_mass(canvas, density, task.block), total)
 
 
-def _objective(task: PlaceTask | FitTask, settings: BlockSettings) -> Pixels:
+def _objective(task: BlockTask, settings: BlockSettings) -> Pixels:
     """Return the objective of a window."""
     types = types_in(select(settings.options.backend))
     data = data_of(task.window.read(), settings.space, affine=settings.affine)
@@ -176,7 +159,7 @@ def _mass(canvas: Canvas, density: Float, block: Block) -> float:
     return float(pixels[block.core].sum(dtype=np.float64))
 
 
-def place_in_block(task: PlaceTask, settings: BlockSettings) -> Arrays:
+def place_in_block(task: BlockTask, settings: BlockSettings) -> Arrays:
     """Place and shape the Gaussians of a block.
 
     Returns
@@ -187,8 +170,8 @@ def place_in_block(task: PlaceTask, settings: BlockSettings) -> Arrays:
     options, count, spacing = settings.options, task.gaussians, settings.spacing
     canvas, energy, density = _density(_objective(task, settings), settings)
     types, grid = canvas.types, canvas.grid
-    if task.old is not None:
-        arrays, size = task.old | {"color": task.old["ratio"]}, (grid.width, grid.height)
+    if task.arrays is not None:
+        arrays, size = task.arrays | {"color": task.arrays["ratio"]}, (grid.width, grid.height)
         old = _set_of(arrays, size, "data", settings)
         density *= Owners.of(old).average(old.color[0])
     column, row, _, _ = canvas.pixels()
@@ -205,7 +188,7 @@ StepDone = Callable[[int], None]
 
 
 def find_density(
-    task: FitTask, settings: BlockSettings, step_done: StepDone | None = None
+    task: BlockTask, settings: BlockSettings, step_done: StepDone | None = None
 ) -> Arrays:
     """Fit the Gaussians of a window for some steps; return the density that their errors suggest.
 
@@ -213,7 +196,7 @@ def find_density(
     -------
     dict of str to ndarray
         Mean (n, 2) and factor (n, 3) of the Gaussians of the block in pixels of the window, their
-        ratio (n, 1), see `PlaceTask`, and the mass (1,) of the density in the core.
+        ratio (n, 1), see `BlockTask`, and the mass (1,) of the density in the core.
     """
     full = _objective(task, settings)
     objective, start = _start(task, full, settings)
@@ -231,7 +214,9 @@ def find_density(
     }
 
 
-def fit_block(task: FitTask, settings: BlockSettings, step_done: StepDone | None = None) -> Arrays:
+def fit_block(
+    task: BlockTask, settings: BlockSettings, step_done: StepDone | None = None
+) -> Arrays:
     """Take some steps of the fit of a window, and return the Gaussians of its block.
 
     Returns
@@ -251,11 +236,12 @@ def fit_block(task: FitTask, settings: BlockSettings, step_done: StepDone | None
     return {name: arrays[name][task.members] for name in ("mean", "factor", "color")}
 
 
-def _start(task: FitTask, objective: Pixels, settings: BlockSettings) -> tuple[Pixels, Gaussians]:
+def _start(task: BlockTask, objective: Pixels, settings: BlockSettings) -> tuple[Pixels, Gaussians]:
     """Return the objective minus the fixed Gaussians, and the others with initial colours."""
     if task.fixed is not None and len(task.fixed["mean"]):
         fixed = _set_of(task.fixed, objective.size, settings.space, settings)
         objective = objective.minus(fixed)
+    assert task.arrays is not None
     unset = {
         "color": np.zeros((len(task.arrays["mean"]), objective.channels), np.float32),
         "background": np.array(settings.background, np.float32),
@@ -278,7 +264,7 @@ def _set_of(
 def _descend(
     objective: Pixels,
     start: Gaussians,
-    task: FitTask,
+    task: BlockTask,
     settings: BlockSettings,
     step_done: StepDone | None,
 ) -> Gaussians:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,9 +19,8 @@ from ..image.io import bits_of, dtype_of, to_file, write_pixels
 from ..image.metrics import float_space, squared_error
 from ..raster.render import filter_by_box, picture_of, render
 from ..storage.atomic import atomic_write
-from .block import BlockSettings
-from .grid import Block
-from .windows import TILE_SIDE, Source, Window, write_tiles
+from .block import BlockSettings, BlockTask
+from .windows import TILE_SIDE, write_tiles
 
 BAND_PIXELS = 1 << 22
 """Number of pixels of a band that is rendered at once; a pixel takes about 100 bytes."""
@@ -151,30 +149,12 @@ def save_region(
     write_pixels(path, picture, bits)
 
 
-class CompareTask(NamedTuple):
-    """A part of an image, and the Gaussians that touch it, in the unit of the fit."""
-
-    block: Block
-    window: Window
-    data: SetData
-
-
-def compare_tasks(source: Source, data: SetData, blocks: list[Block]) -> Iterator[CompareTask]:
-    """Yield the comparison of each block of a set with its image."""
-    band, in_band = slice(0, 0), data
-    for block in blocks:
-        if block.rows != band:  # cropping first to a row of blocks is faster
-            band = block.rows
-            in_band = crop(data, (0, band.start), (source.width, band.stop - band.start))
-        size = (block.columns.stop - block.columns.start, band.stop - band.start)
-        part = crop(in_band, (block.columns.start, 0), size)
-        yield CompareTask(block, source.window(block.rows, block.columns), part)
-
-
-def block_errors(task: CompareTask, settings: BlockSettings) -> tuple[float, float]:
+def block_errors(task: BlockTask, settings: BlockSettings) -> tuple[float, float]:
     """Return the sums of the squared errors of a block in the spaces of psnr_ycbcr and psnr_rgb."""
-    pixels, data, affine = task.window.read(), task.data, settings.affine
-    backend = settings.options.backend
+    assert task.arrays is not None
+    pixels, affine, backend = task.window.read(), settings.affine, settings.options.backend
+    size = pixels.shape[1], pixels.shape[0]
+    data = SetData(task.arrays, size, settings.space, settings.options.method.cutoff)
     if data.space != "data":
         scaled = {name: data.arrays[name] * np.float32(affine.scale) for name in COLORS}
         scaled["background"] += np.float32(affine.offset)

@@ -9,13 +9,13 @@ from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.arguments import takes_numbers
-from ..backend.executor import Executor, completed
+from ..backend.executor import Executor, Value, completed
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.progress import shows_progress
 from ..backend.selection import select
@@ -26,14 +26,14 @@ from ..fitting.objective import Extent, restored
 from ..fitting.options import FitOptions, named_options
 from ..gaussian.file import SetData, check_suffix, write
 from ..gaussian.gaussians import Gaussians
+from ..gaussian.region import crop
 from ..image.color import rendered_as
 from ..image.metrics import psnr_from_mse
 from ..storage.atomic import require_writable
 from ..storage.checkpoint import Checkpoint, open_checkpoint
 from .block import (
     BlockSettings,
-    FitTask,
-    PlaceTask,
+    BlockTask,
     exchange_rounds,
     find_density,
     fit_block,
@@ -41,11 +41,11 @@ from .block import (
     place_in_block,
     survey,
 )
-from .draw import block_errors, compare_tasks
+from .draw import block_errors
 from .grid import Block, BlockSets, allocate, choose_halo, divide
 from .manifest import ImageRow, RowProgress, list_sources
 from .run import figures_of, run_pieces
-from .windows import Source, Window, open_source
+from .windows import Source, open_source
 
 BLOCK_SIDE = 1024
 """Default side of a block in pixels."""
@@ -310,8 +310,18 @@ class LargeRun:
         The set is in the unit of the fit.
         """
         self._begin("measure", len(self.blocks))
-        tasks = compare_tasks(self.image, data, self.blocks)  # in the order of the blocks
-        errors = self._in_order(block_errors, lambda block: next(tasks))
+        band, in_band = slice(0, 0), data
+
+        def task_of(block: Block) -> BlockTask:
+            nonlocal band, in_band
+            if block.rows != band:  # cropping first to a row of blocks is faster
+                band = block.rows
+                in_band = crop(data, (0, band.start), (self.image.width, band.stop - band.start))
+            size = (block.columns.stop - block.columns.start, band.stop - band.start)
+            part = crop(in_band, (block.columns.start, 0), size)
+            return BlockTask(self.image.window(block.rows, block.columns), block, part.arrays)
+
+        errors = self._each(block_errors, task_of)
         ycbcr, rgb = np.sum(errors, axis=0).tolist()
         return ycbcr, rgb
 
@@ -321,11 +331,11 @@ class LargeRun:
         The image is read twice, because the unit depends on all blocks.
         """
         self._begin("survey", 2 * len(self.blocks))
-        extent = reduce(Extent.joined, self._in_order(measure_extent, self._place_task))
+        extent = reduce(Extent.joined, self._each(measure_extent, self._task))
         self.settings = self.settings._replace(
             affine=extent.affine(self.settings.space), is_of_codes=extent.is_of_codes
         )
-        figures = np.array(self._in_order(survey, self._place_task))
+        figures = np.array(self._each(survey, self._task))
         if self.checkpoint is not None:
             figures = _stored_figures(self.checkpoint, figures)
         mean = figures[:, 1:].sum(axis=0) / (self.image.width * self.image.height)
@@ -339,9 +349,9 @@ class LargeRun:
         placed = BlockSets(self.blocks, counts, ("mean", "factor"))
         self._begin("place", len(self.blocks))
 
-        def task_of(block: Block) -> PlaceTask:
-            near = None if old is None else old.in_window(block)[0]
-            return self._place_task(block, int(counts[block.number]), near)
+        def task_of(block: Block) -> BlockTask:
+            density = None if old is None else old.in_window(block)[0]
+            return self._task(block, arrays=density, gaussians=int(counts[block.number]))
 
         self._each(place_in_block, task_of, placed.put)
         return placed
@@ -393,38 +403,31 @@ class LargeRun:
         ]
         return max(complete, default=0)
 
-    def _place_task(self, block: Block, count: int = 0, old: Arrays | None = None) -> PlaceTask:
-        return PlaceTask(self._window(block), block, count, old)
+    def _task(self, block: Block, **content: Any) -> BlockTask:
+        window = self.image.window(block.window_rows, block.window_columns)
+        return BlockTask(window, block, **content)
 
-    def _fit_task(self, block: Block, sets: BlockSets, steps: int, part: range) -> FitTask:
+    def _fit_task(self, block: Block, sets: BlockSets, steps: int, part: range) -> BlockTask:
         """Return the task of a block: its window, the Gaussians in it, and others that touch it."""
         arrays, members = sets.in_window(block)
         fixed = sets.around(block) if "color" in arrays else None
-        return FitTask(self._window(block), block, arrays, members, fixed, steps, part)
+        return self._task(
+            block, arrays=arrays, members=members, fixed=fixed, iterations=steps, part=part
+        )
 
     def _told(self, fit: Callable[..., Arrays]) -> Callable[..., Arrays]:
         """Let a fit in this process tell its steps, and stop between two of them."""
-        return fit if self.interrupted is None else partial(fit, step_done=self._step_done)
-
-    def _in_order(self, function: Any, task_of: Callable[[Block], Any]) -> list[Any]:
-        """Return the results of all blocks in their order."""
-        results: list[Any] = [None] * len(self.blocks)
-
-        def put(block: Block, value: Any) -> None:
-            results[block.number] = value
-
-        self._each(function, task_of, put)
-        return results
+        return fit if self.interrupted is None else partial(fit, step_done=self._tell)
 
     def _each(
         self,
-        function: Any,
-        task_of: Callable[[Block], Any],
-        put: Callable[[Block, Any], None],
+        function: Callable[..., Value],
+        task_of: Callable[[Block], BlockTask],
+        put: Callable[[Block, Value], None] | None = None,
         kept: str = "",
         steps: int = 1,
-    ) -> None:
-        """Call a function with the task of each block, and put its results.
+    ) -> list[Value]:
+        """Call a function with the task of each block.
 
         Parameters
         ----------
@@ -432,57 +435,58 @@ class LargeRun:
             ``function(task, settings)``.
         task_of : callable
             Returns the task of a block.
-        put : callable
-            ``put(block, value)``.
+        put : callable, optional
+            ``put(block, value)`` takes each result. By default results are returned.
         kept : str, optional
             Start of the names in the checkpoint: results that it holds are taken from there, others
             are stored. By default no results are kept.
         steps : int, optional
             What a block counts in the progress.
+
+        Returns
+        -------
+        list
+            The results in the order of the blocks, unless `put` takes them.
         """
+        results: dict[int, Value] = {}
         store = self.checkpoint if kept else None
 
-        def find(block: Block) -> Arrays | None:
+        def find(block: Block) -> Any:
             arrays = store.load(f"{kept}{block.number}") if store else None
             self.resumed += arrays is not None
             return arrays
 
-        def work(blocks: Iterator[Block]) -> Generator[tuple[Block, Any], None, None]:
+        def work(blocks: Iterator[Block]) -> Generator[tuple[Block, Value], None, None]:
             tasks = map(task_of, blocks)
             with closing(completed(self.executor, function, tasks, self.settings)) as ended:
                 for task, value in ended:
                     if store:
-                        store.save(f"{kept}{task.block.number}", value)
+                        store.save(f"{kept}{task.block.number}", cast(Arrays, value))
                     yield task.block, value
 
-        def end(block: Block, value: Any) -> None:
-            put(block, value)
-            self._advance(steps)  # `progress` may raise: the result is stored
-            self._stop_if_interrupted()
+        def end(block: Block, value: Value) -> None:
+            if put is None:
+                results[block.number] = value
+            else:
+                put(block, value)
+            self._advance(steps)  # may raise: the result is stored
 
         run_pieces(self.blocks, find, work, end)
-
-    def _window(self, block: Block) -> Window:
-        return self.image.window(block.window_rows, block.window_columns)
+        return [results[number] for number in sorted(results)]
 
     def _begin(self, stage: str, total: int) -> None:
         self.row = replace(self.row, status=stage)
         self.done, self.total = 0, total
-        self._advance(0)
+        self._tell()
 
     def _advance(self, steps: int) -> None:
         self.done += steps
-        self._tell(self.done)
+        self._tell()
 
-    def _step_done(self, step: int) -> None:
-        self._tell(self.done + step)
-        self._stop_if_interrupted()
-
-    def _tell(self, done: int) -> None:
+    def _tell(self, steps: int = 0) -> None:
+        """Tell what is done, with some steps of the current block, and stop if that is asked."""
         if self.progress:
-            self.progress(done, self.total, self.row)
-
-    def _stop_if_interrupted(self) -> None:
+            self.progress(self.done + steps, self.total, self.row)
         if self.interrupted is not None and self.interrupted():
             raise KeyboardInterrupt
 

@@ -402,9 +402,9 @@ def test_a_cluster_of_others_is_as_it_was(task):
             for entry in executor.map(task, range(4)):
                 assert entry.value["threads"] == 1 and entry.value["blas"] == {1}
         deadline = time.monotonic() + 30  # other tasks end after an error
-        while client.run(clusters.worker_state) != before and time.monotonic() < deadline:
+        while (after := client.run(clusters.worker_state)) != before:
+            assert time.monotonic() < deadline, after
             time.sleep(0.05)
-        assert client.run(clusters.worker_state) == before
         assert (sorted(scheduler.plugins), sorted(scheduler.worker_plugins)) == plugins
 
 

@@ -256,8 +256,9 @@ def stop_after(output, pixels, stage, share, settings=FEW, act=end):
         if row.status == stage and done and done >= share * total:
             act()
 
-    with pytest.raises((Stop, KeyboardInterrupt)):
+    with pytest.raises((Stop, eg.Interrupted)) as stopped:
         eg.fit_large(pixels, output, progress=stop, **settings)
+    return stopped.value
 
 
 @pytest.mark.parametrize(("stage", "act"), [("fit", end), ("density", end), ("fit", press)])
@@ -265,7 +266,10 @@ def test_interrupted_run_goes_on(tmp_path, stage, act):
     pixels, output = mosaic(128), tmp_path / "a.npz"
     settings = FEW | {"iterations": 200 if stage == "density" else 20}
     whole = eg.fit_large(pixels, **settings)
-    stop_after(output, pixels, stage, 0.5, settings, act)
+    stopped = stop_after(output, pixels, stage, 0.5, settings, act)
+    if act is press:
+        row = stopped.result
+        assert (row.status, row.width, row.height, row.output) == (stage, 128, 128, output)
     folder = tmp_path / "a.npz.checkpoint"
     assert folder.is_dir() and not output.exists()
     again = eg.fit_large(pixels, output, **settings)
