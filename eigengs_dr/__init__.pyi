@@ -6,12 +6,7 @@ from .backend.executor import ClusterError as ClusterError
 from .backend.interrupts import Interrupted as Interrupted
 from .backend.recording import exclusive as exclusive
 from .backend.selection import BackendError as BackendError
-from .blocks.fit_large import LargeFit as LargeFit
-from .blocks.fit_large import fit_large as fit_large
 from .codec.packing import pack as pack
-from .collection.fit_many import fit_many as fit_many
-from .collection.manifest import ImageRow as ImageRow
-from .collection.manifest import RunInterrupted as RunInterrupted
 from .eigenbasis.basis import Eigenbasis as Eigenbasis
 from .eigenbasis.eigengs import EigenGS as EigenGS
 from .fitting.coarse import COARSE_TO_FINE as COARSE_TO_FINE
@@ -35,6 +30,10 @@ from .image.metrics import ms_ssim as ms_ssim
 from .image.metrics import psnr as psnr
 from .image.metrics import ssim as ssim
 from .image.pixels import ImageError as ImageError
+from .many.fit_large import LargeFit as LargeFit
+from .many.fit_large import fit_large as fit_large
+from .many.fit_many import fit_many as fit_many
+from .many.manifest import ImageRow as ImageRow
 from .plugins import register_plugins as register_plugins
 from .raster.render import picture_of as picture_of
 from .raster.render import render as render
@@ -62,7 +61,6 @@ __all__ = [
     "Loss",
     "Map",
     "Method",
-    "RunInterrupted",
     "concatenate",
     "convert_scene",
     "exclusive",

@@ -1,6 +1,6 @@
 """Executors run tasks in this process or on the workers of a cluster.
 
-Functions that take ``client`` get an `Executor` from `eigengs_dr.cluster.client.executor_for`.
+Functions that take ``client`` get an `Executor` from `eigengs_dr.cluster.executor_for`.
 """
 
 from __future__ import annotations

@@ -445,8 +445,8 @@ def _fit_several(
             rows = eg.fit_many(
                 files, folder, overwrite=overwrite, progress=note, client=client, **given
             )
-        except eg.RunInterrupted as stop:
-            rows = stop.rows
+        except eg.Interrupted as stop:
+            rows = stop.result
             done = f"{len(rows)} of {len(files)} images are done"
             print_message(f"interrupted; {done}; repeat the command to fit the others")
     space, seconds = settings.space or "ycbcr", time.perf_counter() - started
@@ -535,7 +535,7 @@ def _check_memory(
     ValueError
         If this process may not use enough memory.
     """
-    from ..blocks.windows import image_size
+    from ..many.windows import image_size
     from . import memory
 
     size = image_size(path)
@@ -562,14 +562,14 @@ def _fit_by_blocks(
     choices["space"] = settings.space or YCBCR
     with bar(run.quiet) as show:
 
-        def progress(done: int, total: int, row: Record) -> None:
-            show(f"{Path(path).name}: {row['stage']}", done, total)
+        def progress(done: int, total: int, row: eg.ImageRow) -> None:
+            show(f"{Path(path).name}: {row.status}", done, total)
 
         try:
             result = eg.fit_large(
                 path, output, block=side, progress=progress, client=client, **choices
             )
-        except KeyboardInterrupt:
+        except eg.Interrupted:
             print_message(
                 f"interrupted; finished blocks are in {output}.checkpoint; repeat the command to "
                 "continue"

@@ -91,10 +91,10 @@ def _render(
     **choices: Any,
 ) -> Path:
     """Render one set to a file, and return its name."""
-    from ..blocks.draw import save_region
     from ..gaussian.file import read_map
     from ..gaussian.region import check_region
     from ..image.formats import TIFF_SUFFIXES
+    from ..many.draw import save_region
 
     name, region, first = (choices[key] for key in ("name", "region", "first"))
     data = read_map(file, name, "--map")

@@ -27,9 +27,8 @@ from .files import read_model, write_model
 from .truncation import TruncationCurve, curve_from_eigenvalues, name_components
 
 if TYPE_CHECKING:  # training, encoding and runs over many images are imported on demand
-    from ..collection.manifest import ImageRow
-    from ..collection.sources import Images
     from ..image.folder import TrainingImages
+    from ..many.manifest import ImageRow, Images
     from .basis import Eigenbasis
     from .encoder import ModelEncoder
 
@@ -288,11 +287,11 @@ class EigenGS:
 
         Raises
         ------
-        ValueError, OSError, RunInterrupted
+        ValueError, OSError, Interrupted
             See `encode` and `eigengs_dr.fit_many`.
         """
-        from ..collection.manifest import fingerprint
-        from ..collection.run import Job, run_images
+        from ..many.manifest import fingerprint
+        from ..many.run import Job, run_images
 
         check_coding(colors, mean, target_psnr)
         work = partial(_encode_all, model=self, options=(colors, mean, target_psnr))

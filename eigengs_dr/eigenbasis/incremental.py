@@ -26,7 +26,7 @@ from scipy.linalg import eigh
 from ..backend.executor import completed
 from ..backend.messages import warn
 from ..backend.types import Doubles, Singles, Values
-from ..cluster.client import executor_for
+from ..cluster import executor_for
 from ..image.folder import ReadProgress, TrainingImages, list_images, read_blocks
 from ..image.pixels import ImageError
 from ..image.remote import is_url

@@ -151,16 +151,16 @@ def restore_package():
 
 def patch_write(replacement):
     """Replace the function that writes results, in this process."""
-    from eigengs_dr.collection import run
     from eigengs_dr.gaussian.file import write
+    from eigengs_dr.many import run
 
     run.write = lambda *arguments: replacement(write, *arguments)
 
 
 def mend_writes():
     """Write results again, in this process."""
-    from eigengs_dr.collection import run
     from eigengs_dr.gaussian.file import write
+    from eigengs_dr.many import run
 
     run.write = write
 

@@ -3,7 +3,7 @@
 import pytest
 
 from eigengs_dr.backend.executor import Done
-from eigengs_dr.cluster.client import executor_for
+from eigengs_dr.cluster import executor_for
 
 
 def test_tasks_run_in_order_when_they_are_asked_for():

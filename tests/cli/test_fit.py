@@ -131,13 +131,13 @@ def interrupts(photo, tmp_path):
     out = tmp_path / "x.npz"
     return {
         "early": ("fit", KeyboardInterrupt(), "interrupted"),
-        "whole": (
-            "fit",
-            eg.Interrupted(kept, "interrupted"),
-            f"interrupted; the best fit so far is in {out}",
+        "whole": ("fit", eg.Interrupted(kept, ""), f"interrupted; the best fit so far is in {out}"),
+        "many": ("fit_many", eg.Interrupted(rows[:1], ""), "interrupted; 1 of 2 images are done"),
+        "blocks": (
+            "fit_large",
+            eg.Interrupted(rows[0], ""),
+            f"interrupted; finished blocks are in {out}",
         ),
-        "many": ("fit_many", eg.RunInterrupted(rows[:1]), "interrupted; 1 of 2 images are done"),
-        "blocks": ("fit_large", KeyboardInterrupt(), f"interrupted; finished blocks are in {out}"),
     }
 
 

@@ -35,15 +35,15 @@ from _helpers.sets import check_equal
 from eigengs_dr.backend.executor import ClusterError, Done
 from eigengs_dr.backend.selection import describe
 from eigengs_dr.cluster import executor as module
-from eigengs_dr.cluster.client import executor_for
+from eigengs_dr.cluster import executor_for
 from eigengs_dr.cluster.executor import connect
 from eigengs_dr.cluster.local import local_cluster
 from eigengs_dr.cluster.worker import Shared, package_versions, run_task, share
-from eigengs_dr.collection.manifest import NAME, read_manifest
 from eigengs_dr.eigenbasis import incremental, training
 from eigengs_dr.eigenbasis.basis import Eigenbasis
 from eigengs_dr.eigenbasis.components import TrainOptions
 from eigengs_dr.image.io import save_image
+from eigengs_dr.many.manifest import NAME, read_manifest
 
 
 @pytest.fixture
@@ -129,12 +129,12 @@ def test_ctrl_c_leaves_what_is_done(client, photos, output, expected):
         if done == 3:
             raise KeyboardInterrupt
 
-    with pytest.raises(eg.RunInterrupted) as stopped:
+    with pytest.raises(eg.Interrupted) as stopped:
         eg.fit_many(photos, output, client=client, progress=press, **QUICK)
-    assert len(stopped.value.rows) == 3
+    assert len(stopped.value.result) == 3
     rows = eg.fit_many(photos, output, client=client, **QUICK)
     kept = {row.name for row in rows if row.status == "skipped"}
-    assert kept >= {row.name for row in stopped.value.rows}
+    assert kept >= {row.name for row in stopped.value.result}
     assert_complete(output, expected)
 
 
@@ -401,9 +401,9 @@ def test_a_cluster_of_others_is_as_it_was(task):
             for entry in executor.map(task, range(4)):
                 assert entry.value["threads"] == 1 and entry.value["blas"] == {1}
         deadline = time.monotonic() + 30  # other tasks end after an error
-        while client.run(clusters.worker_state) != before and time.monotonic() < deadline:
+        while (after := client.run(clusters.worker_state)) != before:
+            assert time.monotonic() < deadline, after
             time.sleep(0.05)
-        assert client.run(clusters.worker_state) == before
         assert (sorted(scheduler.plugins), sorted(scheduler.worker_plugins)) == plugins
 
 

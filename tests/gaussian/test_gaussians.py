@@ -12,10 +12,10 @@ from hypothesis.extra import numpy as hnp
 from _helpers.footprints import matrices
 from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, few, random_scene
 from eigengs_dr.backend.selection import select
-from eigengs_dr.blocks.draw import draw
 from eigengs_dr.gaussian.file import CUTOFF, SetData
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION, Gaussians, concatenate
 from eigengs_dr.gaussian.region import crop
+from eigengs_dr.many.draw import draw
 from eigengs_dr.raster.render import render
 
 

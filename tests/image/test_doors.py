@@ -19,10 +19,10 @@ from _helpers.command import run, succeeded
 from _helpers.errors import one_line
 from _helpers.files import png, tiff
 from _helpers.process import python_path, run_python
-from eigengs_dr.blocks.windows import image_size, open_source
 from eigengs_dr.image.folder import image_files
 from eigengs_dr.image.formats import HAS_HEIF, HEIF_SUFFIXES, READ_SUFFIXES
 from eigengs_dr.image.io import ImageError, check_image, load_image, save_image
+from eigengs_dr.many.windows import image_size, open_source
 from eigengs_dr.storage.memory import SETTING
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from _helpers.image_kinds import KINDS, NEEDS_PILLOW_13
-from eigengs_dr.blocks.windows import open_source
 from eigengs_dr.image.io import ImageError, check_image, load_image
+from eigengs_dr.many.windows import open_source
 
 PAGE = Path(__file__).parents[2] / "docs/reference/image-files.md"
 

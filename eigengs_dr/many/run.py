@@ -1,8 +1,13 @@
-"""Runs over many images: groups of images are processed, and each image gets a row of results.
+"""A run over pieces, and the runs of jobs over many images.
 
-In this process, a run reads images ahead and writes results in the background. On a cluster, each
-task is such a run over a chunk of images. Chunks depend on the images only, never on timings, so
-that runs are reproducible.
+`run_pieces` is the one run: pieces that an earlier call has done are not done again, the others are
+worked on, and every piece ends with its result kept. The pieces of `eigengs_dr.fit_many` are
+images, and the manifest of the folder keeps their rows; those of `eigengs_dr.fit_large` are blocks,
+whose Gaussians a checkpoint keeps.
+
+In this process, a run over images reads ahead and writes results in the background. On a cluster,
+each task is such a run over a chunk of images. Chunks depend on the images only, never on timings,
+so that runs are reproducible.
 """
 
 from __future__ import annotations
@@ -18,15 +23,15 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from ..backend.executor import Executor
-from ..backend.interrupts import defer_interrupts
+from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import warn
 from ..backend.recording import exclusive
-from ..cluster.client import executor_for
+from ..cluster import executor_for
 from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write
 from ..gaussian.gaussians import Gaussians
@@ -35,8 +40,7 @@ from ..image.io import check_data, read_floats
 from ..image.pixels import EncodedImage
 from ..storage.atomic import refuse_url, require_writable
 from ..storage.settings import Settings
-from .manifest import ImageRow, Manifest, RowProgress, RunInterrupted, open_manifest
-from .sources import Images, RunImage, list_sources, plan_output
+from .manifest import ImageRow, Images, Manifest, RowProgress, RunImage, list_sources, open_manifest
 
 WRITERS = 2
 """Number of threads that compress and write results: 5,000 Gaussians take 6 ms."""
@@ -49,6 +53,43 @@ FAILURES = (ValueError, OSError, MemoryError)
 
 FIGURES = ("psnr_ycbcr", "psnr_rgb", "iterations", "stopped")
 """Figures of a fit in a row."""
+
+Piece = TypeVar("Piece")
+Result = TypeVar("Result")
+
+
+def run_pieces(
+    pieces: Iterable[Piece],
+    find: Callable[[Piece], Result | None],
+    work: Callable[[Iterator[Piece]], Generator[tuple[Piece, Result], None, None]],
+    end: Callable[[Piece, Result], None],
+) -> None:
+    """Run over pieces: find the results of an earlier call, work on the other pieces, end each.
+
+    Parameters
+    ----------
+    pieces : iterable
+        A piece is taken when there is room for its work.
+    find : callable
+        Returns the result of a piece if an earlier call has done it, otherwise None.
+    work : callable
+        ``work(pieces)`` yields pieces with their results, in any order. It is closed if `end` or
+        `find` raises.
+    end : callable
+        ``end(piece, result)`` is called for every piece.
+    """
+
+    def unfinished() -> Iterator[Piece]:
+        for piece in pieces:
+            result = find(piece)
+            if result is None:
+                yield piece
+            else:
+                end(piece, result)
+
+    with closing(work(unfinished())) as ended:
+        for piece, result in ended:
+            end(piece, result)
 
 
 class Job(NamedTuple):
@@ -82,24 +123,6 @@ class Job(NamedTuple):
     given: Collection[str] = ()
 
 
-class Finished(NamedTuple):
-    """An image whose result, if there is one, is written.
-
-    Attributes
-    ----------
-    place : int
-        Index of the image in the run, from 0.
-    row : ImageRow
-        With the result, whether or not there is an output folder.
-    is_transient : bool
-        Whether a failure may be temporary, such as a full disk or a network error.
-    """
-
-    place: int
-    row: ImageRow
-    is_transient: bool = False
-
-
 def run_images(
     images: Images,
     output: str | os.PathLike[str] | None,
@@ -113,52 +136,43 @@ def run_images(
 
     In this process, images that are processed end in order.
     """
-    sources = list_sources(images, recursive)
+    sources = list_sources(images, recursive, output)
     total = len(sources) if isinstance(sources, list) else None
     executor = None if client is None else executor_for(client)
     rows: dict[int, ImageRow] = {}
 
-    def record(place: int, row: ImageRow) -> None:
+    def find(source: RunImage) -> ImageRow | None:
+        if source.error:
+            return source._replace(output=None).row("failed", error=source.error)
+        return manifest.find(source) if manifest else None
+
+    def end(source: RunImage, row: ImageRow) -> None:
+        if row.error:
+            row = replace(row, result=None)
         if manifest:
             manifest.add(row)
-        rows[place] = replace(row, result=None) if manifest else row
+        rows[source.place] = replace(row, result=None) if manifest else row
         if progress:
             progress(len(rows), total, row)
 
-    def unfinished() -> Iterator[RunImage]:
-        for source in sources:
-            planned: RunImage | ImageRow = source
-            if source.error:
-                planned = source.row("failed", error=source.error)
-            elif manifest:
-                planned = plan_output(source, manifest, overwrite)
-            if isinstance(planned, ImageRow):
-                record(source.place, planned)
-                continue
-            if conflict:
-                raise ValueError(conflict)
-            yield planned
+    def work(unfinished: Iterator[RunImage]) -> Generator[Finished, None, None]:
+        if executor is None:
+            return run_here(unfinished, job)
+        return run_on_workers(unfinished, job, executor, total, keep=output is None)
 
     with ExitStack() as stack:
         manifest: Manifest | None = None
-        conflict = ""  # message about options that differ from those of results
         if output is not None:
-            manifest = stack.enter_context(open_manifest(make_folder(output), job.options))
-            if not overwrite:
-                if message := manifest.other_options(job.given):
-                    raise ValueError(message)
-                conflict = manifest.other_options(job.options or {})
-        if executor is None:
-            finished = run_here(unfinished(), job)
-        else:
-            finished = run_on_workers(unfinished(), job, executor, total, output is None)
+            opened = open_manifest(make_folder(output), job.options, job.given, overwrite)
+            manifest = stack.enter_context(opened)
         try:
-            for place, row, _ in stack.enter_context(closing(finished)):
-                record(place, row)
+            run_pieces(sources, find, work, end)
         except KeyboardInterrupt:
-            raise RunInterrupted([rows[place] for place in sorted(rows)]) from None
-    if conflict:
-        warn(conflict)
+            done = [rows[place] for place in sorted(rows)]
+            message = f"interrupted after {len(done)} images; .result holds their rows"
+            raise Interrupted(done, message) from None
+    if manifest and manifest.conflict:
+        warn(manifest.conflict)
     return [rows[place] for place in sorted(rows)]
 
 
@@ -186,8 +200,8 @@ def make_folder(output: str | os.PathLike[str]) -> Path:
 Decoded = tuple[RunImage, EncodedImage | Exception]
 """An image that was read, or the error."""
 
-Writing = tuple[RunImage, ImageRow, "Future[None] | None"]
-"""An image, its row, and the pending write of its file, if any."""
+Finished = tuple[RunImage, ImageRow]
+"""An image whose result, if there is one, is written, and its row."""
 
 
 def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None, None]:
@@ -196,7 +210,8 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
     Yields
     ------
     Finished
-        One for each image, in order, after its result is written.
+        One for each image, in order. The row has the result, whether or not there is an output
+        folder, or the error.
 
     Raises
     ------
@@ -204,7 +219,12 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
         After Ctrl-C or SIGTERM, once all results are written and yielded.
     """
     decoded = read_ahead(sources, partial(_decode, job=job), _is_file, _bytes_of)
-    writing: deque[Writing] = deque()
+    writing: deque[tuple[RunImage, ImageRow, Future[None] | None]] = deque()
+
+    def is_written() -> bool:
+        file = writing[0][2]
+        return file is None or file.done()
+
     with (
         closing(decoded),
         ThreadPoolExecutor(WRITERS, thread_name_prefix="write") as pool,
@@ -216,9 +236,9 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
                     file = None
                     if gaussians is not None and row.output:
                         # Only this thread uses Dr.Jit: the writers get NumPy arrays.
-                        file = pool.submit(write, row.output, gaussians.data(), _figures_of(row))
+                        file = pool.submit(write, row.output, gaussians.data(), figures_of(row))
                     writing.append((source, row, file))
-                    while writing and (len(writing) > MAX_WRITING or _is_written(writing[0])):
+                    while writing and (len(writing) > MAX_WRITING or is_written()):
                         yield _finish(*writing.popleft())
                     if interrupted():
                         raise KeyboardInterrupt
@@ -284,7 +304,7 @@ def _work_on(
         yield source, source.row("done", seconds=seconds, result=result, **figures), gaussians
 
 
-def _figures_of(row: ImageRow) -> FitFigures | None:
+def figures_of(row: ImageRow) -> FitFigures | None:
     """Return the figures that are stored in the file of a fit."""
     if row.psnr_ycbcr is None or row.psnr_rgb is None:
         return None
@@ -313,10 +333,6 @@ def _failed(source: RunImage, error: Exception) -> ImageRow:
     return source.row("failed", error=text, result=error)
 
 
-def _is_written(entry: Writing) -> bool:
-    return entry[2] is None or entry[2].done()
-
-
 def _finish(source: RunImage, row: ImageRow, file: Future[None] | None) -> Finished:
     """Wait until a result is written; a file that cannot be written is an error of the image."""
     try:
@@ -324,8 +340,7 @@ def _finish(source: RunImage, row: ImageRow, file: Future[None] | None) -> Finis
             file.result()
     except OSError as error:
         row = _failed(source, error)
-    is_transient = isinstance(row.result, OSError)
-    return Finished(source.place, replace(row, result=None) if row.error else row, is_transient)
+    return source, row
 
 
 # ---------------------------------------------------------------------------------------------
@@ -383,38 +398,43 @@ def run_on_workers(
     for last, tasks in enumerate(chunks):
         with closing(executor.map(run_chunk, tasks, (job, keep, Path.cwd()))) as ended:
             for chunk, result, lost in ended:
-                finished, notes = result or ([_lost(source, lost) for source in chunk], [])
+                rows, notes = result or ([_lost(source, lost) for source in chunk], [])
                 for text in notes:
                     warn(text)
-                for source, entry in zip(chunk, finished, strict=True):
-                    if entry.is_transient and not last:
+                for source, (row, is_transient) in zip(chunk, rows, strict=True):
+                    if is_transient and not last:
                         retries.append(source)
                     else:
-                        yield entry
+                        yield source, row
 
 
-def _lost(source: RunImage, lost: str) -> Finished:
+ChunkRow = tuple[ImageRow, bool]
+"""The row of an image of a chunk; whether a failure may be temporary, as on a full disk."""
+
+
+def _lost(source: RunImage, lost: str) -> ChunkRow:
     """Return the failure of an image whose chunk crashed its worker."""
-    error = f"{source.path or source.name}: {lost}"
-    return Finished(source.place, source.row("failed", error=error), is_transient=True)
+    return source.row("failed", error=f"{source.path or source.name}: {lost}"), True
 
 
 def run_chunk(
     chunk: list[RunImage], shared: tuple[Job, bool, Path]
-) -> tuple[list[Finished], list[str]]:
-    """Process the images of a chunk on a worker; return the finished images and the warnings.
+) -> tuple[list[ChunkRow], list[str]]:
+    """Process the images of a chunk on a worker; return their rows and the warnings.
 
     Names in the rows are as the user gave them, relative to the folder of the client.
     """
     job, keep, folder = shared
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        results = list(run_here((_absolute(source, folder) for source in chunk), job))
-    finished = []
-    for source, entry in zip(chunk, results, strict=True):
-        row = replace(entry.row, input=source.path, output=source.output)
-        finished.append(entry._replace(row=row if keep else replace(row, result=None)))
-    return finished, [str(n.message) for n in caught if issubclass(n.category, UserWarning)]
+        ended = list(run_here((_absolute(source, folder) for source in chunk), job))
+    rows = []
+    for source, (_, row) in zip(chunk, ended, strict=True):
+        is_transient = isinstance(row.result, OSError)
+        result = row.result if keep and not row.error else None
+        row = replace(row, input=source.path, output=source.output, result=result)
+        rows.append((row, is_transient))
+    return rows, [str(n.message) for n in caught if issubclass(n.category, UserWarning)]
 
 
 def _absolute(source: RunImage, folder: Path) -> RunImage:

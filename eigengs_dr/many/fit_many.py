@@ -15,9 +15,8 @@ from ..fitting.options import FitOptions, refuse_unknown
 from ..fitting.start import load_start, set_in
 from ..image.pixels import EncodedImage
 from ..image.space import YCBCR
-from .manifest import ImageRow, fingerprint
+from .manifest import ImageRow, Images, fingerprint
 from .run import Job, run_images
-from .sources import Images
 
 MAX_SIDE = 256
 """Largest side in pixels of images that are fitted in groups."""
@@ -103,9 +102,9 @@ def fit_many(
         If the backend is not available.
     ClusterError
         If the cluster cannot be used, or is lost. The same call continues the run.
-    RunInterrupted
-        After Ctrl-C or SIGTERM: a `KeyboardInterrupt` with the rows so far, whose files are
-        complete. The interrupted image has no file.
+    Interrupted
+        After Ctrl-C or SIGTERM: a `KeyboardInterrupt` whose ``result`` are the rows so far, with
+        complete files. The interrupted image has no file.
 
     Notes
     -----

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eigengs_dr.blocks.block import rounds
-from eigengs_dr.blocks.grid import BlockSets, allocate, divide
 from eigengs_dr.fitting.control import Relocate
 from eigengs_dr.fitting.descent import next_build
 from eigengs_dr.fitting.method import DEFAULT
+from eigengs_dr.many.block import exchange_rounds
+from eigengs_dr.many.grid import BlockSets, allocate, divide
 
 
 @given(st.integers(1, 300), st.integers(1, 300), st.integers(20, 120), st.integers(0, 40))
@@ -59,7 +59,7 @@ def test_gaussians_follow_the_picture():
 
 @pytest.mark.parametrize("iterations", [0, 1, 2, 10, 100, 179, 180, 980, 5000])
 def test_rounds_take_every_step_once(iterations):
-    parts = rounds(DEFAULT, iterations)
+    parts = exchange_rounds(DEFAULT, iterations)
     assert [step for part in parts for step in part] == list(range(iterations))
     assert len(parts) == 1 or all(parts)
     starts = {part.start for part in parts}

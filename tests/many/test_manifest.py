@@ -8,9 +8,8 @@ import eigengs_dr as eg
 from _helpers.clusters import QUICK, files_of
 from _helpers.process import run_python
 from _helpers.sets import check_equal
-from eigengs_dr.collection.manifest import KEYS, NAME, read_manifest
-from eigengs_dr.collection.sources import list_sources
 from eigengs_dr.image.remote import list_urls
+from eigengs_dr.many.manifest import KEYS, NAME, list_sources, read_manifest
 from eigengs_dr.storage.atomic import lock_folder
 
 
@@ -63,7 +62,7 @@ def test_a_result_stays_until_it_is_replaced(photos, output):
     def press(done, total, row):
         raise KeyboardInterrupt
 
-    with pytest.raises(eg.RunInterrupted):
+    with pytest.raises(eg.Interrupted):
         eg.fit_many(photos, output, overwrite=True, progress=press, **other)
     assert files_of(output)["00.npz"] != before["00.npz"]
     with pytest.raises(ValueError, match="holds results with gaussians 20 instead of 10"):

@@ -7,7 +7,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, Here, files_of, folder_of_photos
-from eigengs_dr.collection import run
+from eigengs_dr.many import run
 
 
 @pytest.fixture

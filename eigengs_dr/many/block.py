@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import types_in
 from ..backend.selection import select
-from ..backend.types import Float
+from ..backend.types import Arrays, Float
 from ..fitting.control import Redistribute, Relocate
 from ..fitting.descent import State, begin
 from ..fitting.loop import descend, last
@@ -39,17 +39,16 @@ from ..fitting.placement.density import Owners, density_ratio, squared_error
 from ..fitting.placement.filters import Canvas
 from ..fitting.problem import WHITE
 from ..fitting.solve import solve
+from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
-from ..image.space import YCBCR, Affine, Extent, Space
+from ..image.space import DATA, YCBCR, Affine, Extent, Space
 from ..raster.render import to_tensor
 from .grid import Block
 from .windows import Window
 
-Arrays = dict[str, NDArray[np.floating]]
 
-
-class Settings(NamedTuple):
+class BlockSettings(NamedTuple):
     """Settings that all tasks of a run share.
 
     Attributes
@@ -62,6 +61,8 @@ class Settings(NamedTuple):
         Mean distance of the Gaussians, in pixels.
     affine : Affine
         The unit of the fit.
+    is_of_codes : bool
+        Whether data is in [0, 1]. Otherwise the peak is the range, and psnr_rgb is NaN.
     background : tuple of float
         Value of every pixel before the Gaussians are added, in the unit of the fit.
     """
@@ -70,6 +71,7 @@ class Settings(NamedTuple):
     gaussians: int
     spacing: float
     affine: Affine = Affine()
+    is_of_codes: bool = True
     background: tuple[float, ...] = ()
 
     @property
@@ -78,50 +80,25 @@ class Settings(NamedTuple):
         return self.options.space or YCBCR
 
 
-class Surveyed(NamedTuple):
-    """Result of `survey`: the integral of the density over the core, and the sums of its values."""
-
-    mass: float
-    total: NDArray[np.float64]
-
-
-class PlaceTask(NamedTuple):
-    """A block whose Gaussians are to be placed.
+class BlockTask(NamedTuple):
+    """The work on a block.
 
     Attributes
     ----------
     window : Window
-        The pixels.
+        The pixels: those of the window of the block, or of its core to measure errors.
     block : Block
-    gaussians : int
-        From 1 to the number of pixels of the core.
-    old : dict of str to ndarray, or None
-        The density according to a fit: mean (N, 2) and factor (N, 3) of the Gaussians in the
-        window, in pixels of the window, and the ratio (N, 1), see
-        `eigengs_dr.fitting.placement.density.density_ratio`. By default the density depends on
+    arrays : dict of str to ndarray of float32, or None
+        Gaussians in pixels of `window`. A fit begins with mean (N, 2) and factor (N, 3) of those
+        whose means lie in the window, and optionally their color (N, C); otherwise the initial
+        colours are solved for. A placement takes the density of an earlier fit, if there is one:
+        mean, factor, and the ratio (N, 1), see
+        `eigengs_dr.fitting.placement.density.density_ratio`; otherwise the density depends on
         second derivatives only.
-    """
-
-    window: Window
-    block: Block
-    gaussians: int = 0
-    old: Arrays | None = None
-
-
-class FitTask(NamedTuple):
-    """A block whose Gaussians are to be fitted.
-
-    Attributes
-    ----------
-    window : Window
-        The pixels.
-    block : Block
-    arrays : dict of str to ndarray of float32
-        Initial mean (N, 2) and factor (N, 3) of the Gaussians whose means lie in the window, in
-        pixels of the window, and optionally their color (N, C); otherwise the initial colours are
-        solved for.
+    gaussians : int
+        Number of Gaussians to place, from 1 to the number of pixels of the core.
     members : slice
-        The Gaussians that belong to the block.
+        The Gaussians of a fit that belong to the block.
     fixed : dict of str to ndarray, or None
         Mean, factor and color of other Gaussians that touch the window.
     iterations : int
@@ -132,14 +109,15 @@ class FitTask(NamedTuple):
 
     window: Window
     block: Block
-    arrays: Arrays
-    members: slice
-    fixed: Arrays | None
-    iterations: int
-    part: range
+    arrays: Arrays | None = None
+    gaussians: int = 0
+    members: slice = slice(0)
+    fixed: Arrays | None = None
+    iterations: int = 0
+    part: range = range(0)
 
 
-def measure_extent(task: PlaceTask, settings: Settings) -> Extent:
+def measure_extent(task: BlockTask, settings: BlockSettings) -> Extent:
     """Return the extent of the values of a block, and reject invalid pixels."""
     pixels, space = task.window.read()[task.block.core], settings.space
     bright = space.above_white
@@ -150,17 +128,20 @@ def measure_extent(task: PlaceTask, settings: Settings) -> Extent:
     return Extent.of(space.values_of(pixels))
 
 
-def survey(task: PlaceTask, settings: Settings) -> Surveyed:
-    """Measure the number of Gaussians that a block needs, relative to other blocks."""
+def survey(task: BlockTask, settings: BlockSettings) -> NDArray[np.float64]:
+    """Return the number of Gaussians that a block needs, relative to others, and its sums.
+
+    These are the integral of the density over the core, and the sum of the values of each channel.
+    """
     objective = _objective(task, settings)
     canvas, _, density = _density(objective, settings)
     assert objective.model.target is not None
     values = objective.picture(objective.model.target).numpy()[task.block.core]
     total = values.sum(axis=(0, 1), dtype=np.float64)
-    return Surveyed(_mass(canvas, density, task.block), total)
+    return np.append(_mass(canvas, density, task.block), total)
 
 
-def _objective(task: PlaceTask | FitTask, settings: Settings) -> Pixels:
+def _objective(task: BlockTask, settings: BlockSettings) -> Pixels:
     """Return the objective of a window."""
     types = types_in(select(settings.options.backend))
     target = Target.of(task.window.read(), settings.space, settings.affine)
@@ -168,7 +149,7 @@ def _objective(task: PlaceTask | FitTask, settings: Settings) -> Pixels:
     return pixels_of([Channels("", settings.space, part, (target,))], types)
 
 
-def _density(objective: Pixels, settings: Settings) -> tuple[Canvas, Float, Float]:
+def _density(objective: Pixels, settings: BlockSettings) -> tuple[Canvas, Float, Float]:
     """Return the canvas of a window, the squared Hessian and the density."""
     canvas = Canvas.of(objective.types, objective.grid)
     return canvas, *density_from_hessian(canvas, objective.placement_image, settings.spacing)
@@ -180,7 +161,7 @@ def _mass(canvas: Canvas, density: Float, block: Block) -> float:
     return float(pixels[block.core].sum(dtype=np.float64))
 
 
-def place(task: PlaceTask, settings: Settings) -> Arrays:
+def place_in_block(task: BlockTask, settings: BlockSettings) -> Arrays:
     """Place and shape the Gaussians of a block.
 
     Returns
@@ -191,18 +172,9 @@ def place(task: PlaceTask, settings: Settings) -> Arrays:
     options, count, spacing = settings.options, task.gaussians, settings.spacing
     canvas, energy, density = _density(_objective(task, settings), settings)
     types, grid = canvas.types, canvas.grid
-    if task.old is not None:
-        mean, factor, ratio = (task.old[name] for name in ("mean", "factor", "ratio"))
-        size = grid.width, grid.height
-        old = Gaussians.from_arrays(
-            mean,
-            factor,
-            ratio,
-            size=size,
-            space="data",
-            backend=types.backend,
-            cutoff=options.method.cutoff,
-        )
+    if task.arrays is not None:
+        arrays, size = task.arrays | {"color": task.arrays["ratio"]}, (grid.width, grid.height)
+        old = _set_of(arrays, size, DATA, settings)
         density *= Owners.of(old).average(old.color[0])
     column, row, _, _ = canvas.pixels()
     for position, part in zip((row, column), task.block.core, strict=True):
@@ -217,14 +189,16 @@ StepDone = Callable[[int], None]
 """``step_done(step)`` is called every 10 steps of a fit. It may raise an error to end the fit."""
 
 
-def find_density(task: FitTask, settings: Settings, step_done: StepDone | None = None) -> Arrays:
+def find_density(
+    task: BlockTask, settings: BlockSettings, step_done: StepDone | None = None
+) -> Arrays:
     """Fit the Gaussians of a window for some steps; return the density that their errors suggest.
 
     Returns
     -------
     dict of str to ndarray
         Mean (n, 2) and factor (n, 3) of the Gaussians of the block in pixels of the window, their
-        ratio (n, 1), see `PlaceTask`, and the mass (1,) of the density in the core.
+        ratio (n, 1), see `BlockTask`, and the mass (1,) of the density in the core.
     """
     full = _objective(task, settings)
     objective, start = _start(task, full, settings)
@@ -242,7 +216,9 @@ def find_density(task: FitTask, settings: Settings, step_done: StepDone | None =
     }
 
 
-def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = None) -> Arrays:
+def fit_block(
+    task: BlockTask, settings: BlockSettings, step_done: StepDone | None = None
+) -> Arrays:
     """Take some steps of the fit of a window, and return the Gaussians of its block.
 
     Returns
@@ -262,38 +238,36 @@ def fit_block(task: FitTask, settings: Settings, step_done: StepDone | None = No
     return {name: arrays[name][task.members] for name in ("mean", "factor", "color")}
 
 
-def _start(task: FitTask, objective: Pixels, settings: Settings) -> tuple[Pixels, Gaussians]:
+def _start(task: BlockTask, objective: Pixels, settings: BlockSettings) -> tuple[Pixels, Gaussians]:
     """Return the objective minus the fixed Gaussians, and the others with initial colours."""
-    options, channels = settings.options, objective.channels
-    background = np.array(settings.background, np.float32)
-
-    def make(arrays: Arrays, background: NDArray[np.float32]) -> Gaussians:
-        uncolored = np.zeros((len(arrays["mean"]), channels), np.float32)
-        return Gaussians.from_arrays(
-            arrays["mean"],
-            arrays["factor"],
-            arrays.get("color", uncolored),
-            background,
-            size=objective.size,
-            space=settings.space,
-            backend=objective.types.backend,
-            cutoff=options.method.cutoff,
-        )
-
     if task.fixed is not None and len(task.fixed["mean"]):
-        objective = objective.minus(make(task.fixed, np.zeros(channels, np.float32)))
-    placed = make(task.arrays, background).bounded()
+        fixed = _set_of(task.fixed, objective.size, settings.space, settings)
+        objective = objective.minus(fixed)
+    assert task.arrays is not None
+    unset = {
+        "color": np.zeros((len(task.arrays["mean"]), objective.channels), np.float32),
+        "background": np.array(settings.background, np.float32),
+    }
+    placed = _set_of(unset | task.arrays, objective.size, settings.space, settings).bounded()
     if "color" not in task.arrays:
-        steps = options.method.solve_steps
+        steps = settings.options.method.solve_steps
         placed = solve(placed, objective, steps, background=settings.background)
     return objective, placed
+
+
+def _set_of(
+    arrays: Arrays, size: tuple[int, int], space: Space, settings: BlockSettings
+) -> Gaussians:
+    """Return Gaussians in pixels of a window as a set."""
+    data = SetData(arrays, size, space, settings.options.method.cutoff)
+    return Gaussians.from_data(data, settings.options.backend)
 
 
 def _descend(
     objective: Pixels,
     start: Gaussians,
-    task: FitTask,
-    settings: Settings,
+    task: BlockTask,
+    settings: BlockSettings,
     step_done: StepDone | None,
 ) -> Gaussians:
     """Take the steps of a task, with the controls of the method if the objective has a part."""
@@ -318,7 +292,7 @@ rounds lose the state of the optimiser; fewer leave seams. On 1,024x1,024 pixels
 to 4 short rounds were equally good, and better than 1 or 6."""
 
 
-def rounds(method: Method, iterations: int) -> list[range]:
+def exchange_rounds(method: Method, iterations: int) -> list[range]:
     """Return the steps of each round of a descent.
 
     Gaussians relocate before the first step of a round, so that neighbours relocate at the same
@@ -327,7 +301,7 @@ def rounds(method: Method, iterations: int) -> list[range]:
     Examples
     --------
     >>> import eigengs_dr as eg
-    >>> rounds(eg.DEFAULT, 30)
+    >>> exchange_rounds(eg.DEFAULT, 30)
     [range(0, 10), range(10, 20), range(20, 30)]
     """
     relocate = method.control(Relocate)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.types import Arrays
 from ..gaussian.file import CUTOFF, SetData
 from ..gaussian.region import crop, reaches
 from ..image.space import DATA
@@ -161,8 +162,6 @@ def allocate(mass: NDArray[np.float64], pixels: NDArray[np.int64], count: int) -
         missing -= step * len(changed)
     return counts
 
-
-Arrays = dict[str, NDArray[np.float32]]
 
 COLUMNS = {"mean": 2, "factor": 3, "ratio": 1}
 """Number of columns of the arrays; that of a colour is the number of channels."""

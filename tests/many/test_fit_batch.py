@@ -11,13 +11,13 @@ import pytest
 import eigengs_dr as eg
 from _helpers.sets import check_equal
 from _helpers.waves import picture
-from eigengs_dr.collection.fit_many import MAX_CUTOFF, _is_groupable, _may_join
 from eigengs_dr.fitting.fit import fit_images
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.place import Adaptive, Grid, Random
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 from eigengs_dr.image.pixels import EncodedImage
+from eigengs_dr.many.fit_many import MAX_CUTOFF, _is_groupable, _may_join
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 from eigengs_dr.raster.evaluate import is_steep
 from eigengs_dr.raster.parameters import kernel_radius, kernel_shape

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from ..backend.doors import door
 from ..backend.types import Values
-from ..fitting.objective import Affine
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.region import crop
@@ -20,8 +18,8 @@ from ..image.io import bits_of, dtype_of, to_file, write_pixels
 from ..image.metrics import squared_error
 from ..raster.render import filter_by_box, picture_of, render
 from ..storage.atomic import atomic_write
-from .grid import Block
-from .windows import TILE_SIDE, Source, Window, write_tiles
+from .block import BlockSettings, BlockTask
+from .windows import TILE_SIDE, write_tiles
 
 BAND_PIXELS = 1 << 22
 """Number of pixels of a band that is rendered at once; a pixel takes about 100 bytes."""
@@ -150,55 +148,23 @@ def save_region(
     write_pixels(path, picture, bits)
 
 
-class CompareTask(NamedTuple):
-    """A part of an image, and the Gaussians that touch it."""
-
-    block: Block
-    window: Window
-    data: SetData
-    backend: str | None
-
-
-def compare_tasks(
-    source: Source, data: SetData, blocks: list[Block], backend: str | None
-) -> Iterator[CompareTask]:
-    """Yield the comparison of each block of a set with its image."""
-    band, in_band = slice(0, 0), data
-    for block in blocks:
-        if block.rows != band:  # cropping first to a row of blocks is faster
-            band = block.rows
-            in_band = crop(data, (0, band.start), (source.width, band.stop - band.start))
-        size = (block.columns.stop - block.columns.start, band.stop - band.start)
-        part = crop(in_band, (block.columns.start, 0), size)
-        yield CompareTask(block, source.window(block.rows, block.columns), part, backend)
-
-
-def compare(
-    task: CompareTask, shared: None = None, *, affine: Affine, codes: bool
-) -> tuple[float, float]:
-    """Return the sums of the squared errors of a part in the spaces of psnr_ycbcr and psnr_rgb.
-
-    Parameters
-    ----------
-    task : CompareTask
-        Its set is in the unit of the fit.
-    affine : Affine
-        The unit of the fit.
-    codes : bool
-        Whether data is in [0, 1]. Otherwise the peak is the range, and psnr_rgb is NaN.
-    """
-    pixels, data = task.window.read(), task.data
+def block_errors(task: BlockTask, settings: BlockSettings) -> tuple[float, float]:
+    """Return the sums of the squared errors of a block in the spaces of psnr_ycbcr and psnr_rgb."""
+    assert task.arrays is not None
+    pixels, affine, backend = task.window.read(), settings.affine, settings.options.backend
+    size = pixels.shape[1], pixels.shape[0]
+    data = SetData(task.arrays, size, settings.space, settings.options.method.cutoff)
     if not data.space.by_range:
         scaled = {name: data.arrays[name] * np.float32(affine.scale) for name in COLORS}
         scaled["background"] += np.float32(affine.offset)
-        rendered = draw(data._replace(arrays=data.arrays | scaled), task.backend)
+        rendered = draw(data._replace(arrays=data.arrays | scaled), backend)
         floats = squared_error(rendered, pixels, data.space.figure)
         return floats, squared_error(rendered, pixels, "rgb")
     # Comparing in the unit of the fit avoids cancellation.
-    rendered = draw(data, task.backend)
+    rendered = draw(data, backend)
     values = (pixels - np.float32(affine.offset)) / np.float32(affine.scale)
     floats = squared_error(rendered, values, "data")
-    if not codes:
+    if not settings.is_of_codes:
         return floats, math.nan
     floats *= affine.scale**2
     return floats, squared_error(rendered * affine.scale + affine.offset, pixels, "rgb")

@@ -14,10 +14,10 @@ from _helpers.mosaics import FEW, Sliced, assert_same_bits, mosaic
 from _helpers.process import python_path, run_python
 from _helpers.sets import check_equal, random_scene
 from eigengs_dr.backend.executor import Done
-from eigengs_dr.blocks.draw import BAND_PIXELS, draw_region, save_region
 from eigengs_dr.cli.memory import estimate_memory
 from eigengs_dr.gaussian.file import read
 from eigengs_dr.image.color import to_coded
+from eigengs_dr.many.draw import BAND_PIXELS, draw_region, save_region
 from eigengs_dr.storage.checkpoint import read_arrays, write_arrays
 
 
@@ -116,7 +116,7 @@ def test_progress():
     eg.fit_large(
         mosaic(128),
         **FEW,
-        progress=lambda done, total, row: rows.append((row["stage"], done, total)),
+        progress=lambda done, total, row: rows.append((row.status, done, total)),
     )
     stages = list(dict.fromkeys(stage for stage, _, _ in rows))
     assert stages == ["survey", "place", "fit", "measure"]
@@ -181,7 +181,7 @@ def test_memory_is_that_of_a_block(tmp_path):
 import resource
 import numpy as np
 import eigengs_dr as eg
-from eigengs_dr.blocks.draw import save_region
+from eigengs_dr.many.draw import save_region
 from eigengs_dr.gaussian.file import read
 from pathlib import Path
 folder, side = Path({folder!r}), {side}
@@ -218,7 +218,7 @@ def test_written_set_draws_by_strips(tmp_path):
 
 def test_bands_of_a_smaller_picture_are_averaged(monkeypatch):
     """Also by Gaussians outside of a band or a region that become wider."""
-    monkeypatch.setattr("eigengs_dr.blocks.draw.BAND_PIXELS", 4096)
+    monkeypatch.setattr("eigengs_dr.many.draw.BAND_PIXELS", 4096)
     size, small = (16, 2048), (16, 512)
     scene = random_scene(0, 200, size)
     scene.mean[:, 1] = np.linspace(1008, 1040, 200)  # around the border of two bands
@@ -253,11 +253,12 @@ def stop_after(output, pixels, stage, share, settings=FEW, act=end):
     """Fit until a share of a stage is done."""
 
     def stop(done, total, row):
-        if row["stage"] == stage and done and done >= share * total:
+        if row.status == stage and done and done >= share * total:
             act()
 
-    with pytest.raises((Stop, KeyboardInterrupt)):
+    with pytest.raises((Stop, eg.Interrupted)) as stopped:
         eg.fit_large(pixels, output, progress=stop, **settings)
+    return stopped.value
 
 
 @pytest.mark.parametrize(("stage", "act"), [("fit", end), ("density", end), ("fit", press)])
@@ -265,7 +266,10 @@ def test_interrupted_run_goes_on(tmp_path, stage, act):
     pixels, output = mosaic(128), tmp_path / "a.npz"
     settings = FEW | {"iterations": 200 if stage == "density" else 20}
     whole = eg.fit_large(pixels, **settings)
-    stop_after(output, pixels, stage, 0.5, settings, act)
+    stopped = stop_after(output, pixels, stage, 0.5, settings, act)
+    if act is press:
+        row = stopped.result
+        assert (row.status, row.width, row.height, row.output) == (stage, 128, 128, output)
     folder = tmp_path / "a.npz.checkpoint"
     assert folder.is_dir() and not output.exists()
     again = eg.fit_large(pixels, output, **settings)
@@ -299,7 +303,7 @@ def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
         path.unlink()
 
     def note(done, total, row):
-        if row["stage"] == "fit":
+        if row.status == "fit":
             rows.append(done)
 
     assert_same_bits(whole, eg.fit_large(mosaic(64), output, progress=note, **settings))

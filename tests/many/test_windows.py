@@ -7,10 +7,10 @@ from PIL import Image
 
 from _helpers.files import png
 from _helpers.mosaics import Sliced, mosaic
-from eigengs_dr.blocks.windows import image_size, open_source, write_tiles
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.io import ImageError, load_image, save_image
 from eigengs_dr.image.tiff import has_windows
+from eigengs_dr.many.windows import image_size, open_source, write_tiles
 
 PART = slice(37, 90), slice(50, 131)
 

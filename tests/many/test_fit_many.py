@@ -122,9 +122,9 @@ def send_signal(done, total, row):
 
 @pytest.mark.parametrize("stop", [press, send_signal])
 def test_ctrl_c_leaves_what_is_done(photos, output, stop):
-    with pytest.raises(eg.RunInterrupted) as stopped:
+    with pytest.raises(eg.Interrupted) as stopped:
         eg.fit_many(photos, output, progress=stop, **QUICK)
-    assert [row.name for row in stopped.value.rows[:2]] == ["a", "b"]
+    assert [row.name for row in stopped.value.result[:2]] == ["a", "b"]
     left = files_in(output)
     assert left[:2] == ["a.npz", "b.npz"]  # and what was being fitted, if it was quick
     for name in left[:-1]:
