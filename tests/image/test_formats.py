@@ -1,6 +1,5 @@
 """Files of floats and of 16 bits: EXR, HDR, PFM, TIFF and PNG."""
 
-import sys
 import warnings
 
 import numpy as np
@@ -175,34 +174,9 @@ def test_a_tiff_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_
     save_image(tmp_path / "a.tif", LIGHT / 5000, bits=16)
     with tifffile.TiffFile(tmp_path / "a.tif", mode="r+b") as file:
         for name in ("ImageWidth", "ImageLength"):
-            file.pages[0].tags[name].overwrite(60_000)
-    with pytest.raises(ImageError, match="takes 43,200 MB in memory"):
+            file.pages[0].tags[name].overwrite(9000)
+    with pytest.raises(ImageError, match="takes 972 MB in memory"):
         load_image(tmp_path / "a.tif")
-
-
-def test_without_openimageio(tmp_path, monkeypatch):
-    save_image(tmp_path / "a.exr", LIGHT)
-    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
-    for act in (load_image, lambda path: save_image(path, LIGHT)):
-        with refused(ImageError, r"pip install 'eigengs-dr\[hdr\]'"):
-            act(tmp_path / "a.exr")
-    save_image(tmp_path / "a.pfm", LIGHT)  # needs no package
-
-
-@pytest.mark.parametrize("compression", ["lzw", "packbits"])
-def test_tiff_without_openimageio(tmp_path, monkeypatch, compression):
-    pixels = {8: (LIGHT / 20).astype(np.uint8), 16: LIGHT.astype(np.uint16)}
-    for bits, values in pixels.items():
-        image = oiio.ImageBuf(np.ascontiguousarray(values))
-        image.specmod().attribute("compression", compression)
-        assert image.write(str(tmp_path / f"{bits}.tif"), f"uint{bits}")
-    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
-    np.testing.assert_allclose(load_image(tmp_path / "8.tif"), pixels[8] / 255, atol=1e-6)
-    if compression == "lzw":
-        with refused(ImageError, "LZW with 16 bits needs another package; type: pip install"):
-            load_image(tmp_path / "16.tif")
-    else:  # tifffile knows it
-        np.testing.assert_allclose(load_image(tmp_path / "16.tif"), pixels[16] / 65535, atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "bits"), [("a.jpg", 16), ("a.hdr", 16), ("a.png", 32)])
