@@ -6,6 +6,7 @@ and JPEG with stray bytes. Headers are read, and the memory is checked, before a
 
 from __future__ import annotations
 
+import math
 import re
 import stat
 import sys
@@ -298,6 +299,8 @@ def _header(path: Path, file: oiio.ImageInput) -> Header:
     width, height = size[::-1] if orientation in TRANSPOSED else size
     stored, depth = spec.pixel_bytes(True), 8 * spec.format.size()
     needed = stored if encoding == "linear" else 2 * stored  # decoders hold a second copy
+    if _display(spec) != _data(spec):
+        needed += math.ceil(stored * spec.width * spec.height / max(1, math.prod(size)))
     if alpha in ("straight", "associated"):
         needed = max(needed, stored + 4 * colors)
     return Header(width, height, colors, needed, depth, encoding, orientation, alpha, notes)

@@ -1,5 +1,7 @@
 """Files of floats and of 16 bits: EXR, HDR, PFM, TIFF and PNG."""
 
+import os
+import sys
 import warnings
 
 import numpy as np
@@ -248,3 +250,27 @@ def test_a_tensor_of_colours_shall_say_what_it_is(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         save_image(tmp_path / "a.png", tensor, encoding="linear")
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="has names of text alone")
+def test_a_name_that_is_no_text(tmp_path):
+    path = tmp_path / os.fsdecode(b"\xff.png")
+    Image.fromarray(np.zeros((2, 3, 3), np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "a.png").rename(path)
+    assert load_image(path).shape == (2, 3, 3)
+
+
+def test_a_suffix_that_opens_no_file_is_refused(tmp_path):
+    """OpenImageIO makes a picture of a file whose suffix is .null, whatever it holds."""
+    save_image(tmp_path / "a.png", LIGHT / 5000)
+    (tmp_path / "a.png").rename(tmp_path / "a.null")
+    with refused(ImageError, r"a\.null: its suffix \.null is that of other files; rename it"):
+        load_image(tmp_path / "a.null")
+
+
+def test_a_jpeg_with_stray_bytes_is_read(tmp_path):
+    pixels = np.full((16, 24, 3), 200, np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=100)
+    content = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "a.jpg").write_bytes(content[:20] + b"\0\1\2" + content[20:])
+    np.testing.assert_allclose(load_image(tmp_path / "a.jpg"), pixels / 255, atol=0.01)
