@@ -19,8 +19,8 @@ from eigengs_dr.backend.types import ArrayLike
 from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
-from eigengs_dr.image.pictures import is_picture
 from eigengs_dr.image.pixels import ImageError, check_encoding, reason_of
+from eigengs_dr.image.read import is_picture
 
 from .environment import texels_of
 from .follow import check_scene, sensor_of

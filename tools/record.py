@@ -1053,8 +1053,6 @@ FILES = {
 
 def read(kind: str) -> Figures:
     """Write a kind of file, read it, and describe its pixels."""
-    if kind.startswith(("exr", "hdr", "png of 16 bits")):
-        package("OpenImageIO")
     path = folder() / f"{kind.replace(' ', '-')}.{kind.split()[0]}"
     try:
         FILES[kind](path)

@@ -1,9 +1,9 @@
 """Images: files, pixels, colour spaces and metrics. This folder knows no Gaussians.
 
 - ``io``: image files, and photos of scikit-image
-- ``formats``: suffixes, and the libraries that write files
-- ``header``, ``reading``: the header of a file, and its pixels, by the kind of the file
-- ``pictures``, ``tiff``, ``deep``: files that Pillow reads; TIFF; floats and more than 8 bits
+- ``formats``: who reads and writes which files
+- ``read``: headers and pixels of files, by OpenImageIO and Pillow; windows of large files
+- ``notes``: warnings about what is not applied, such as colour profiles
 - ``remote``: images behind URLs
 - ``pixels``: the encoding of pixels, sRGB or linear light, and the checks of an image
 - ``folder``: many images, in blocks
@@ -13,5 +13,4 @@
 - ``metrics``: PSNR, SSIM, MS-SSIM
 - ``structure``: differentiable SSIM of tensors
 - ``strips``: processing of strips of rows by threads
-- ``hilbert``: a curve through the cells of a square
 """

@@ -1,7 +1,4 @@
-"""Suffixes of image files, and the libraries that write them: Pillow, tifffile, OpenImageIO.
-
-OpenImageIO, from the extra ``hdr``, writes EXR, Radiance HDR and PNG files of 16-bit colour.
-"""
+"""The formats of image files: who reads them, their suffixes, and how they are written."""
 
 from __future__ import annotations
 
@@ -13,6 +10,21 @@ import numpy as np
 
 from ..backend.types import Record
 from .strips import Pixels
+
+STARTS = {
+    b"II*\0": "tiff",
+    b"MM\0*": "tiff",
+    b"II+\0": "tiff",
+    b"MM\0+": "tiff",
+    b"\x76\x2f\x31\x01": "openexr",
+    b"#?": "hdr",
+    b"\x89PNG\r\n\x1a\n": "png",
+    b"\xff\xd8\xff": "jpeg",
+    **{b"P%c" % kind: "pnm" for kind in b"123456Ff"},
+}
+"""First bytes of the files that OpenImageIO reads, with its names of the formats; Pillow reads all
+others. OpenImageIO 3.2 decodes JPEG 2000 before its size can be checked, takes the unused byte of a
+BMP file for alpha, and tells neither the frames of WebP nor whether a GIF is grey."""
 
 BITS: dict[str, tuple[int, ...]] = {
     ".png": (8, 16),
@@ -56,13 +68,11 @@ UNREAD_SUFFIXES = (
 """Suffixes of images that cannot be read; a warning names those in a folder."""
 
 PICTURE_SUFFIXES = tuple(suffix for suffix, bits in BITS.items() if 8 in bits)
-"""Suffixes of 8-bit files, which Pillow writes."""
+"""Suffixes of 8-bit files, which Pillow writes; OpenImageIO writes the others."""
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 
 LOSSY = (".jpg", ".jpeg", ".webp")
-
-ADVICE = "needs OpenImageIO; type: pip install 'eigengs-dr[hdr]'"
 
 MAX_HALF = 65_504.0
 """Largest finite 16-bit float."""
@@ -73,36 +83,22 @@ def write_file(path: Path, pixels: Pixels, bits: int) -> None:
 
     Raises
     ------
-    ImportError, ValueError, OSError
-        If a package is missing, or the file cannot be written.
+    ValueError, OSError
+        If the file cannot be written.
     """
     suffix = path.suffix.lower()
-    grey = pixels.shape[2] == 1
-    flat = pixels[..., 0] if grey else pixels
-    if bits == 8 or (suffix == ".png" and grey):
+    if bits == 8 or (suffix == ".png" and pixels.shape[2] == 1):
         from PIL import Image
 
         options: Record = {"quality": 95} if suffix in LOSSY else {}
+        flat = pixels[..., 0] if pixels.shape[2] == 1 else pixels
         Image.fromarray(flat).save(path, **options)
-    elif suffix in TIFF_SUFFIXES:
-        import tifffile
-
-        kind = "minisblack" if grey else "rgb"
-        tifffile.imwrite(path, flat, photometric=kind, compression="zlib")
-    elif suffix == ".pfm":
-        header = f"{'Pf' if grey else 'PF'}\n{pixels.shape[1]} {pixels.shape[0]}\n-1.0\n"
-        path.write_bytes(header.encode() + pixels[::-1].astype("<f4").tobytes())
     else:
         _write_openimageio(path, pixels, bits)
 
 
-def has_openimageio() -> bool:
-    """Return whether OpenImageIO is installed."""
-    return find_spec("OpenImageIO") is not None
-
-
 def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
-    """Write an EXR or HDR file, or a 16-bit PNG; 16-bit floats are clamped to +-65,504."""
+    """Write floats, a 16-bit PNG or a 16-bit TIFF; 16-bit floats are clamped to +-65,504."""
     import OpenImageIO as oiio
 
     suffix = path.suffix.lower()
@@ -114,8 +110,7 @@ def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
     image = oiio.ImageBuf(np.ascontiguousarray(pixels))
     image.set_write_format(kind)
     image.specmod().channelnames = ("R", "G", "B") if pixels.shape[2] == 3 else ("Y",)
-    if suffix == ".exr":
-        image.specmod().attribute("compression", "zip")
+    image.specmod().attribute("compression", "zip")
     written = image.write(str(path))
     reason = image.geterror().strip() or "the file is cut"
     if written and suffix == ".png":  # OpenImageIO takes one that a full disk has cut for written
@@ -123,10 +118,15 @@ def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
             file.seek(max(0, path.stat().st_size - len(PNG_END)))
             written = file.read() == PNG_END
     if not written:
-        with path.open("ab") as file:  # nor does it tell why; the system does
-            file.write(bytes(1 << 16))
-            os.fsync(file.fileno())
-        raise OSError(reason)
+        raise_reason(path, reason)
+
+
+def raise_reason(path: Path, reason: str) -> None:
+    """Raise the error of the system for a file that OpenImageIO could not write, or its own."""
+    with path.open("ab") as file:
+        file.write(bytes(1 << 16))
+        os.fsync(file.fileno())
+    raise OSError(reason)
 
 
 PNG_END = b"IEND\xaeB`\x82"

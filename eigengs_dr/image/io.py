@@ -15,15 +15,7 @@ from ..backend.messages import warn
 from ..backend.types import ArrayLike
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
-from .formats import (
-    ADVICE,
-    BITS,
-    SUFFIXES,
-    has_openimageio,
-    write_file,
-)
-from .header import over_background, transparency_note
-from .pictures import is_picture, picture_pixels
+from .formats import BITS, SUFFIXES, write_file
 from .pixels import (
     MAX_PIXEL,
     EncodedImage,
@@ -34,7 +26,14 @@ from .pixels import (
     reason_of,
     to_floats,
 )
-from .reading import decode, read_header
+from .read import (
+    decode,
+    is_picture,
+    over_background,
+    picture_pixels,
+    read_header,
+    transparency_note,
+)
 from .remote import is_copied, local_copy
 from .strips import Pixels, by_strips
 
@@ -44,16 +43,15 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
 
     The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation. It
     ignores colour profiles, with a warning if one is not sRGB. Integers are divided by their
-    largest value, so that 1 is white. Floats are not converted. EXR, Radiance HDR, and PNG of
-    16-bit colour need OpenImageIO, from the extra ``hdr``; without it, such a PNG is read with 8
-    bits and a warning. The manual has a table of all kinds of files.
+    largest value, so that 1 is white. Floats are not converted. The manual has a table of the kinds
+    of files.
 
     Parameters
     ----------
     path : str or Path
-        PNG, JPEG and other files that Pillow reads; TIFF; EXR; Radiance HDR; PGM, PPM and PFM. A
-        pipe, or the URL of such a file, of up to 1 GB is accepted too; URLs need fsspec, from the
-        extra ``cluster``.
+        TIFF, EXR, Radiance HDR, PNG, JPEG, PGM, PPM, PFM, and files that Pillow reads. A pipe, or
+        the URL of such a file, of up to 1 GB is accepted too; URLs need fsspec, from the extra
+        ``cluster``.
     keep_grey : bool, optional
         Return one channel if the file is grey and opaque.
 
@@ -136,10 +134,9 @@ def pixels_of(image: object) -> Any:
     if not is_picture(image):
         return image
     try:
-        pixels = picture_pixels(image)
+        pixels, alpha = picture_pixels(image)
     except ImageError as error:
         raise ImageError(f"image: {error}") from None
-    alpha = "straight" if pixels.shape[2] in (2, 4) else "none"
     pixels, transparent = over_background(pixels, alpha)
     if transparent:
         warn(f"image: {transparency_note(alpha)}")
@@ -222,8 +219,7 @@ def save_image(
     path : str or Path
         The suffix selects the format. Integers in sRGB: .png, .tif, .tiff, .bmp and .ppm are
         lossless; .jpg, .jpeg and .webp have quality 95. Floats in linear light: .exr, .hdr and
-        .pfm. EXR, HDR, and PNG of 16-bit colour need OpenImageIO, from the extra ``hdr``. An
-        existing file is replaced.
+        .pfm. An existing file is replaced.
     image : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
         RGB, or grey, which is written with one channel. Types as for `check_image`. Integers are
         clamped to [0, 1]; floats are not.
@@ -243,8 +239,8 @@ def save_image(
     Raises
     ------
     ImageError
-        If the array is not an image, the suffix is unknown, the format does not support the bits, a
-        package is missing or the file cannot be written. An existing file does not change.
+        If the array is not an image, the suffix is unknown, the format does not support the bits or
+        the file cannot be written. An existing file does not change.
     """
     refuse_url(path)
     path = Path(path)
@@ -271,7 +267,7 @@ def bits_of(path: Path, bits: int | None = None) -> int:
     Raises
     ------
     ImageError
-        If the suffix is unknown, the format does not support the bits, or OpenImageIO is missing.
+        If the suffix is unknown, or the format does not support the bits.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -281,8 +277,6 @@ def bits_of(path: Path, bits: int | None = None) -> int:
     if bits is not None and bits not in known_bits:
         supported = " or ".join(map(str, sorted(known_bits)))
         raise ImageError(f"{path}: bits is {bits}; a {suffix} file has {supported}")
-    if suffix in (".exr", ".hdr") and not has_openimageio():
-        raise ImageError(f"{path}: {ADVICE}")
     return bits or known_bits[0]
 
 
@@ -320,13 +314,11 @@ def write_pixels(path: Path, pixels: Pixels, bits: int) -> None:
     Raises
     ------
     ImageError
-        If a package is missing, or the file cannot be written.
+        If the file cannot be written.
     """
     try:
         with atomic_write(path) as temporary:
             write_file(temporary, pixels, bits)
-    except ImportError:
-        raise ImageError(f"{path}: {ADVICE}") from None
     except (OSError, ValueError) as error:
         message = reason_of(error)
         if not message.startswith(f"{path}: "):  # errors of atomic_write are clear already

@@ -18,12 +18,11 @@ from numpy.typing import DTypeLike, NDArray
 from ..backend.messages import warn
 from ..backend.types import Record, Values
 from ..gaussian.file import MAX_SET_SIDE
-from ..image.header import transparency_note
+from ..image.formats import raise_reason
 from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
 from ..image.pixels import encoding_of
-from ..image.reading import TIFF, decode, read_header, reader_of
+from ..image.read import decode, has_windows, read_header, read_window, transparency_note
 from ..image.remote import is_copied
-from ..image.tiff import has_windows, read_window
 
 Pixels = Values
 """Pixels (h, w) or (h, w, channels) of any dtype."""
@@ -112,8 +111,8 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     ----------
     source : path-like or array
         TIFF files with strips or tiles and ``.npy`` files are read by windows. Other files (PNG,
-        JPEG, unusual TIFF) are decoded completely: 8-bit colours take 10 bytes per pixel during
-        decoding, and 3 afterwards. An array (H, W, 3), (H, W, 1) or (H, W) has a dtype that
+        JPEG, unusual TIFF) are decoded completely: 8-bit colours take 6 to 10 bytes per pixel
+        during decoding, and 3 afterwards. An array (H, W, 3), (H, W, 1) or (H, W) has a dtype that
         `eigengs_dr.load_image` supports, and is read by slices
         ``source[top:bottom, left:right]``: an array of NumPy (also memory-mapped), zarr or Dask.
     keep_grey : bool, optional
@@ -178,13 +177,9 @@ def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixe
     header = read_header(path)
     shape = header.height, header.width, header.channels
     _check_sides(str(path), shape)
-    if reader_of(path) is TIFF and has_windows(path):
-        notes = (
-            header.notes
-            if header.alpha == "none"
-            else (*header.notes, transparency_note(header.alpha))
-        )
-        for note in notes:
+    if has_windows(path, header):
+        shown = (transparency_note(header.alpha),) if header.alpha != "none" else ()
+        for note in header.notes + shown:
             warn(f"{path}: {note}")
         return shape, absolute, header.encoding
     header.check_memory(path, as_floats=False)
@@ -247,25 +242,24 @@ def write_tiles(
     OSError
         If the file cannot be written.
     """
-    import tifffile
+    import OpenImageIO as oiio
 
     height, width, channels = shape
-    large = height * width * channels * np.dtype(dtype).itemsize > 4_000_000_000
-    with tifffile.TiffWriter(path, bigtiff=large) as file:
-        file.write(
-            _tiles(bands, width),
-            shape=shape if channels > 1 else shape[:2],
-            dtype=dtype,
-            photometric="rgb" if channels > 1 else "minisblack",
-            tile=(TILE_SIDE, TILE_SIDE),
-            compression="zlib",
-        )
-
-
-def _tiles(bands: Iterator[Pixels], width: int) -> Iterator[Pixels]:
-    """Cut bands into tiles; tifffile pads those at the edges."""
+    kind = "float" if np.dtype(dtype).kind == "f" else np.dtype(dtype).name
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.tile_width = spec.tile_height = TILE_SIDE
+    spec.attribute("compression", "zip")
+    if spec.image_bytes() > 4_000_000_000:
+        spec.attribute("tiff:bigtiff", 1)
+    file = oiio.ImageOutput.create("tiff")
+    assert file is not None
+    written, top = file.open(str(path), spec), 0
     for band in bands:
-        for top in range(0, len(band), TILE_SIDE):
-            for left in range(0, width, TILE_SIDE):
-                tile = band[top : top + TILE_SIDE, left : left + TILE_SIDE]
-                yield tile[..., 0] if tile.shape[2] == 1 else tile
+        place = (0, width, top, top + len(band), 0, 1)
+        written = written and file.write_tiles(*place, np.ascontiguousarray(band))
+        if not written:
+            break
+        top += len(band)
+    reason = file.geterror().strip()
+    if not (file.close() and written):
+        raise_reason(Path(path), reason or file.geterror().strip())

@@ -1,5 +1,6 @@
 """Files of floats and of 16 bits: EXR, HDR, PFM, TIFF and PNG."""
 
+import os
 import sys
 import warnings
 
@@ -175,34 +176,9 @@ def test_a_tiff_that_claims_too_many_pixels_is_refused_before_it_is_decoded(tmp_
     save_image(tmp_path / "a.tif", LIGHT / 5000, bits=16)
     with tifffile.TiffFile(tmp_path / "a.tif", mode="r+b") as file:
         for name in ("ImageWidth", "ImageLength"):
-            file.pages[0].tags[name].overwrite(60_000)
-    with pytest.raises(ImageError, match="takes 43,200 MB in memory"):
+            file.pages[0].tags[name].overwrite(9000)
+    with pytest.raises(ImageError, match="takes 972 MB in memory"):
         load_image(tmp_path / "a.tif")
-
-
-def test_without_openimageio(tmp_path, monkeypatch):
-    save_image(tmp_path / "a.exr", LIGHT)
-    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
-    for act in (load_image, lambda path: save_image(path, LIGHT)):
-        with refused(ImageError, r"pip install 'eigengs-dr\[hdr\]'"):
-            act(tmp_path / "a.exr")
-    save_image(tmp_path / "a.pfm", LIGHT)  # needs no package
-
-
-@pytest.mark.parametrize("compression", ["lzw", "packbits"])
-def test_tiff_without_openimageio(tmp_path, monkeypatch, compression):
-    pixels = {8: (LIGHT / 20).astype(np.uint8), 16: LIGHT.astype(np.uint16)}
-    for bits, values in pixels.items():
-        image = oiio.ImageBuf(np.ascontiguousarray(values))
-        image.specmod().attribute("compression", compression)
-        assert image.write(str(tmp_path / f"{bits}.tif"), f"uint{bits}")
-    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
-    np.testing.assert_allclose(load_image(tmp_path / "8.tif"), pixels[8] / 255, atol=1e-6)
-    if compression == "lzw":
-        with refused(ImageError, "LZW with 16 bits needs another package; type: pip install"):
-            load_image(tmp_path / "16.tif")
-    else:  # tifffile knows it
-        np.testing.assert_allclose(load_image(tmp_path / "16.tif"), pixels[16] / 65535, atol=1e-6)
 
 
 @pytest.mark.parametrize(("name", "bits"), [("a.jpg", 16), ("a.hdr", 16), ("a.png", 32)])
@@ -274,3 +250,27 @@ def test_a_tensor_of_colours_shall_say_what_it_is(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         save_image(tmp_path / "a.png", tensor, encoding="linear")
+
+
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="has names of text alone")
+def test_a_name_that_is_no_text(tmp_path):
+    path = tmp_path / os.fsdecode(b"\xff.png")
+    Image.fromarray(np.zeros((2, 3, 3), np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "a.png").rename(path)
+    assert load_image(path).shape == (2, 3, 3)
+
+
+def test_a_suffix_that_opens_no_file_is_refused(tmp_path):
+    """OpenImageIO makes a picture of a file whose suffix is .null, whatever it holds."""
+    save_image(tmp_path / "a.png", LIGHT / 5000)
+    (tmp_path / "a.png").rename(tmp_path / "a.null")
+    with refused(ImageError, r"a\.null: its suffix \.null is that of other files; rename it"):
+        load_image(tmp_path / "a.null")
+
+
+def test_a_jpeg_with_stray_bytes_is_read(tmp_path):
+    pixels = np.full((16, 24, 3), 200, np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=100)
+    content = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "a.jpg").write_bytes(content[:20] + b"\0\1\2" + content[20:])
+    np.testing.assert_allclose(load_image(tmp_path / "a.jpg"), pixels / 255, atol=0.01)

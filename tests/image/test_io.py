@@ -67,16 +67,6 @@ def test_16_bit_colour_keeps_its_precision(tmp_path, kind, channels):
     np.testing.assert_allclose(load_image(tmp_path / "a.png"), colors / 65535, atol=1e-7)
 
 
-def test_16_bit_colour_without_openimageio_has_8_bits_and_a_word(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "OpenImageIO", None)
-    rows = (np.arange(18) * 3000 + 77).astype(">u2").reshape(2, 3, 3)
-    (tmp_path / "a.png").write_bytes(png(3, 2, 16, 2, rows))
-    with pytest.warns(UserWarning, match="keeps 8 of its 16 bits.*eigengs-dr.hdr") as caught:
-        image = load_image(tmp_path / "a.png")
-    assert len(caught) == 1
-    np.testing.assert_allclose(image, (rows >> 8) / 255, atol=1e-7)
-
-
 @pytest.mark.parametrize("mode", ["RGBA", "LA"])
 def test_alpha_is_composited_over_white(tmp_path, mode):
     image = Image.new("LA", (2, 1), (51, 255))
@@ -141,8 +131,8 @@ def test_files_that_are_no_images(tmp_path, content, words):
 
 def test_decompression_bomb(tmp_path):
     path = tmp_path / "a.png"
-    path.write_bytes(png(30_000, 30_000, 8, 2, []))
-    with refused(ImageError, "takes 10,800 MB in memory, the limit is"):
+    path.write_bytes(png(9000, 9000, 8, 2, []))
+    with refused(ImageError, "takes 972 MB in memory, the limit is"):
         load_image(path)
 
 

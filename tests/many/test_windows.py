@@ -9,7 +9,7 @@ from _helpers.files import png
 from _helpers.mosaics import Sliced, mosaic
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.io import ImageError, load_image, save_image
-from eigengs_dr.image.tiff import has_windows
+from eigengs_dr.image.read import has_windows, read_header
 from eigengs_dr.many.windows import image_size, open_source, write_tiles
 
 PART = slice(37, 90), slice(50, 131)
@@ -42,7 +42,7 @@ def assert_same(source, pixels, part=PART):
 def test_tiff_is_read_by_windows(tmp_path, pixels, options):
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, pixels, photometric="rgb", **options)
-    assert has_windows(path) and image_size(path) == (150, 150, 3)
+    assert has_windows(path, read_header(path)) and image_size(path) == (150, 150, 3)
     assert_same(open_source(path), pixels)
 
 
@@ -106,8 +106,8 @@ def test_larger_than_pillow_allows(tmp_path, pixels, monkeypatch):
 
 
 def test_a_header_that_claims_too_much_is_refused_before_anything_is_decoded(tmp_path):
-    (tmp_path / "a.png").write_bytes(png(1 << 20, 1 << 20, 8, 2, []))  # 1 TB of pixels
-    with pytest.raises(ImageError, match="1048576x1048576 pixels; sides must be from 1 to 65,536"):
+    (tmp_path / "a.png").write_bytes(png(100_000, 1000, 8, 2, []))
+    with pytest.raises(ImageError, match="100000x1000 pixels; sides must be from 1 to 65,536"):
         open_source(tmp_path / "a.png")
     with pytest.raises(ImageError, match="MB in memory, the limit is"):
         load_image(tmp_path / "a.png")
@@ -173,5 +173,5 @@ def test_tiles_are_written(tmp_path, channels):
     write_tiles(tmp_path / "a.tif", pixels.shape, iter([pixels[:512], pixels[512:]]))
     found = np.asarray(Image.open(tmp_path / "a.tif"))
     np.testing.assert_array_equal(found.reshape(pixels.shape), pixels)
-    assert has_windows(tmp_path / "a.tif")
+    assert has_windows(tmp_path / "a.tif", read_header(tmp_path / "a.tif"))
     assert image_size(tmp_path / "a.tif") == pixels.shape
