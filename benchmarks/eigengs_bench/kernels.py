@@ -15,11 +15,10 @@ from eigengs_bench.report import Section, number, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.control import Perturb, Relocate
-from eigengs_dr.fitting.descent import begin
 from eigengs_dr.fitting.loop import descend, last, refine
 from eigengs_dr.fitting.measure import psnrs
 from eigengs_dr.fitting.objective import Pixels, data_of, picture
+from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.resize import center_crop
 from eigengs_dr.image.space import YCBCR
 from eigengs_dr.raster.binning.lists import TileLists
@@ -167,7 +166,7 @@ def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     objective = replace(Pixels.of(data, YCBCR, types), pictures=(display,))
     start = method.place_and_solve(objective, COUNT)
     bare = replace(method, controls=())
-    moves = [c for c in method.controls if isinstance(c, (Relocate, Perturb))]
+    moves = [*method.in_phase("moves"), *method.in_phase("shakes")]
     first = moves[0].steps(LONG)[0]
 
     def score(gaussians: eg.Gaussians) -> list[Row]:

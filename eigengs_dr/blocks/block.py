@@ -28,17 +28,22 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_in
 from ..backend.selection import select
 from ..backend.types import Float
-from ..fitting.control import Redistribute, Relocate
-from ..fitting.descent import State, begin
 from ..fitting.loop import descend, last
 from ..fitting.method import Method
 from ..fitting.objective import Affine, Extent, Part, Pixels, data_of
 from ..fitting.options import FitOptions
 from ..fitting.pixels import WHITE
-from ..fitting.placement.adaptive import density_from_hessian, place_by_density, shift_of
-from ..fitting.placement.density import Owners, density_ratio, squared_error
+from ..fitting.placement.adaptive import (
+    Owners,
+    density_from_hessian,
+    density_ratio,
+    place_by_density,
+    shift_of,
+    squared_error,
+)
 from ..fitting.placement.filters import Canvas
 from ..fitting.solve import solve
+from ..fitting.state import State, begin
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
 from ..image.space import YCBCR, Space
@@ -98,7 +103,7 @@ class PlaceTask(NamedTuple):
     old : dict of str to ndarray, or None
         The density according to a fit: mean (N, 2) and factor (N, 3) of the Gaussians in the
         window, in pixels of the window, and the ratio (N, 1), see
-        `eigengs_dr.fitting.placement.density.density_ratio`. By default the density depends on
+        `eigengs_dr.fitting.placement.adaptive.density_ratio`. By default the density depends on
         second derivatives only.
     """
 
@@ -296,7 +301,7 @@ def _descend(
     step_done: StepDone | None,
 ) -> Gaussians:
     """Take the steps of a task, with the controls of the method if the objective has a part."""
-    method, seed = settings.options.method.without(Redistribute), settings.options.seed
+    method, seed = settings.options.method.without("places"), settings.options.seed
     if objective.part is None:
         method = replace(method, controls=())
 
@@ -329,8 +334,7 @@ def rounds(method: Method, iterations: int) -> list[range]:
     >>> rounds(eg.DEFAULT, 30)
     [range(0, 10), range(10, 20), range(20, 30)]
     """
-    relocate = method.control(Relocate)
-    cuts = [0, *(relocate.steps(iterations) if relocate else [])]
+    cuts = sorted({0, *method.steps_in("moves", iterations)})
     number, latest = LAST_ROUNDS if cuts[1:] else SHORT_ROUNDS, cuts.pop()
     number = max(1, min(number, iterations - latest))
     cuts += [latest + k * (iterations - latest) // number for k in range(number + 1)]

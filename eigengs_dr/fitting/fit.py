@@ -23,8 +23,6 @@ from ..image.pixels import check_weight
 from ..image.space import DATA, YCBCR, space_of
 from ..raster.render import picture_of
 from .coarse import COARSE_TO_FINE
-from .control import Redistribute, Surplus
-from .descent import begin
 from .fewest import fewest
 from .from_loss import Problem, Spaces, refine_loss, views_of_spaces
 from .levels import place_levels, sort_levels
@@ -38,6 +36,7 @@ from .options import FitOptions, Goal, Start, named_options
 from .pixels import Image, PixelsOrPath, check_channels, read_pixels
 from .place import Adaptive
 from .start import check_start, load_start, set_in, start_from, types_for
+from .state import begin
 
 
 @dataclass(frozen=True, eq=False)
@@ -488,7 +487,7 @@ def _refined(
     (width, height), channels = objective.size, objective.channels
     counts = options.levels
     if counts or method.place != Adaptive():  # the choice of a placement is not undone
-        method = method.without(Surplus, Redistribute)
+        method = method.without("grows", "places")
     if counts:
         begun = place_levels(objective, method, counts, iterations, key, interrupted)
         objective = replace(objective, levels=counts[:-1])

@@ -19,13 +19,13 @@ from ..gaussian.gaussians import Gaussians
 from ..image.space import DATA, YCBCR, space_of
 from ..storage.npz import BadValue
 from .coarse import Coarse, texel_sums
-from .descent import begin
 from .loop import FitProgress, Refinement, descend, last, refine
 from .loss import Loss, LossObjective, View
 from .measure import Row
 from .method import DEFAULT
 from .objective import Data, Pixels
 from .options import FitOptions, max_gaussians_for
+from .state import begin
 
 Spaces: TypeAlias = "str | Mapping[str, str] | None"
 """The space of a picture, or those of several maps by name; data have one channel."""

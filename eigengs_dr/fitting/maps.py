@@ -25,7 +25,7 @@ from .measure import Row, psnrs
 from .objective import Data, Pixels, data_of, picture
 from .options import FitOptions, Goal
 from .pixels import read_pixels
-from .placement.density import squares_by_channel
+from .placement.adaptive import squares_by_channel
 
 Image = NDArray[np.float32]
 
