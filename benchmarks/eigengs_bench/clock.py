@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import eigengs_dr as eg
-from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate
-from eigengs_dr.fitting.descent import State, begin
+from eigengs_dr.fitting.control import Control, Perturb, Redistribute, Relocate, phase_of
 from eigengs_dr.fitting.fit import begin_fit
 from eigengs_dr.fitting.loop import descend
 from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.place import Adaptive
 from eigengs_dr.fitting.problem import problem_of_images
+from eigengs_dr.fitting.state import State, begin
 from eigengs_dr.image.metrics import MAX_PSNR
 from eigengs_dr.paper.eigengs import EIGENGS
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
@@ -30,8 +30,11 @@ METHODS = {"default": eg.DEFAULT, "gaussianimage": GAUSSIANIMAGE, "eigengs": EIG
 WARM_STEPS = 10
 """Steps of a fit that compiles the programs of the fits to be timed."""
 
-SOON = {Redistribute: Redistribute(after=1), Relocate: Relocate(every=3), Perturb: Perturb(every=3)}
-"""Controls that act within `WARM_STEPS`."""
+SOON: dict[str, Control] = {
+    control.phase: control
+    for control in (Redistribute(after=1), Relocate(every=3), Perturb(every=3))
+}
+"""Controls by phase that act within `WARM_STEPS`."""
 
 
 class Moment(NamedTuple):
@@ -98,7 +101,7 @@ def descent(
 def warm_up(image: Image, iterations: int, **options: Any) -> None:
     """Compile the programs of a fit, also those of its controls."""
     method, steps = options.pop("method", eg.DEFAULT), min(WARM_STEPS, iterations)
-    controls = tuple(SOON.get(type(control), control) for control in method.controls)
+    controls = tuple(SOON.get(phase_of(control) or "", control) for control in method.controls)
     soon = FitOptions(method=replace(method, controls=controls), **options)
     list(follow(image, steps, (0, steps), soon))
 

@@ -15,11 +15,10 @@ from eigengs_bench.report import Section, number, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.control import Perturb, Relocate
-from eigengs_dr.fitting.descent import begin
 from eigengs_dr.fitting.loop import Descent, descend, last, refine
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.problem import problem_of_images
+from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.resize import center_crop
 from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters
@@ -165,8 +164,8 @@ def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
     objective = problem.pixels()
     start = method.place_and_solve(objective, COUNT)
     bare = replace(method, controls=())
-    moves = [c for c in method.controls if isinstance(c, (Relocate, Perturb))]
-    first = moves[0].steps(LONG)[0]
+    moves = [*method.in_phase("moves"), *method.in_phase("shakes")]
+    first = min(moves[0].steps(LONG))
 
     measured = Descent(objective, method, lambda g: problem.measure(g, objective, 0.0))
 

@@ -22,11 +22,11 @@ from eigengs_bench.clock import Image
 from eigengs_bench.rows import Job, Row, Task, alone, peak_gib
 from eigengs_dr.backend.arrays import ArrayTypes, types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.descent import begin
 from eigengs_dr.fitting.loop import descend
 from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.placement.adaptive import place_adaptive
 from eigengs_dr.fitting.solve import solve
+from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.resize import center_crop
 from eigengs_dr.image.space import YCBCR
 

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..fitting.descent import begin
 from ..fitting.loop import descend, last
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
+from ..fitting.state import begin
 from ..gaussian.gaussians import Gaussians, like
 from ..image.space import DATA
 from ..raster.render import render

@@ -20,8 +20,8 @@ from ..backend.recording import freeze_program
 from ..backend.types import Float, UInt
 from .loss import LossObjective
 from .method import DEFAULT
-from .optimizer import Adam, Optimizer
 from .place import Adaptive
+from .state import Adam, Optimizer
 
 LEAST_SIDE = 4
 """Smallest length of the shorter side of the coarsest level, in texels."""

@@ -22,8 +22,6 @@ from ..image.pixels import check_weight
 from ..image.space import space_of
 from ..raster.render import picture_of
 from .coarse import COARSE_TO_FINE
-from .control import Redistribute, Surplus
-from .descent import begin
 from .from_loss import Watch, fit_loss
 from .levels import place_levels, sort_levels
 from .loop import Descent, FitProgress, Refinement, refine, sets_of
@@ -36,6 +34,7 @@ from .place import Adaptive
 from .problem import Map, PixelsOrPath, Problem, problem_of, problem_of_images
 from .search import fewest
 from .start import start_from
+from .state import begin
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +346,7 @@ def _refined(
     options, counts = problem.options, problem.levels
     objective, method = descent.objective, descent.method
     if counts or method.place != Adaptive():  # the choice of a placement is not undone
-        method = method.without(Surplus, Redistribute)
+        method = method.without("grows", "places")
     if counts:
         begun = place_levels(
             objective, method, counts, options.iterations, options.seed, descent.interrupted

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from ..backend.types import Float
 from ..gaussian.gaussians import Gaussians
 from .coarse import Coarse, texel_sums
-from .control import Redistribute, Surplus
-from .descent import begin
 from .loop import Descent, FitProgress, Refinement, descend, last, refine
 from .loss import LossObjective
 from .measure import Measured, Row
@@ -24,6 +22,7 @@ from .objective import Pixels
 from .options import max_gaussians_for
 from .place import Adaptive
 from .problem import Problem
+from .state import begin
 
 PIXELS_PER_GAUSSIAN = 16
 """Pixels of the picture per Gaussian, if nothing indicates how many the scene needs. On the scenes
@@ -171,7 +170,7 @@ def _start(
     options, image = problem.options, objective.image()
     method = replace(DEFAULT, place=options.method.place, cutoff=options.method.cutoff)
     if not isinstance(method.place, Adaptive):  # the choice of a placement is not undone
-        method = method.without(Surplus, Redistribute)
+        method = method.without("grows", "places")
 
     def fitted(count: int) -> Gaussians:
         start = method.place_and_solve(image, count, options.seed)

@@ -17,11 +17,11 @@ import drjit as dr
 import numpy as np
 
 from ..gaussian.gaussians import Gaussians, concatenate
-from .descent import begin
-from .exchange import removal_cost
+from .control import removal_cost
 from .loop import descend
 from .method import Method
 from .objective import Pixels
+from .state import begin
 
 STEPS_PER_LEVEL = 50
 """Largest number of refinement steps between the placements of two levels."""

@@ -13,11 +13,12 @@ from ..backend.arrays import types_of
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
-from .descent import State, listed, rate_table, started, step_program
-from .exchange import prune
+from .control import Control, prune
 from .measure import Measured, Row
-from .method import Control, Method
+from .method import Method
 from .objective import Pixels
+from .state import State
+from .step import listed, rate_table, started, step_program
 
 
 def descend(

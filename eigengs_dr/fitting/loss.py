@@ -30,7 +30,7 @@ from ..raster.render import bin_gaussians, pixels_inside, to_tensor
 from .objective import Channels, Pixels, Quadratic, Slope
 
 if TYPE_CHECKING:
-    from .descent import State
+    from .state import State
 
 
 LossFunction: TypeAlias = Callable[[Any, int], Any]

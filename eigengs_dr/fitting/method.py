@@ -3,43 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.doors import plain_numbers
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
-from .control import Perturb, Redistribute, Relocate, Retreat, Surplus
-from .optimizer import Adam, Optimizer
+from ..gaussian.gaussians import Gaussians
+from .control import (
+    Control,
+    Perturb,
+    Phase,
+    Redistribute,
+    Relocate,
+    Retreat,
+    Surplus,
+    phase_of,
+)
+from .objective import Pixels
 from .place import Adaptive, Placement
 from .solve import solve
-from .variables import Coordinates, Relative
-
-if TYPE_CHECKING:
-    from ..gaussian.gaussians import Gaussians
-    from .descent import State
-    from .objective import Pixels
-
-
-@runtime_checkable
-class Control(Protocol):
-    """A change of the Gaussians between steps of a descent: it adds, moves or removes some."""
-
-    def steps(self, iterations: int) -> Collection[int]:
-        """Return the steps of a descent before which the control acts."""
-
-    def __call__(
-        self, state: State, objective: Pixels, step: int, iterations: int, key: int
-    ) -> State:
-        """Return the state with other Gaussians, by `eigengs_dr.fitting.descent.State.replaced`.
-
-        All random numbers depend on `key` and `step`. A control that changes how many Gaussians the
-        result has sets the `count` of the state too.
-        """
+from .state import Adam, Coordinates, Optimizer, Relative, begin
 
 
 @runtime_checkable
@@ -57,9 +45,6 @@ class Model(Protocol):
 
     def dense_mean(self, width: int, height: int) -> NDArray[np.float32]:
         """Return the pixels (height, width, C) that a set lacks if the mean is "dense"."""
-
-
-Kind = TypeVar("Kind")
 
 
 @dataclass(frozen=True)
@@ -90,7 +75,7 @@ class Method:
         Gaussians by what they may move until the next build, see `Coordinates.reach`.
     rate_exponent : float
         Exponent by which the rates of means and shapes fall with the colour, see
-        `eigengs_dr.fitting.descent.rate_scale_of`.
+        `eigengs_dr.fitting.step.rate_scale_of`.
     average : float
         Share of the steps at the end whose mean set is the result, in [0, 1): for derivatives with
         noise, see `eigengs_dr.fitting.loop.averaged`. Controls must leave their Gaussians alone.
@@ -139,9 +124,8 @@ class Method:
             )
         if self.solve_steps < 0:
             raise ValueError(f"solve_steps is {self.solve_steps!r}; it must be at least 0")
-        surplus, relocate = self.control(Surplus), self.control(Relocate)
-        often = relocate.every if relocate else 0
-        if surplus and surplus.every and not 0 < often <= surplus.every:
+        every = {phase_of(c): getattr(c, "every", 0) for c in reversed(self.controls)}
+        if every.get("grows") and not 0 < every.get("moves", 0) <= every["grows"]:
             raise ValueError(
                 "controls: a Surplus leaves by a Relocate that comes as often; add one, or leave "
                 "the Surplus out"
@@ -184,16 +168,34 @@ class Method:
 
     def first_phase(self, iterations: int) -> int:
         """Return the steps before a redistribution; 0 if there is none."""
-        control = self.control(Redistribute)
-        return sum(control.steps(iterations)) if control else 0
+        return max(self.steps_in("places", iterations), default=0)
 
-    def control(self, kind: type[Kind]) -> Kind | None:
-        """Return the first control of a type, if there is one."""
-        return next((c for c in self.controls if isinstance(c, kind)), None)
+    def in_phase(self, phase: Phase) -> list[Control]:
+        """Return the controls of a phase."""
+        return [control for control in self.controls if phase_of(control) == phase]
 
-    def without(self, *kinds: type) -> Method:
-        """Return the method without the controls of some types."""
-        return replace(self, controls=tuple(c for c in self.controls if not isinstance(c, kinds)))
+    def steps_in(self, phase: Phase, iterations: int) -> set[int]:
+        """Return the steps of a descent before which controls of a phase act."""
+        return {step for control in self.in_phase(phase) for step in control.steps(iterations)}
+
+    def without(self, *phases: Phase) -> Method:
+        """Return the method without the controls of some phases.
+
+        Examples
+        --------
+        >>> import eigengs_dr as eg
+        >>> eg.DEFAULT.without("grows", "places", "moves", "shakes").controls
+        (Retreat(rise=4.0, factor=0.4, first=10),)
+        """
+        kept = tuple(c for c in self.controls if phase_of(c) not in phases)
+        return replace(self, controls=kept)
+
+    def surplus(self, gaussians: Gaussians, objective: Pixels, iterations: int) -> int:
+        """Return how many Gaussians more than a set a descent from it may have at first."""
+        state = begin(gaussians)
+        for control in self.in_phase("grows"):
+            state = control(state, objective, 0, iterations, 0)
+        return state.surplus
 
     def at_rates(self, factor: float) -> Method:
         """Return the method with all learning rates times a factor."""

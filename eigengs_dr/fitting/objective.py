@@ -31,7 +31,7 @@ from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import batch_to_tiles, bin_gaussians, pixels_inside, to_tensor
 
 if TYPE_CHECKING:
-    from .descent import State
+    from .state import State
 
 Image = NDArray[np.float32]
 

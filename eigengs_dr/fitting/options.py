@@ -20,7 +20,6 @@ from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
 from ..image.space import Space, space_of
 from .coarse import Coarse
-from .control import Redistribute
 from .loss import Loss
 from .method import DEFAULT, Method, Model
 from .place import Adaptive
@@ -194,7 +193,7 @@ class FitOptions:
             )
         if isinstance(self.method.place, Coarse):
             return
-        if not places or self.method.control(Redistribute) is None:
+        if not places or not self.method.in_phase("places"):
             raise ValueError(
                 f"{target} needs a method that places Gaussians by the image and redistributes "
                 "them, such as DEFAULT, and no start"

@@ -31,7 +31,7 @@ from .measure import Measured, Row, psnrs
 from .method import Model
 from .objective import Channels, Pixels, Target, pixels_of, restored
 from .options import FitOptions, Goal
-from .placement.density import squares_by_channel
+from .placement.adaptive import squares_by_channel
 from .start import check_start, load_start, set_in
 
 Image = NDArray[np.float32]

@@ -3,8 +3,8 @@
 The search has three stages. *Estimate*: short descents with few Gaussians ("tries") estimate the
 number. Two tries measure the gain per doubling; each try shows where to place the Gaussians of the
 next one (`eigengs_dr.fitting.placement.adaptive`). *Fit*: a longer descent with the estimate.
-*Polish*: Gaussians are dropped (`eigengs_dr.fitting.exchange`) while the set meets the goal, and
-added while it does not; each change ends with a short descent.
+*Polish*: Gaussians are dropped (`eigengs_dr.fitting.control.prune`) while the set meets the goal,
+and added while it does not; each change ends with a short descent.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ from typing import NamedTuple
 import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
-from .control import Perturb, Redistribute, Relocate, Surplus
-from .descent import begin
-from .exchange import densify, prune
+from .control import densify, prune
 from .loop import Descent, Refinement, descend
 from .measure import Row
 from .objective import Pixels
 from .placement.adaptive import redistribute
+from .state import begin
 
 # The constants of a search, chosen on training photos of ImageNet classes. With a surplus in the
 # fit, a fit of 1.0 and a margin of 1.1 take 4.6 and 1.6 % fewer Gaussians for 32 and 36 dB on 9
@@ -52,7 +51,7 @@ fit met the goal, so that they drop Gaussians."""
 
 DB_PER_DOUBLING = 4.0
 """Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
-`eigengs_dr.fitting.placement.density.ERROR_EXPONENT`."""
+`eigengs_dr.fitting.placement.adaptive.ERROR_EXPONENT`."""
 
 DOUBLING_RANGE = (2.0, 12.0)
 """Allowed range of the measured gain, in dB; training images gained 1.6 to 8."""
@@ -172,9 +171,9 @@ class _Run:
     ) -> _Trial:
         """Take some steps at a fraction of the learning rates, and score the pruned set."""
         descent = self.descent
-        method = descent.method.at_rates(share).without(Surplus, Redistribute)
+        method = descent.method.at_rates(share).without("grows", "places")
         if share < 1:  # a polish moves Gaussians by itself
-            method = method.without(Relocate, Perturb)
+            method = method.without("moves", "shakes")
         self.planned, before = max(self.planned, self.step + steps), self.step
         current = replace(begin(gaussians), count=len(gaussians) - surplus, surplus=surplus)
         states = descend(descent.objective, method, current, steps, descent.key + before)
@@ -279,9 +278,7 @@ def _fit_estimate(
 def _fit(run: _Run, estimate: _Estimate, steps: int) -> _Trial:
     """Fit the estimated number, with a surplus that is placed as well and leaves."""
     tried, placed = estimate
-    surplus, more = run.descent.method.control(Surplus), 0
-    if surplus:
-        more = surplus.number(len(placed), placed.width * placed.height, steps)
+    more = run.descent.method.surplus(placed, run.descent.objective, steps)
     if more:
         placed = run.redistribute(tried, len(placed) + more)
     return run.descend(placed, steps, surplus=more)

@@ -139,7 +139,7 @@ def _begin(
     squares = sum_lanes(lanes, lists)
     dr.eval(error, squares)  # together: later, the sums would render again
     color, diagonal = weigh(shape, error, channels, lists, cutoff, model.curvatures(grid))
-    inverse = by_channel(invert(diagonal[0]), channels), by_channel(invert(diagonal[1]), channels)
+    inverse = preconditioner(diagonal, channels)
     inverse = held_background(inverse) if held else inverse
     r = negate((color, channel_sums(error, channels, grid)))
     p = multiply(r, inverse)
@@ -308,14 +308,16 @@ def weigh(
     return products[:channels], (diagonal, channel_sums(factors, len(diagonal), lists.grid))
 
 
-def by_channel(values: list, channels: int) -> list:
+def for_channels(values: list, channels: int) -> list:
     """Return a value for each channel, from one for all or one for each."""
     return values * (channels // len(values))
 
 
-def invert(diagonal: list) -> list:
-    """Return one over the entries of a diagonal, and 0 for a Gaussian without a pixel."""
-    return [dr.select(d > 1e-8, rcp(d), 0) for d in diagonal]
+def preconditioner(diagonal: Unknowns, channels: int) -> Unknowns:
+    """Return one over a diagonal for each channel, and 0 for a Gaussian without a pixel."""
+    inverse = ([dr.select(d > 1e-8, rcp(d), 0) for d in part] for part in diagonal)
+    color, background = (for_channels(part, channels) for part in inverse)
+    return color, background
 
 
 def held_background(inverse: Unknowns) -> Unknowns:

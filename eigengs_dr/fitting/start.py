@@ -14,11 +14,11 @@ from ..backend.selection import select
 from ..backend.types import Float
 from ..gaussian.gaussians import Fitted, Gaussians, concatenate, set_of
 from ..image.space import Space
-from .exchange import densify, in_order, prune
+from .control import densify, in_order, prune
 from .method import Method, Model
 from .objective import Pixels
 from .options import FitOptions, Start
-from .placement.density import Owners, squared_error
+from .placement.adaptive import Owners, squared_error
 from .solve import solve
 
 MAX_ERROR, TRUSTED_STEPS = 0.4, 50

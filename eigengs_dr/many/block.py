@@ -28,17 +28,22 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_in
 from ..backend.selection import select
 from ..backend.types import Arrays, Float
-from ..fitting.control import Redistribute, Relocate
-from ..fitting.descent import State, begin
 from ..fitting.loop import descend, last
 from ..fitting.method import Method
 from ..fitting.objective import Channels, Part, Pixels, Target, pixels_of
 from ..fitting.options import FitOptions
-from ..fitting.placement.adaptive import density_from_hessian, place_by_density, shift_of
-from ..fitting.placement.density import Owners, density_ratio, squared_error
+from ..fitting.placement.adaptive import (
+    Owners,
+    density_from_hessian,
+    density_ratio,
+    place_by_density,
+    shift_of,
+    squared_error,
+)
 from ..fitting.placement.filters import Canvas
 from ..fitting.problem import WHITE
 from ..fitting.solve import solve
+from ..fitting.state import State, begin
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import ImageError
@@ -93,7 +98,7 @@ class BlockTask(NamedTuple):
         whose means lie in the window, and optionally their color (N, C); otherwise the initial
         colours are solved for. A placement takes the density of an earlier fit, if there is one:
         mean, factor, and the ratio (N, 1), see
-        `eigengs_dr.fitting.placement.density.density_ratio`; otherwise the density depends on
+        `eigengs_dr.fitting.placement.adaptive.density_ratio`; otherwise the density depends on
         second derivatives only.
     gaussians : int
         Number of Gaussians to place, from 1 to the number of pixels of the core.
@@ -271,7 +276,7 @@ def _descend(
     step_done: StepDone | None,
 ) -> Gaussians:
     """Take the steps of a task, with the controls of the method if the objective has a part."""
-    method, seed = settings.options.method.without(Redistribute), settings.options.seed
+    method, seed = settings.options.method.without("places"), settings.options.seed
     if objective.part is None:
         method = replace(method, controls=())
 
@@ -304,8 +309,7 @@ def exchange_rounds(method: Method, iterations: int) -> list[range]:
     >>> exchange_rounds(eg.DEFAULT, 30)
     [range(0, 10), range(10, 20), range(20, 30)]
     """
-    relocate = method.control(Relocate)
-    cuts = [0, *(relocate.steps(iterations) if relocate else [])]
+    cuts = sorted({0, *method.steps_in("moves", iterations)})
     number, latest = LAST_ROUNDS if cuts[1:] else SHORT_ROUNDS, cuts.pop()
     number = max(1, min(number, iterations - latest))
     cuts += [latest + k * (iterations - latest) // number for k in range(number + 1)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 
 from ..backend.types import Float, Rows
-from ..fitting.optimizer import debias, zeros_like
+from ..fitting.state import debias, zeros_like
 
 
 @dataclass(frozen=True)

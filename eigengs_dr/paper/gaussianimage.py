@@ -16,7 +16,7 @@ from ..backend.types import Float, FloatLike
 from ..fitting.method import Method
 from ..fitting.objective import Pixels
 from ..fitting.place import gaussians_at, random_shapes
-from ..fitting.variables import ImageSize, Variables
+from ..fitting.state import ImageSize, Variables
 from ..gaussian.covariance import cholesky_from_factor, factor_from_cholesky
 from ..gaussian.gaussians import Gaussians
 from .adan import Adan
@@ -34,7 +34,7 @@ class Cholesky:
     """atanh of the mean in [-1, 1], Cholesky factor of the covariance in pixels, and colour."""
 
     def encode(self, gaussians: Gaussians) -> Variables:
-        """Return the variables; see `eigengs_dr.fitting.variables.Coordinates`."""
+        """Return the variables; see `eigengs_dr.fitting.state.Coordinates`."""
         types = types_of(gaussians.mean)
         x, y = gaussians.mean
         sides = (dr.opaque(types.Float, side) for side in (gaussians.width, gaussians.height))
@@ -47,7 +47,7 @@ class Cholesky:
         }
 
     def decode(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Gaussians:
-        """Return the set; see `eigengs_dr.fitting.variables.Coordinates`."""
+        """Return the set; see `eigengs_dr.fitting.state.Coordinates`."""
         width, height = size or (fixed.width, fixed.height)
         mean, factor = fixed.mean, fixed.factor
         if "mean" in variables:
@@ -61,7 +61,7 @@ class Cholesky:
         return replace(fixed, mean=mean, factor=factor, color=color)
 
     def project(self, fixed: Gaussians, variables: Variables, size: ImageSize = None) -> Variables:
-        """Bound the diagonal; see `eigengs_dr.fitting.variables.Coordinates`."""
+        """Bound the diagonal; see `eigengs_dr.fitting.state.Coordinates`."""
         if "cholesky" not in variables:
             return variables
         l1, l2, l3 = variables["cholesky"]
@@ -70,7 +70,7 @@ class Cholesky:
         return {**variables, "cholesky": bounded}
 
     def reach(self, fixed: Gaussians, moves: dict[str, float]) -> tuple[FloatLike, float]:
-        """Return the growth of ellipses; see `eigengs_dr.fitting.variables.Coordinates`."""
+        """Return the growth of ellipses; see `eigengs_dr.fitting.state.Coordinates`."""
         side = 0.5 * max(fixed.width, fixed.height)  # the slope of tanh is at most 1
         return moves.get("mean", 0.0) * side + moves.get("cholesky", 0.0) * fixed.cutoff, 1.0
 

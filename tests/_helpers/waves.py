@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from _helpers.sets import random_scene
-from eigengs_dr.fitting.control import Redistribute, Surplus
-from eigengs_dr.fitting.descent import begin
 from eigengs_dr.fitting.loop import descend
 from eigengs_dr.fitting.method import DEFAULT
 from eigengs_dr.fitting.objective import Pixels
+from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.image.metrics import MAX_PSNR, psnr
 from eigengs_dr.paper.eigengs import EIGENGS
@@ -48,7 +47,7 @@ def start(backend, count=SPLATS, seed=0):
 
 def still(**changed):
     """The default method, which here places nothing anew, changed."""
-    return replace(DEFAULT.without(Surplus, Redistribute), **changed)
+    return replace(DEFAULT.without("grows", "places"), **changed)
 
 
 def half_read(backend, count=2):

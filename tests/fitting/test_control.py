@@ -9,11 +9,18 @@ import pytest
 import eigengs_dr as eg
 from _helpers.halves import SIDE, fitted, objective_of, picture, squared_error, ycbcr_psnr
 from _helpers.sets import check_equal
-from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Retreat, Surplus, rounds
-from eigengs_dr.fitting.descent import begin
+from eigengs_dr.fitting.control import (
+    Perturb,
+    Redistribute,
+    Relocate,
+    Retreat,
+    Surplus,
+    round_steps,
+)
 from eigengs_dr.fitting.loop import Descent, descend, refine
 from eigengs_dr.fitting.measure import Measured
 from eigengs_dr.fitting.objective import Part
+from eigengs_dr.fitting.state import begin
 
 COUNT, STEPS = 30, 100
 
@@ -32,12 +39,12 @@ def placed(image=None, backend=None):
 
 
 def test_rounds_end_after_two_thirds():
-    assert rounds(45, 100) == []
-    assert rounds(45, 140) == [46, 91]
-    assert rounds(45, 1000) == [round(650 * k / 14) for k in range(1, 15)]
-    assert rounds(45, 100_000)[-1] == 65_000
-    assert rounds(0, 1000) == []
-    assert Relocate().steps(1000) == Perturb().steps(1000) == rounds(45, 1000)
+    assert round_steps(45, 100) == []
+    assert round_steps(45, 140) == [46, 91]
+    assert round_steps(45, 1000) == [round(650 * k / 14) for k in range(1, 15)]
+    assert round_steps(45, 100_000)[-1] == 65_000
+    assert round_steps(0, 1000) == []
+    assert Relocate().steps(1000) == Perturb().steps(1000) == round_steps(45, 1000)
 
 
 def test_redistribution_comes_after_a_tenth_of_a_short_descent():
@@ -277,7 +284,7 @@ def test_an_interrupt_in_between_leaves_the_number_asked_for(color):
 def test_an_interrupt_after_the_last_round_keeps_the_best_set_before_it():
     """Just after noise the last step is poor; the best set with a surplus is pruned as well."""
     image = picture()
-    last_round = rounds(15, 200)[-1]
+    last_round = round_steps(15, 200)[-1]
 
     def stop(iteration, iterations, row):
         if iteration >= last_round:

@@ -14,17 +14,16 @@ from _helpers.waves import METHODS, SIDE, SPLATS, picture, start, still
 from eigengs_dr.backend.arrays import types_in, upload_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.control import Perturb
-from eigengs_dr.fitting.descent import (
+from eigengs_dr.fitting.loop import descend, last
+from eigengs_dr.fitting.objective import Pixels
+from eigengs_dr.fitting.state import Adam, begin
+from eigengs_dr.fitting.step import (
     MAX_RATE_SCALE,
-    begin,
     next_build,
     rate_scale_of,
     rate_table,
     started,
 )
-from eigengs_dr.fitting.loop import descend, last
-from eigengs_dr.fitting.objective import Pixels
-from eigengs_dr.fitting.optimizer import Adam
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import bin_gaussians
 

@@ -264,7 +264,7 @@ def test_a_search_ends_where_no_place_is_left_to_grow():
         ({"gaussians": 10}, "exclude each other"),
         ({"method": GAUSSIANIMAGE}, "needs a method that places Gaussians by the image"),
         ({"method": replace(eg.DEFAULT, place=Random())}, "places Gaussians by the image"),
-        ({"method": eg.DEFAULT.without(Redistribute)}, "and redistributes them, such as DEFAULT"),
+        ({"method": eg.DEFAULT.without("places")}, "and redistributes them, such as DEFAULT"),
         ({"target_psnr": 0}, "above 0"),
         ({"target_psnr": np.nan}, "above 0"),
         ({"target_psnr": 101}, "at most 100"),

@@ -10,8 +10,7 @@ from _helpers.halves import objective_of
 from _helpers.photos import coffee
 from _helpers.waves import METHODS
 from eigengs_dr.codec.packing import MSE_WITHOUT_IMAGE
-from eigengs_dr.fitting.control import Relocate, Surplus
-from eigengs_dr.fitting.exchange import removal_cost
+from eigengs_dr.fitting.control import removal_cost
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.options import level_counts
 from eigengs_dr.image.color import rgb_to_ycbcr
@@ -82,7 +81,7 @@ def test_every_level_gains_by_relocation():
     image, counts = eg.sample("coffee")[200:264, 300:364], [100, 140, 180]
     found, left = (
         fit(image, counts, iterations=300, method=method).gaussians
-        for method in (eg.DEFAULT, eg.DEFAULT.without(Surplus, Relocate))
+        for method in (eg.DEFAULT, eg.DEFAULT.without("grows", "moves"))
     )
     for count in counts:
         assert reached(found[:count], image) > reached(left[:count], image) + 0.3
@@ -159,7 +158,7 @@ def test_levels_with_weights(image):
     weight[:, 24:], hidden[:, 24:] = 0, np.nan
     found, left = (
         fit(hidden, [40, 120], iterations=200, weight=weight, method=method).gaussians
-        for method in (eg.DEFAULT, eg.DEFAULT.without(Surplus, Relocate))
+        for method in (eg.DEFAULT, eg.DEFAULT.without("grows", "moves"))
     )
     for count in (40, 120):
         one, other = (picture_of(g[:count])[:, :24] for g in (found, left))

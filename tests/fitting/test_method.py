@@ -11,9 +11,8 @@ from _helpers.photos import coffee
 from _helpers.waves import METHODS
 from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Retreat, Surplus
 from eigengs_dr.fitting.method import Method, Model
-from eigengs_dr.fitting.optimizer import Adam
 from eigengs_dr.fitting.place import Adaptive, Grid, gaussians_at
-from eigengs_dr.fitting.variables import Relative
+from eigengs_dr.fitting.state import Adam, Relative
 from eigengs_dr.paper.adan import Adan
 from eigengs_dr.paper.eigengs import EIGENGS, EigenGSMethod
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE, Cholesky, RandomColors
@@ -44,13 +43,25 @@ def test_a_method_is_a_value():
 
 
 def test_controls_of_a_method():
-    assert eg.DEFAULT.control(Surplus) == Surplus()
-    less = eg.DEFAULT.without(Surplus, Perturb)
-    assert less.control(Surplus) is None
-    assert less.controls == tuple(
-        c for c in eg.DEFAULT.controls if not isinstance(c, (Surplus, Perturb))
-    )
-    assert GAUSSIANIMAGE.control(Redistribute) is None
+    assert eg.DEFAULT.in_phase("grows") == [Surplus()]
+    less = eg.DEFAULT.without("grows", "shakes")
+    assert less.in_phase("grows") == []
+    assert less.controls == (Retreat(), Redistribute(), Relocate())
+    assert GAUSSIANIMAGE.in_phase("places") == []
+
+
+def test_a_control_of_ones_own_may_say_its_phase():
+    """Without one it acts in every descent."""
+    own, beside = Shrink(60), eg.DEFAULT.without("grows", "places", "moves", "shakes")
+    assert replace(eg.DEFAULT, controls=(own,)).without("moves").controls == (own,)
+    assert beside.controls == (Retreat(),)
+
+    class Mover(Shrink):
+        phase = "moves"
+
+    method = replace(eg.DEFAULT, controls=(Mover(60), *beside.controls))
+    assert method.steps_in("moves", 100) == {60} and method.first_phase(100) == 0
+    assert method.without("moves").controls == beside.controls
 
 
 def test_rates_times_a_factor():
@@ -84,7 +95,7 @@ def test_bad_values_are_refused(changed, words):
         ({"place": "random"}, "place holds 'random', which lacks what a Placement has"),
         ({"place": Grid}, "place holds <class .*Grid'>"),
         ({"controls": None}, "controls is None; give a tuple of controls"),
-        ({"controls": (print,)}, "controls holds .*see eigengs_dr.fitting.method.Control"),
+        ({"controls": (print,)}, "controls holds .*see eigengs_dr.fitting.control.Control"),
         ({"optimizer": 3}, "optimizer holds 3"),
         ({"coordinates": Adaptive()}, r"coordinates holds Adaptive\(\)"),
     ],

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.optimizer import Adam
+from eigengs_dr.fitting.state import Adam
 from eigengs_dr.paper.adan import Adan
 
 

@@ -9,7 +9,6 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, family, small_model
 from _helpers.halves import objective_of, picture
-from eigengs_dr.fitting.control import Perturb, Redistribute, Relocate, Surplus
 from eigengs_dr.fitting.place import Grid, Random
 from eigengs_dr.fitting.start import keep_fitting
 from eigengs_dr.image.resize import resample
@@ -23,7 +22,7 @@ places = pytest.mark.parametrize("place", [Grid(), Random()], ids=repr)
 def test_other_placements_stay_where_they_were_put(place):
     """They are not placed anew, and have no surplus."""
     method = replace(eg.DEFAULT, place=place)
-    plain = method.without(Surplus, Redistribute)
+    plain = method.without("grows", "places")
     one, other = (eg.fit(picture(), 60, 110, method=m) for m in (method, plain))
     np.testing.assert_array_equal(one.image, other.image)
 
@@ -35,7 +34,7 @@ def test_other_placements_gain_from_relocation(place):
     method = replace(eg.DEFAULT, place=place)
     moved, left = (
         eg.fit(image, 200, 600, method=m).psnr_rgb
-        for m in (method, method.without(Surplus, Relocate, Perturb))
+        for m in (method, method.without("grows", "moves", "shakes"))
     )
     assert moved > left + 0.3
 

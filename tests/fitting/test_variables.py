@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 from _helpers.footprints import matrices
 from _helpers.sets import COUNT, SIZE, few, random_scene, scenes
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.variables import Relative
+from eigengs_dr.fitting.state import Relative
 from eigengs_dr.gaussian.gaussians import MIN_DEVIATION
 from eigengs_dr.paper.gaussianimage import CHOLESKY_BOUND, MIN_DIAGONAL, Cholesky
 

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from eigengs_dr.fitting.control import Relocate
-from eigengs_dr.fitting.descent import next_build
 from eigengs_dr.fitting.method import DEFAULT
+from eigengs_dr.fitting.step import next_build
 from eigengs_dr.many.block import exchange_rounds
 from eigengs_dr.many.grid import BlockSets, allocate, divide
 
@@ -63,7 +62,7 @@ def test_rounds_take_every_step_once(iterations):
     assert [step for part in parts for step in part] == list(range(iterations))
     assert len(parts) == 1 or all(parts)
     starts = {part.start for part in parts}
-    assert set(DEFAULT.control(Relocate).steps(iterations)) <= starts  # a round may end with none
+    assert DEFAULT.steps_in("moves", iterations) <= starts  # a round may end with none
 
 
 def test_rates_rise_from_the_start_of_a_part():

@@ -10,8 +10,8 @@ from scipy.sparse import csr_array
 import eigengs_dr as eg
 from _helpers.poster import NAME, albedo, bitmap, blocks, board, camera, photo, scene_of
 from _helpers.sets import few
-from eigengs_dr.fitting.descent import begin
 from eigengs_dr.fitting.loop import descend, last
+from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.space import DATA
 from eigengs_dr.plugins import texture_of

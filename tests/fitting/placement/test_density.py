@@ -7,7 +7,7 @@ import eigengs_dr as eg
 from _helpers.halves import objective_for
 from _helpers.plain_placement import to_canvas, to_pixels
 from _helpers.sets import SIZE, random_scene
-from eigengs_dr.fitting.placement.density import (
+from eigengs_dr.fitting.placement.adaptive import (
     ERROR_EXPONENT,
     Owners,
     squared_error,

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from _helpers.plain_placement import plain_blur, plain_squared_hessian, to_canvas, to_pixels
 from _helpers.sets import few
-from eigengs_dr.fitting.placement.filters import blur, squared_hessian
+from eigengs_dr.fitting.placement.filters import smoothed, squared_hessian
 
 sizes = st.tuples(st.integers(1, 30), st.integers(1, 30), st.sampled_from([1, 3]))
 
@@ -21,7 +21,7 @@ def test_blur_is_that_of_scipy(backend, shape, deviation):
     """Also with weights wider than the image."""
     image = noise(shape)
     canvas, values = to_canvas(image, backend)
-    found = to_pixels(canvas, blur(canvas, values, deviation)).reshape(shape)
+    found = to_pixels(canvas, smoothed(canvas, values, deviation)).reshape(shape)
     np.testing.assert_allclose(found, plain_blur(image, deviation), atol=1e-6)
 
 
@@ -40,7 +40,7 @@ def test_second_derivatives_of_a_parabola(backend):
     """2 and 6 along the axes, 1 across: H H."""
     y, x = np.indices((30, 40))
     canvas, values = to_canvas((x * x + 3 * y * y + x * y)[..., None] / 64, backend)
-    energy, _ = squared_hessian(canvas, blur(canvas, values, 0.7), 0.0)
+    energy, _ = squared_hessian(canvas, smoothed(canvas, values, 0.7), 0.0)
     hessian = np.array([[2.0, 1], [1, 6]]) / 64
     squared = hessian @ hessian
     expected = [squared[0, 0], squared[1, 1], squared[0, 1]]

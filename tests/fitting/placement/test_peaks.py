@@ -11,8 +11,7 @@ from scipy.ndimage import correlate1d, maximum_filter
 from _helpers.sets import few
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.placement.filters import TRUNCATION, Canvas
-from eigengs_dr.fitting.placement.peaks import SIZE, residual_peaks
+from eigengs_dr.fitting.placement.filters import SIZE, TRUNCATION, Canvas, residual_peaks
 from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.render import batch_to_tiles
 

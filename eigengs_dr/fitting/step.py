@@ -1,4 +1,4 @@
-"""The state of a descent, its tile lists, and the program of one step.
+"""One step of a descent: its learning rates, its tile lists and its program.
 
 A step takes three kernels, with levels two more for each: the sum over Gaussians, which writes the
 derivative of the objective instead of an image; the adjoint; and the optimiser, with one lane per
@@ -8,14 +8,14 @@ Gaussian. `eigengs_dr.fitting.loop.descend` takes the steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from dataclasses import replace
+from typing import TypeAlias
 
 import drjit as dr
 import numpy as np
 
 from ..backend.arrays import ArrayTypes, make_divisor, types_of, upload
-from ..backend.types import Float, FloatLike, Mask, Rows, UInt
+from ..backend.types import Float, FloatLike, Mask, UInt
 from ..gaussian.gaussians import Gaussians, take
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.binning.lists import TileLists
@@ -24,97 +24,10 @@ from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, p
 from ..raster.render import bin_gaussians
 from .method import Method
 from .objective import Pixels, Quadratic, Slope
-from .variables import Coordinates, Variables
+from .state import Coordinates, Moving, State, Variables
 
 LOSS_EPSILON = 1e-10
 """Mean loss added before the logarithm of a level, which would diverge at 0."""
-
-
-class Moving(NamedTuple):
-    """What a step takes and returns.
-
-    Attributes
-    ----------
-    variables : dict of str to arrays
-        The variables that the optimiser moves.
-    moments : dict of str to tuple
-        The state of the optimiser for each variable.
-    time : Float, shape (1,)
-        Steps since the optimiser started.
-    speed : Float, shape (1,)
-        Factor of all learning rates.
-    packed : Float
-        The parameters of the set for the kernels.
-    rate_scale : Float or None
-        Factor of the learning rates of means and shapes, one for each Gaussian.
-    """
-
-    variables: Variables
-    moments: dict[str, tuple[Rows, ...]]
-    time: Float
-    speed: Float
-    packed: Float
-    rate_scale: Float | None
-
-
-@dataclass(frozen=True)
-class State:
-    """The state of a descent between two steps.
-
-    Attributes
-    ----------
-    gaussians : Gaussians
-        The current set; for a batch, image after image.
-    count : int
-        Requested number of Gaussians of an image.
-    surplus : int
-        How many more a control may place before the last ones have left.
-    chosen : bool
-        Whether the fit started from Gaussians of the user, which a redistribution keeps.
-    squares : Float or None, shape (images,)
-        The sums of ``h (p - t)^2`` that a control has measured before this step.
-    speed : float
-        Factor of all learning rates.
-    fixed : Gaussians or None
-        The set at which the optimiser started, whose variables move; None until the next step,
-        which starts the optimiser.
-    moving : Moving or None
-    since : int
-        The step at which the optimiser started.
-    lists : tuple of TileLists
-        Lists of the current set: one for each level, and one for the whole set.
-    until : int
-        The step that needs new lists.
-    """
-
-    gaussians: Gaussians
-    count: int
-    surplus: int = 0
-    chosen: bool = False
-    squares: Float | None = None
-    speed: float = 1.0
-    fixed: Gaussians | None = None
-    moving: Moving | None = None
-    since: int = 0
-    lists: tuple[TileLists, ...] = ()
-    until: int = 0
-
-    def replaced(self, gaussians: Gaussians) -> State:
-        """Return the state with another set, from which the optimiser starts anew.
-
-        A control that changes the number of the result sets `count` too.
-        """
-        return replace(self, gaussians=gaussians, squares=None, fixed=None, moving=None, lists=())
-
-    @property
-    def total(self) -> int:
-        """Number of Gaussians of an image."""
-        return len(self.gaussians) // dr.width(self.gaussians.background[0])
-
-
-def begin(gaussians: Gaussians, images: int = 1, chosen: bool = False) -> State:
-    """Return the state before the first step from the Gaussians of one image after another."""
-    return State(gaussians, len(gaussians) // images, chosen=chosen)
 
 
 def started(state: State, method: Method, step: int, images: int = 1) -> State:
@@ -133,7 +46,8 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
         scale = rate_scale_of(color, method.rate_exponent, images)
         dr.eval(scale)
     time, speed = dr.opaque(types.Float, 0), dr.opaque(types.Float, state.speed)
-    moving = Moving(variables, moments, time, speed, pack(gaussians), scale)
+    packed = pack_parameters([*kernel_shape(gaussians), *gaussians.color])
+    moving = Moving(variables, moments, time, speed, packed, scale)
     return replace(state, fixed=gaussians, moving=moving, since=step, lists=())
 
 
@@ -155,10 +69,20 @@ def listed(
     counts, gaussians = (*objective.levels, len(state.gaussians)), state.gaussians
     state = replace(state, lists=())  # old lists make room for new ones
     images = objective.grid.images
-    lists = [
-        bin_gaussians(prefix(gaussians, n), _prefix(pad, n), growth, images=images) for n in counts
-    ]
-    return replace(state, lists=tuple(lists), until=until)
+    lists = tuple(_lists_of_first(n, gaussians, pad, growth, images) for n in counts)
+    return replace(state, lists=lists, until=until)
+
+
+def _lists_of_first(
+    count: int, gaussians: Gaussians, pad: FloatLike, growth: float, images: int
+) -> TileLists:
+    """Return the lists of the first `count` Gaussians; `pad` has a number for each, or one."""
+    if count < len(gaussians):
+        first = dr.arange(types_of(gaussians.mean).UInt, count)
+        gaussians = take(gaussians, first)
+        if not isinstance(pad, float) and dr.width(pad) > 1:
+            pad = dr.gather(type(pad), pad, first)
+    return bin_gaussians(gaussians, pad, growth, images=images)
 
 
 def next_build(
@@ -288,7 +212,8 @@ def _move(
         variables, moments, time = dr.select(rests, before, (variables, moments, time))
     variables = coordinates.project(fixed, variables, size)
     moved = coordinates.decode(fixed, variables, size)
-    return Moving(variables, moments, time, moving.speed, pack(moved), moving.rate_scale), moved
+    packed = pack_parameters([*kernel_shape(moved), *moved.color])
+    return Moving(variables, moments, time, moving.speed, packed, moving.rate_scale), moved
 
 
 def _sum_level(parts: Float, lists: TileLists, channels: int, count: int) -> list:
@@ -319,20 +244,6 @@ def _pull_back(
         dr.enqueue(dr.ADMode.Backward, [row for row, _ in pairs])
         dr.traverse(dr.ADMode.Backward)
         return {name: dr.grad(value) for name, value in traced.items()}
-
-
-def _prefix(pad: FloatLike, count: int) -> FloatLike:
-    """Return the first `count` entries of an array; a number stays as it is."""
-    if isinstance(pad, float) or dr.width(pad) in (1, count):
-        return pad
-    return dr.gather(type(pad), pad, dr.arange(dr.uint32_array_t(type(pad)), count))
-
-
-def prefix(gaussians: Gaussians, count: int) -> Gaussians:
-    """Return the first `count` Gaussians of a set, differentiably, also in a frozen program."""
-    if count == len(gaussians):
-        return gaussians
-    return take(gaussians, dr.arange(types_of(gaussians.mean).UInt, count))
 
 
 MAX_RATE_SCALE = 1.7
@@ -369,8 +280,3 @@ def rate_scale_of(color: Sequence[Float], exponent: float, images: int = 1) -> F
     ratio = dr.select(mean > 0, mean / length, types.Float(1))
     bound = MAX_RATE_SCALE ** (1 / exponent)
     return dr.clip(ratio, 1 / bound, bound) ** exponent
-
-
-def pack(gaussians: Gaussians) -> Float:
-    """Return the parameters of a set for the kernels, in their layout in memory."""
-    return pack_parameters([*kernel_shape(gaussians), *gaussians.color])
