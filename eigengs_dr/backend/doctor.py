@@ -73,7 +73,7 @@ def report() -> Record:
     }
 
 
-def describe(diagnosis: Record) -> str:
+def describe_machine(diagnosis: Record) -> str:
     """Format a report as text.
 
     Parameters
@@ -173,7 +173,7 @@ class Trial(NamedTuple):
     problem: str = ""
 
 
-class Comparison(NamedTuple):
+class Agreement(NamedTuple):
     """A trial on llvm and on a GPU.
 
     Attributes
@@ -196,7 +196,7 @@ class Comparison(NamedTuple):
         return self.difference <= ALLOWED[self.name]
 
 
-def compare(name: str, backend: str) -> Comparison:
+def compare_backends(name: str, backend: str) -> Agreement:
     """Run a trial on llvm and on a GPU; this takes between a few seconds and a minute.
 
     Parameters
@@ -213,7 +213,7 @@ def compare(name: str, backend: str) -> Comparison:
         differences = [abs(one - other) / unit for one, other in pairs]
         if all(map(math.isfinite, differences)):
             difference = max(differences)
-    return Comparison(name, llvm, gpu, difference)
+    return Agreement(name, llvm, gpu, difference)
 
 
 def run_trial(name: str, backend: str) -> Trial:

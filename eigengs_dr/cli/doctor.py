@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..backend import doctor as machine
-from ..backend.doctor import ALLOWED, Comparison, compare
+from ..backend.doctor import ALLOWED, Agreement, compare_backends
 from ..backend.selection import BACKENDS
 from ..backend.types import Floats, Record
 from . import options
@@ -49,24 +49,24 @@ def doctor(
     facts = machine.report()
     works = any(facts[name]["works"] for name in BACKENDS)
     device = backend or "cuda"
-    comparisons: list[Comparison] = []
+    comparisons: list[Agreement] = []
     if gpu and not facts[device]["works"]:
         raise click.ClickException(f"--gpu: {device} does not work: {facts[device]['problem']}")
     for name in ALLOWED if gpu else ():
         print_message(f"{name}: on llvm and on {device}")
-        comparisons.append(compare(name, device))
+        comparisons.append(compare_backends(name, device))
     if as_json:
         rows = [{**row._asdict(), "agrees": row.agrees} for row in comparisons]
         facts |= {"trials": rows} if gpu else {}
         click.echo(json.dumps(facts, indent=2, default=str))
     else:
-        click.echo(machine.describe(facts))
+        click.echo(machine.describe_machine(facts))
     if gpu and not as_json:
         click.echo("\n".join(["", *_describe(comparisons, device)]))
     context.exit(0 if works and all(row.agrees for row in comparisons) else MISSED)
 
 
-def _describe(comparisons: list[Comparison], device: str) -> list[str]:
+def _describe(comparisons: list[Agreement], device: str) -> list[str]:
     """Format the trials as lines: times, differences and failures."""
     rows = [["trial", "llvm, s", f"{device}, s", "difference", "allowed", ""]]
     problems = []

@@ -125,7 +125,7 @@ def _describe_set(data: SetData) -> Facts:
 
 def _describe_fit(file: Path) -> Facts:
     """Describe a set and its fit. The set is read completely, to check that it can be loaded."""
-    data = set_file.read(file)
+    data = set_file.read_set(file)
     facts = _describe_set(data)
     if not data.maps and (figures := set_file.read_figures(file)):
         for name in ("psnr_ycbcr", "psnr_rgb"):  # JSON has no infinity

@@ -73,7 +73,7 @@ with the photo "coffee"."""
 
 
 @dataclass(frozen=True)
-class Level:
+class TexelLevel:
     """The texels of a level of a pyramid.
 
     Attributes
@@ -101,15 +101,15 @@ class Level:
         return (row * self.width + column) * self.channels + channel
 
 
-def levels_of(width: int, height: int, channels: int) -> list[Level]:
+def texel_levels(width: int, height: int, channels: int) -> list[TexelLevel]:
     """Return the levels of a pyramid from fine to coarse, each of half the size, rounded up."""
-    levels = [Level(width, height, channels)]
+    levels = [TexelLevel(width, height, channels)]
     while min(levels[-1].width, levels[-1].height) >= 2 * LEAST_SIDE:
-        levels.append(Level(-(-levels[-1].width // 2), -(-levels[-1].height // 2), channels))
+        levels.append(TexelLevel(-(-levels[-1].width // 2), -(-levels[-1].height // 2), channels))
     return levels
 
 
-def enlarge(values: Float, coarse: Level, fine: Level) -> Float:
+def enlarge(values: Float, coarse: TexelLevel, fine: TexelLevel) -> Float:
     """Return a level at twice its size: bilinear, with the border texels repeated outside.
 
     The weights along an axis are 3/4 for the texel that holds the centre, and 1/4 for the next.
@@ -124,7 +124,7 @@ def enlarge(values: Float, coarse: Level, fine: Level) -> Float:
     return total
 
 
-def shrink(values: Float, fine: Level, coarse: Level) -> Float:
+def shrink(values: Float, fine: TexelLevel, coarse: TexelLevel) -> Float:
     """Return the transpose of `enlarge`: from a derivative by the finer level to the coarser."""
     types = types_of(values)
     row, column, channel = coarse.place(types.UInt)
@@ -158,7 +158,7 @@ def _children(place: UInt, count: int, fine: int) -> list[tuple[UInt, Float]]:
     return children
 
 
-def _sum_levels(values: Sequence[Float], levels: Sequence[Level]) -> Float:
+def _sum_levels(values: Sequence[Float], levels: Sequence[TexelLevel]) -> Float:
     total = values[-1]
     for value, (fine, coarse) in zip(values[-2::-1], [*pairwise(levels)][::-1], strict=True):
         total = enlarge(total, coarse, fine) + value
@@ -187,7 +187,7 @@ def texel_sums(
         The sums of all levels before the first step and after each, as rows of pixels.
     """
     types, optimizer = objective.types, coarse.optimizer
-    levels = levels_of(*objective.size, objective.channels)
+    levels = texel_levels(*objective.size, objective.channels)
 
     def advance(
         values: list,

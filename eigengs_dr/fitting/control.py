@@ -30,7 +30,7 @@ from ..raster.kernels import channel_sums, sum_by_image, sum_lanes
 from ..raster.parameters import detached_shape
 from ..raster.render import bin_gaussians, to_tiles
 from .objective import Part, Pixels, Quadratic
-from .placement.adaptive import redistribute, squared_error
+from .placement.adaptive import error_by_pixel, redistribute
 from .placement.filters import SIZE, Canvas, Peaks, residual_peaks
 from .placement.pieces import order_along_hilbert
 from .solve import (
@@ -291,7 +291,7 @@ class Perturb:
         strength = self.strength * _strength(len(steps)) * (1 - done)
         squares, images = state.squares, objective.grid.images
         if squares is None:
-            squares = sum_by_image(squared_error(gaussians, objective), objective.grid)
+            squares = sum_by_image(error_by_pixel(gaussians, objective), objective.grid)
         movable = range(state.total)
         if objective.part is not None:
             movable = movable[objective.part.movable]
@@ -354,7 +354,7 @@ class Retreat:
         if objective.levels or objective.part or state.fixed is None:
             return state
         before, after = (
-            sum_by_image(squared_error(dr.detach(g), objective), objective.grid).numpy()
+            sum_by_image(error_by_pixel(dr.detach(g), objective), objective.grid).numpy()
             for g in (state.fixed, state.gaussians)
         )
         (width, height), channels = objective.size, objective.channels

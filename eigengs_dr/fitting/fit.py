@@ -16,7 +16,7 @@ from ..backend.doors import door, shows_progress
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import to_html
 from ..backend.types import ArrayLike
-from ..gaussian.file import FitFigures, write
+from ..gaussian.file import FitFigures, write_set
 from ..gaussian.gaussians import Gaussians
 from ..image.pixels import check_weight
 from ..image.space import space_of
@@ -119,7 +119,7 @@ class Fit:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the set with its PSNR, steps and source; see `eigengs_dr.Gaussians.save`."""
         figures = FitFigures(self.psnr_ycbcr, self.psnr_rgb, self.iterations, self.source)
-        write(path, self.gaussians.data(), figures)
+        write_set(path, self.gaussians.data(), figures)
 
 
 @named_options

@@ -125,7 +125,7 @@ def _squared_errors(
                 error = sum(dr.square((s - v) * a) for s, v in zip(sums, seen, strict=True))
                 rendering, seen = ([dr.fma(v, a, b) for v in pixel] for pixel in (sums, seen))
             else:
-                rendering = show(space, [dr.fma(s, a, b) for s in sums], light)
+                rendering = shown_pixel(space, [dr.fma(s, a, b) for s in sums], light)
                 if bases is not None:
                     rendering = [s + v for s, v in zip(rendering, bases[k], strict=True)]
                 error = squared_difference(rendering, seen, space.figure)
@@ -139,7 +139,7 @@ def _squared_errors(
     return [*floats, *codes, *areas]
 
 
-def show(space: Space, sums: list, exposure: Float | float = 1.0) -> list:
+def shown_pixel(space: Space, sums: list, exposure: Float | float = 1.0) -> list:
     """Convert the channels of a pixel as `eigengs_dr.picture_of` does, light to sRGB."""
     return [space.display(channel * exposure) for channel in space.decode(sums)]
 

@@ -435,7 +435,7 @@ class Pixels:
         return to_tensor(values, self.grid, self.channels)
 
 
-def pixels_of(shown: Sequence[Channels], types: ArrayTypes, weight: Image | None = None) -> Pixels:
+def squares_of(shown: Sequence[Channels], types: ArrayTypes, weight: Image | None = None) -> Pixels:
     """Return the squared error of the targets of all channels, without what PSNRs need.
 
     Errors of light weigh more in the dark.

@@ -29,7 +29,7 @@ from ..storage.npz import BadValue
 from .loss import LossObjective
 from .measure import Measured, Row, psnrs
 from .method import Model
-from .objective import Channels, Pixels, Target, pixels_of, restored
+from .objective import Channels, Pixels, Target, restored, squares_of
 from .options import FitOptions, Goal
 from .placement.adaptive import squares_by_channel
 from .start import check_start, load_start, set_in
@@ -150,7 +150,7 @@ class Problem:
 
     def pixels(self) -> Pixels:
         """Return the squared error of the images, with what the PSNRs need."""
-        pixels = pixels_of(self.channels, self.types, self.weight)
+        pixels = squares_of(self.channels, self.types, self.weight)
         pictures = tuple(c.picture(pixels.types, self.weight) for c in self.channels)
         return replace(pixels, pictures=pictures)
 
@@ -290,7 +290,7 @@ def problem_of_images(
     if isinstance(start, Gaussians):
         one_image(start)
     requested = options.space or (YCBCR if start is None else set_in(start).space)
-    read = [read_pixels(image, requested, weight, options.encoding) for image in images]
+    read = [pixels_in(image, requested, weight, options.encoding) for image in images]
     space, (height, width, channels) = read[0][1], read[0][0].shape
     options.check_image(width, height, channels)
     _check_weight_channels(weight, channels)
@@ -416,7 +416,7 @@ def _read_map(
         if not MIN_WEIGHT <= numbers["weight"] <= 1 / MIN_WEIGHT:
             raise ValueError(f"weight is {given.weight}; it must be from 1e-6 to 1e6")
         space = usual_space(name) if given.space is None else space_of(given.space)
-        pixels, space = read_pixels(given.image, space, weight, encoding)
+        pixels, space = pixels_in(given.image, space, weight, encoding)
         reached = goal.psnr if goal else None
         reached = Goal(numbers["goal"]).psnr if "goal" in numbers else reached
     except ValueError as error:
@@ -428,7 +428,7 @@ def _read_map(
     return Channels(name, space, part, (Target.of(pixels, space),), factor, reached)
 
 
-def read_pixels(
+def pixels_in(
     image: PixelsOrPath, space: Space, weight: Image | None = None, encoding: str | None = None
 ) -> tuple[Image, Space]:
     """Check an image, and convert it to display values (sRGB).

@@ -18,7 +18,7 @@ from .control import densify, in_order, prune
 from .method import Method, Model
 from .objective import Pixels
 from .options import FitOptions, Start
-from .placement.adaptive import Owners, squared_error
+from .placement.adaptive import Owners, error_by_pixel
 from .solve import solve
 
 MAX_ERROR, TRUSTED_STEPS = 0.4, 50
@@ -155,12 +155,12 @@ def keep_fitting(
     """
     placed = method.place_and_solve(objective, len(start), seed)
     with dr.suspend_grad():
-        errors = [squared_error(one, objective) for one in (start, placed)]
+        errors = [error_by_pixel(one, objective) for one in (start, placed)]
         stays = _fits_better(start, *errors)
         mixed = start
         if not stays.all() and stays.any():
             mixed = _mixed(start, placed, stays, ~_fits_better(placed, *errors), objective, method)
-        errors.append(squared_error(mixed, objective))
+        errors.append(error_by_pixel(mixed, objective))
         old, new, both = (dr.sum(error)[0] for error in errors)
     largest = 1 - (1 - MAX_ERROR) * min(1, iterations / TRUSTED_STEPS)
     if min(old, both) > largest * new:

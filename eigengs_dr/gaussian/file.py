@@ -135,13 +135,15 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
         )
 
 
-def write(path: str | os.PathLike[str], data: SetData, figures: FitFigures | None = None) -> None:
+def write_set(
+    path: str | os.PathLike[str], data: SetData, figures: FitFigures | None = None
+) -> None:
     """Write a set atomically as an ``.npz`` file in single precision.
 
     Raises
     ------
     ValueError
-        If the suffix is ``.egs``, or `read` would reject the set.
+        If the suffix is ``.egs``, or `read_set` would reject the set.
     OSError
         If the file cannot be written; an existing file does not change.
     """
@@ -231,7 +233,7 @@ def _properties(members: Arrays) -> tuple[tuple[int, int], Space, float, tuple[T
 
 
 def maps_of(path: Path) -> tuple[TextureMap, ...]:
-    """Return the maps of an ``.npz`` or ``.egs`` file, () for one image; errors as for `read`."""
+    """Return the maps of an ``.npz`` or ``.egs`` file, () for one image; errors: see `read_set`."""
     return packed.read_maps(path) if packed.is_packed(path) else read_head(path).maps
 
 
@@ -249,8 +251,8 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
     Raises
     ------
     ValueError
-        As for `read`; if a file with maps is read without a name, or one without maps with a name;
-        or if there is no such map. The message lists the maps.
+        As for `read_set`; if a file with maps is read without a name, or one without maps with a
+        name; or if there is no such map. The message lists the maps.
     """
     maps = maps_of(path)
     if not maps and name is not None:
@@ -258,7 +260,7 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
     if maps and name is None:
         names = ", ".join(m.name for m in maps)
         raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
-    data = read(path)
+    data = read_set(path)
     with file_errors(path):
         return data if name is None else data.map_data(name)
 
@@ -276,11 +278,11 @@ def read_figures(path: Path) -> FitFigures | None:
     return FitFigures(float(values[0]), float(values[1]), int(values[2]), printable(source))
 
 
-def read(path: Path, sections: int | None = None) -> SetData:
+def read_set(path: Path, sections: int | None = None) -> SetData:
     """Read and check a set; parameters and errors as for `eigengs_dr.Gaussians.load`."""
     with file_errors(path):
         if packed.is_packed(path):
-            data = packed.read_set(path, sections)
+            data = SetData(*packed.read_set(path, sections))
         elif sections is not None:
             raise BadValue("has no sections; pass sections for .egs files only")
         else:

@@ -25,7 +25,7 @@ from ..image.pixels import check_size
 from ..image.space import YCBCR, Space, space_of
 from ..storage.npz import BadValue
 from .channels import TextureMap, find_map
-from .file import CUTOFF, Arrays, SetData, check, read, write
+from .file import CUTOFF, Arrays, SetData, check, read_set, write_set
 
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can lie
@@ -310,7 +310,7 @@ class Gaussians:
         OSError
             If the file cannot be written; an existing file does not change.
         """
-        write(path, self.data())
+        write_set(path, self.data())
 
     @classmethod
     def load(
@@ -341,7 +341,7 @@ class Gaussians:
         OSError
             If there is no such file, it is a folder, or it cannot be opened.
         """
-        return cls.from_data(read(Path(path), sections), backend, dtype)
+        return cls.from_data(read_set(Path(path), sections), backend, dtype)
 
 
 def _arrays(

@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from .channels import TextureMap
-    from .file import SetData
 
 MAGIC = b"\x89EGS"
 """First bytes of a file. The first byte is not ASCII, so no text file starts with it."""
 
-read_set: Callable[[Path, int | None], SetData]
-"""``read_set(path, sections)`` reads a set; `sections` is a number, or None for all."""
+read_set: Callable[[Path, int | None], tuple]
+"""``read_set(path, sections)`` reads a `eigengs_dr.gaussian.file.SetData`; `sections` is a number,
+or None for all."""
 
 read_maps: Callable[[Path], tuple[TextureMap, ...]]
 """``read_maps(path)`` reads the maps of a set, without its Gaussians."""

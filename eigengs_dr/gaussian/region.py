@@ -40,7 +40,7 @@ def crop(
     Parameters
     ----------
     data : SetData
-        See `eigengs_dr.gaussian.file.read`.
+        See `eigengs_dr.gaussian.file.read_set`.
     corner : (float, float)
         x and y of the upper left corner of the region, in native pixels of the set.
     size : (int, int)

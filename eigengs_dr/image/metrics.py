@@ -9,20 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
-from ..backend.types import ArrayLike, Doubles, DrJitArray, Float, Singles, Tensor
+from ..backend.types import ArrayLike, Doubles, DrJitArray, Float, Singles
 from .color import RGB_TO_YCBCR, rgb_to_ycbcr, to_linear, to_pu21
 from .io import pixels_of, to_8bit
-from .pixels import check_weight, peak_of
+from .pixels import C1, C2, check_weight, is_tensor, peak_of
 from .strips import Pixels, map_threads, strips
-
-C1, C2 = 0.01**2, 0.03**2
-"""Constants of SSIM for images whose white is 1."""
 
 MAX_PSNR = 100.0
 """Upper bound of reported PSNRs, in dB: above it, differences are rounding errors."""
@@ -359,16 +356,6 @@ def _window(shape: tuple[int, ...]) -> Doubles:
     """Return one half of the window of SSIM along an axis, for images of shape (H, W, C)."""
     radius = min(WINDOW_SIDE // 2, (min(shape[:2]) - 1) // 2)
     return gaussian_taps(WINDOW_DEVIATION, radius / WINDOW_DEVIATION)
-
-
-def is_tensor(value: object) -> TypeGuard[Tensor]:
-    """Return whether a value is a Dr.Jit tensor of floats that may have derivatives."""
-    kind = type(value)
-    if not (kind.__module__.startswith("drjit.") and kind.__module__.endswith(".ad")):
-        return False
-    import drjit as dr
-
-    return dr.is_tensor_v(kind) and dr.is_float_v(kind)
 
 
 def _similarity(

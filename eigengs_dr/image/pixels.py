@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from operator import index
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.messages import warn
-from ..backend.types import ArrayLike, Singles
+from ..backend.types import ArrayLike, Singles, Tensor
 from .strips import Pixels, by_strips
 
 ENCODINGS = ("srgb", "linear")
@@ -29,6 +29,10 @@ error."""
 MAX_LIGHT = 1e9
 """Largest absolute value of light and of data, with 1 as white; squared errors stay well within the
 range of single precision."""
+
+
+C1, C2 = 0.01**2, 0.03**2
+"""Constants of SSIM for images whose white is 1."""
 
 
 class ImageError(ValueError):
@@ -114,7 +118,7 @@ def peak_of(dtype: np.dtype) -> int:
     raise ValueError(f"pixels are {dtype}; expected uint8, uint16 or floats in [0, 1]")
 
 
-def scale(pixels: Pixels, peak: int) -> NDArray[np.float32]:
+def scale_to_white(pixels: Pixels, peak: int) -> NDArray[np.float32]:
     """Divide pixels by the value of white."""
     with np.errstate(over="ignore"):  # infinities are clamped or rejected later
         return np.divide(pixels, peak, dtype=np.float32)
@@ -167,7 +171,7 @@ def to_floats(
     pixels: NDArray[np.float32] = array
     usable = array.dtype == np.float32 and array.shape[2] == channels
     if copy or not usable or not array.flags.c_contiguous:
-        pixels = by_strips(partial(scale, peak=peak), array, channels=channels)
+        pixels = by_strips(partial(scale_to_white, peak=peak), array, channels=channels)
     if encoding is not None:
         _check_range(pixels, name, encoding)
     return pixels
@@ -233,3 +237,13 @@ def check_size(size: Iterable[int]) -> tuple[int, int]:
     if min(width, height) < 1:
         raise ValueError(f"size is {width}x{height}; both sides must be at least 1 pixel")
     return width, height
+
+
+def is_tensor(value: object) -> TypeGuard[Tensor]:
+    """Return whether a value is a Dr.Jit tensor of floats that may have derivatives."""
+    kind = type(value)
+    if not (kind.__module__.startswith("drjit.") and kind.__module__.endswith(".ad")):
+        return False
+    import drjit as dr
+
+    return dr.is_tensor_v(kind) and dr.is_float_v(kind)

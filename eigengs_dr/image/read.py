@@ -23,7 +23,7 @@ from ..backend.messages import warn
 from ..storage.memory import check_content
 from .formats import HAS_HEIF, HEIF_SUFFIXES, STARTS
 from .notes import depth_notes, png_notes, primaries_note, profile_note
-from .pixels import EncodedImage, ImageError, peak_of, reason_of, scale
+from .pixels import EncodedImage, ImageError, peak_of, reason_of, scale_to_white
 from .strips import Pixels, by_strips
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def over_background(pixels: Pixels, alpha: str) -> tuple[Pixels, bool]:
         return pixels[..., :-1], True
 
     def blend(rows: Pixels) -> NDArray[np.float32]:
-        rows = scale(rows, peak)
+        rows = scale_to_white(rows, peak)
         if alpha == "associated":
             return rows[..., :-1] + (1 - rows[..., -1:])
         return 1 - rows[..., -1:] * (1 - rows[..., :-1])
@@ -461,7 +461,7 @@ def _to_colors(samples: Pixels, spec: oiio.ImageSpec) -> Pixels:
     """Convert samples (H, W, S) to grey or RGB, with alpha as the last channel, if any."""
     inverted = spec.getattribute("tiff:PhotometricInterpretation") == 0
     if samples.dtype == np.uint32:
-        samples = by_strips(lambda rows: scale(rows, 2**32 - 1), samples)
+        samples = by_strips(lambda rows: scale_to_white(rows, 2**32 - 1), samples)
     count, place = _colors_of(spec), spec.alpha_channel
     colors = samples[..., :count]
     if inverted and spec.format.size() > 1:  # OpenImageIO inverts bytes

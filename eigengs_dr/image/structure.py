@@ -33,7 +33,7 @@ from ..backend.arrays import (
 )
 from ..backend.doors import door
 from ..backend.types import Bool, Doubles, Float, Tensor, UInt, Values
-from .metrics import C1, C2, is_tensor
+from .pixels import C1, C2, is_tensor
 
 BLOCK = 8
 """Number of values of a line that a lane computes. With 16 it reads a quarter less, but the values
@@ -125,7 +125,7 @@ class _Similarity(dr.CustomOp):
     def eval(self, x: Float, y: Float, weight: Float | None, size: Size, wanted: str) -> Float:
         self.pictures, self.size, self.wanted = {"x": x, "y": y}, size, wanted
         means = blur_columns(x, y, size)
-        similar, area, self.slopes = compare(means, weight, size, wanted)
+        similar, area, self.slopes = compare_runs(means, weight, size, wanted)
         total, area = _totals([similar, area])
         self.share = rcp(area)
         return total * self.share
@@ -274,7 +274,7 @@ class Runs(NamedTuple):
         return [line[before * BLOCK - shift :] for line in lines]
 
 
-def write(planes: list[list[Float]], lanes: Lanes) -> Runs:
+def write_runs(planes: list[list[Float]], lanes: Lanes) -> Runs:
     """Write the values that lanes computed: for each plane, those of a block."""
     types, values = types_of(planes[0][0]), [v for plane in planes for v in plane]
     result = dr.empty(types.Float, dr.width(lanes.run) * len(values))
@@ -282,7 +282,7 @@ def write(planes: list[list[Float]], lanes: Lanes) -> Runs:
     return Runs(result, len(planes), lanes)
 
 
-def blur(values: list[Float], taps: tuple[float, ...]) -> list[Float]:
+def blur_plane(values: list[Float], taps: tuple[float, ...]) -> list[Float]:
     """Return the weighted sums of neighbours, for values whose neighbours are all given."""
     radius = len(taps) - 1
     results = []
@@ -314,10 +314,10 @@ def blur_columns(x: Float, y: Float, size: Size) -> Runs:
     a, b = read(x), read(y)
     squares = [dr.fma(u, u, v * v) for u, v in zip(a, b, strict=True)]
     products = [u * v for u, v in zip(a, b, strict=True)]
-    return write([blur(plane, size.taps) for plane in (a, b, squares, products)], lanes)
+    return write_runs([blur_plane(plane, size.taps) for plane in (a, b, squares, products)], lanes)
 
 
-def compare(
+def compare_runs(
     columns: Runs, weight: Float | None, size: Size, wanted: str
 ) -> tuple[Float, Float, Runs | None]:
     """Blur along rows, and compute SSIM from the local means of all windows.
@@ -343,7 +343,7 @@ def compare(
     types = types_of(columns.values)
     lanes = lanes_of(types, size.rows, size.channels, size.columns, "place channel block")
     read = columns.across(lanes, 0, BLOCK + size.reach)
-    means = zip(*(blur(plane, size.taps) for plane in read), strict=True)
+    means = zip(*(blur_plane(plane, size.taps) for plane in read), strict=True)
     similar, area = types.Float(0), types.Float(0)
     slopes = []
     for w, (x, y, squares, product) in zip(
@@ -362,7 +362,7 @@ def compare(
         slope = [-s * lower[0] * share, 2 * upper[0] * share, *(by_mean[n] for n in wanted)]
         slopes.append([dr.select(w > 0, w * d, 0) for d in slope])
     planes = [list(plane) for plane in zip(*slopes, strict=True)]
-    return similar, area, write(planes, lanes) if wanted else None
+    return similar, area, write_runs(planes, lanes) if wanted else None
 
 
 def weights_of(types: ArrayTypes, weight: Float | None, lanes: Lanes, size: Size) -> list[Float]:
@@ -386,7 +386,7 @@ def return_to_rows(slopes: Runs, size: Size) -> Runs:
     types = types_of(slopes.values)
     lanes = lanes_of(types, size.rows, size.channels, size.width, "block channel place")
     read = slopes.along(lanes, size.reach)
-    return write([blur(plane, size.taps) for plane in read], lanes)
+    return write_runs([blur_plane(plane, size.taps) for plane in read], lanes)
 
 
 def return_to_pixels(
@@ -399,7 +399,7 @@ def return_to_pixels(
     types = types_of(slopes.values)
     lanes = lanes_of(types, size.width, size.channels, size.height, "channel place block")
     read = slopes.across(lanes, size.reach, BLOCK + size.reach)
-    by_squares, by_product, *by_means = (blur(plane, size.taps) for plane in read)
+    by_squares, by_product, *by_means = (blur_plane(plane, size.taps) for plane in read)
     step = dr.opaque(types.UInt, size.width * size.channels)
     results = {}
     for name, by_mean in zip(wanted, by_means, strict=True):

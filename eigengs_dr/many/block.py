@@ -30,15 +30,15 @@ from ..backend.selection import select
 from ..backend.types import Arrays, Float
 from ..fitting.loop import descend, last
 from ..fitting.method import Method
-from ..fitting.objective import Channels, Part, Pixels, Target, pixels_of
+from ..fitting.objective import Channels, Part, Pixels, Target, squares_of
 from ..fitting.options import FitOptions
 from ..fitting.placement.adaptive import (
     Owners,
     density_from_hessian,
     density_ratio,
+    error_by_pixel,
     place_by_density,
     shift_of,
-    squared_error,
 )
 from ..fitting.placement.filters import Canvas
 from ..fitting.problem import WHITE
@@ -151,7 +151,7 @@ def _objective(task: BlockTask, settings: BlockSettings) -> Pixels:
     types = types_in(select(settings.options.backend))
     target = Target.of(task.window.read(), settings.space, settings.affine)
     part = slice(0, target.pixels.shape[2])
-    return pixels_of([Channels("", settings.space, part, (target,))], types)
+    return squares_of([Channels("", settings.space, part, (target,))], types)
 
 
 def _density(objective: Pixels, settings: BlockSettings) -> tuple[Canvas, Float, Float]:
@@ -210,7 +210,7 @@ def find_density(
     fitted = _descend(objective, start, task, settings, step_done)
     canvas, _, density = _density(full, settings)
     owners = Owners.of(fitted)
-    error = squared_error(fitted, objective, owners.lists)
+    error = error_by_pixel(fitted, objective, owners.lists)
     ratio = density_ratio(owners, error, density)
     arrays = fitted.to_arrays()
     return {
@@ -237,7 +237,7 @@ def fit_block(
     if task.part.stop == task.iterations:
         # Only the last steps are undone if they increase the error, as for a nearly perfect set;
         # earlier steps may increase it temporarily.
-        before, after = (float(dr.sum(squared_error(g, objective))[0]) for g in (start, fitted))
+        before, after = (float(dr.sum(error_by_pixel(g, objective))[0]) for g in (start, fitted))
         fitted = fitted if after < before else start
     arrays = fitted.to_arrays()
     return {name: arrays[name][task.members] for name in ("mean", "factor", "color")}

@@ -23,7 +23,7 @@ from ..cluster import executor_for
 from ..fitting.method import DEFAULT, Method
 from ..fitting.objective import restored
 from ..fitting.options import FitOptions, named_options
-from ..gaussian.file import SetData, check_suffix, write
+from ..gaussian.file import SetData, check_suffix, write_set
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.region import crop
 from ..image.metrics import psnr_from_mse
@@ -212,7 +212,7 @@ def fit_large(
             result = restored(fitted, [run.settings.affine] * fitted.channels)
             if output is not None:
                 measured = replace(row, psnr_ycbcr=ycbcr, psnr_rgb=rgb)
-                write(output, result.data(), figures_of(measured))
+                write_set(output, result.data(), figures_of(measured))
     except KeyboardInterrupt:
         kept = "repeat the call to continue" if output is not None else "no output keeps the blocks"
         raise Interrupted(run.row, f"the run was interrupted; {kept}") from None

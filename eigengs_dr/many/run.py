@@ -33,7 +33,7 @@ from ..backend.messages import warn
 from ..backend.recording import exclusive
 from ..cluster import executor_for
 from ..fitting.fit import Fit
-from ..gaussian.file import FitFigures, write
+from ..gaussian.file import FitFigures, write_set
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import read_ahead
 from ..image.io import check_data, read_floats
@@ -236,7 +236,7 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
                     file = None
                     if gaussians is not None and row.output:
                         # Only this thread uses Dr.Jit: the writers get NumPy arrays.
-                        file = pool.submit(write, row.output, gaussians.data(), figures_of(row))
+                        file = pool.submit(write_set, row.output, gaussians.data(), figures_of(row))
                     writing.append((source, row, file))
                     while writing and (len(writing) > MAX_WRITING or is_written()):
                         yield _finish(*writing.popleft())

@@ -151,26 +151,26 @@ def restore_package():
 
 def patch_write(replacement):
     """Replace the function that writes results, in this process."""
-    from eigengs_dr.gaussian.file import write
+    from eigengs_dr.gaussian.file import write_set
     from eigengs_dr.many import run
 
-    run.write = lambda *arguments: replacement(write, *arguments)
+    run.write_set = lambda *arguments: replacement(write_set, *arguments)
 
 
 def mend_writes():
     """Write results again, in this process."""
-    from eigengs_dr.gaussian.file import write
+    from eigengs_dr.gaussian.file import write_set
     from eigengs_dr.many import run
 
-    run.write = write
+    run.write_set = write_set
 
 
 def slow_writes():
     """Let every write of a result take long, in this process."""
 
-    def slow(write, *arguments):
+    def slow(write_set, *arguments):
         time.sleep(0.5)
-        write(*arguments)
+        write_set(*arguments)
 
     patch_write(slow)
 
@@ -182,11 +182,11 @@ class DieInWrite(WorkerPlugin):
         self.file = name
 
     def setup(self, worker):
-        def die(write, path, *arguments):
+        def die(write_set, path, *arguments):
             if path.name == self.file:
                 path.with_name(".eigengs_dr-0123456789abcdef.npz").write_bytes(b"half")
                 os.kill(os.getpid(), signal.SIGKILL)
-            write(path, *arguments)
+            write_set(path, *arguments)
 
         patch_write(die)
 

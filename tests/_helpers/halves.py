@@ -7,7 +7,7 @@ import numpy as np
 import eigengs_dr as eg
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.objective import Channels, Pixels, Target, pixels_of
+from eigengs_dr.fitting.objective import Channels, Pixels, Target, squares_of
 from eigengs_dr.image.space import space_of
 from eigengs_dr.raster.render import picture_of, render, to_tensor
 
@@ -28,7 +28,7 @@ def objective_of(image, backend=None, space="ycbcr", weight=None):
     known = space_of(space)
     target = Target.of(np.asarray(image, np.float32), known)
     shown = [Channels("", known, slice(0, target.pixels.shape[2]), (target,))]
-    return pixels_of(shown, types_in(select(backend)), weight)
+    return squares_of(shown, types_in(select(backend)), weight)
 
 
 def objective_for(gaussians, target, weight=None):

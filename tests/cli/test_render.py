@@ -8,7 +8,7 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, previewed, run, said, smooth_pixels, succeeded
-from eigengs_dr.gaussian.file import read
+from eigengs_dr.gaussian.file import read_set
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.io import load_image, save_image
 
@@ -126,7 +126,7 @@ def test_fit_of_light(sky, tmp_path):
     figures = json.loads((folder / "r.json").read_text())
     assert figures["psnr_ycbcr"] > 25 and figures["encoding"] is None
     assert load_image(folder / "p.png").shape[1] > 32
-    assert read(folder / "sky.npz").space == "log"
+    assert read_set(folder / "sky.npz").space == "log"
     command = ["pack", folder / "sky.npz", "-o", tmp_path / "y.egs", "--image", folder / "sky.exr"]
     assert "psnr in log" in said(*command)
 

@@ -12,7 +12,7 @@ from drjit.opt import Adam
 import eigengs_dr as eg
 from eigengs_dr.backend.arrays import _types, types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.coarse import Coarse, enlarge, levels_of, shrink, texel_sums
+from eigengs_dr.fitting.coarse import Coarse, enlarge, shrink, texel_levels, texel_sums
 from eigengs_dr.fitting.loss import LossObjective
 from eigengs_dr.fitting.objective import Channels, Pixels, Target
 from eigengs_dr.image.space import RGB, Affine, space_of
@@ -572,7 +572,7 @@ def test_the_curvature_of_the_squared_error_is_its_weight():
 @pytest.mark.parametrize("size", [(16, 16), (21, 13), (9, 40)])
 def test_levels_of_a_pyramid(backend, size):
     """The transpose is one, a constant stays one, and a ramp a ramp but at its ends."""
-    levels = levels_of(*size, 2)
+    levels = texel_levels(*size, 2)
     assert min(levels[-1].width, levels[-1].height) >= 4 and levels[0].values == 2 * np.prod(size)
     types, random = types_in(select(backend)), np.random.default_rng(3)
     fine, coarse = levels[0], levels[1]

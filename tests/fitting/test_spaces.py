@@ -8,7 +8,7 @@ from _helpers.errors import one_line
 from _helpers.families import small_model
 from _helpers.waves import SPLATS, check_sound, figures, methods, picture
 from eigengs_dr.fitting.fit import fit
-from eigengs_dr.fitting.problem import read_pixels
+from eigengs_dr.fitting.problem import pixels_in
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.pixels import ImageError
 from eigengs_dr.image.space import BLACK, LINEAR, YCBCR
@@ -165,7 +165,7 @@ def test_pack(tmp_path, light, color):
 
 def test_the_image_is_not_copied_in_vain():
     photo = np.random.default_rng(0).random((8, 9, 3)).astype(np.float32)
-    assert read_pixels(photo, YCBCR)[0] is photo
+    assert pixels_in(photo, YCBCR)[0] is photo
 
 
 @pytest.mark.parametrize("space", ["ycbcr", "rgb"])

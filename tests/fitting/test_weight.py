@@ -5,7 +5,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.photos import coffee
-from eigengs_dr.fitting.problem import read_pixels
+from eigengs_dr.fitting.problem import pixels_in
 from eigengs_dr.image.pixels import check_weight
 from eigengs_dr.image.space import DATA, to_planes
 
@@ -164,5 +164,5 @@ def test_weights_have_the_mean_1():
 
 def test_pixels_without_weight_get_the_nearest_value():
     row = np.array([[1.0, np.nan, np.nan, np.nan, 2.0]])
-    pixels, _ = read_pixels(row, DATA, np.array([[1, 0, 0, 0, 1.0]]))
+    pixels, _ = pixels_in(row, DATA, np.array([[1, 0, 0, 0, 1.0]]))
     assert pixels.ravel().tolist() in ([1, 1, 1, 2, 2], [1, 1, 2, 2, 2])

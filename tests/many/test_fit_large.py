@@ -15,7 +15,7 @@ from _helpers.process import python_path, run_python
 from _helpers.sets import check_equal, random_scene
 from eigengs_dr.backend.executor import Done
 from eigengs_dr.cli.memory import estimate_memory
-from eigengs_dr.gaussian.file import read
+from eigengs_dr.gaussian.file import read_set
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.many.draw import BAND_PIXELS, draw_region, save_region
 from eigengs_dr.storage.checkpoint import read_arrays, write_arrays
@@ -182,11 +182,11 @@ import resource
 import numpy as np
 import eigengs_dr as eg
 from eigengs_dr.many.draw import save_region
-from eigengs_dr.gaussian.file import read
+from eigengs_dr.gaussian.file import read_set
 from pathlib import Path
 folder, side = Path({folder!r}), {side}
 eg.fit_large(folder / "{side}.npy", folder / "{side}.npz", iterations=2, block=256)
-data = read(folder / "{side}.npz")
+data = read_set(folder / "{side}.npz")
 save_region(folder / "{side}.tif", data, (0, 0, side, side), (2 * side, 2 * side))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
@@ -205,7 +205,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 def test_written_set_draws_by_strips(tmp_path):
     result = eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW)
-    data, size = read(tmp_path / "a.npz"), (BAND_PIXELS // 256, 512)
+    data, size = read_set(tmp_path / "a.npz"), (BAND_PIXELS // 256, 512)
     whole = np.rint(255 * eg.picture_of(result.gaussians, *size).clip(0, 1))
     bands = list(draw_region(data, (0, 0, 128, 128), size, "llvm"))
     assert [band.shape for band in bands] == [(256, size[0], 3)] * 2

@@ -352,7 +352,9 @@ def _squares(shape: list, x: Unknowns, model: Quadratic, lists: TileLists, cutof
     return squares
 
 
-def squared_error(gaussians: Gaussians, objective: Pixels, lists: TileLists | None = None) -> Float:
+def error_by_pixel(
+    gaussians: Gaussians, objective: Pixels, lists: TileLists | None = None
+) -> Float:
     """Return ``sum h (p - t)^2`` over the channels of each pixel for a set.
 
     Parameters
@@ -450,7 +452,7 @@ def redistribute(
     images = objective.grid.images
     with dr.suspend_grad():
         owners = Owners.of(gaussians, images)
-        error = squared_error(gaussians, objective, owners.lists)
+        error = error_by_pixel(gaussians, objective, owners.lists)
 
         def density(canvas: Canvas, default: Float, times: int) -> Float:
             if times == 1:

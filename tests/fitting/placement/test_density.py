@@ -10,7 +10,7 @@ from _helpers.sets import SIZE, random_scene
 from eigengs_dr.fitting.placement.adaptive import (
     ERROR_EXPONENT,
     Owners,
-    squared_error,
+    error_by_pixel,
     target_density,
 )
 
@@ -69,7 +69,7 @@ def test_error_is_that_of_the_rendering(backend):
         factors = 1.0 if factor is None else np.atleast_3d(factor)
         expected = (factors * np.square(target - shown)).sum(axis=2)
         objective = objective_for(gaussians, target, factor)
-        found = to_pixels(canvas, squared_error(gaussians, objective))
+        found = to_pixels(canvas, error_by_pixel(gaussians, objective))
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
