@@ -9,8 +9,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.arrays import ArrayTypes, types_in, types_of
-from ..backend.selection import select
+from ..backend.arrays import types_of
 from ..backend.types import Float
 from ..gaussian.gaussians import Fitted, Gaussians, concatenate, set_of
 from ..image.space import Space
@@ -53,11 +52,6 @@ def load_start(start: Start | Fitted, backend: str | None) -> Gaussians | Model:
 def set_in(start: Gaussians | Model) -> Gaussians:
     """Return the set of a start."""
     return start if isinstance(start, Gaussians) else start.gaussians
-
-
-def types_for(start: Gaussians | Model | None, backend: str | None) -> ArrayTypes:
-    """Return the backend and the precision of a fit: those of its start."""
-    return types_in(select(backend)) if start is None else types_of(set_in(start).mean)
 
 
 def check_start(

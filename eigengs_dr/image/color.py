@@ -76,28 +76,6 @@ def rgb_to_ycbcr(image: FloatImage) -> FloatImage:
     return result
 
 
-def ycbcr_to_rgb(image: FloatImage) -> FloatImage:
-    """Convert studio-range YCbCr / 255 to RGB, the inverse of `rgb_to_ycbcr`.
-
-    Parameters
-    ----------
-    image : ndarray of float32 or float64, shape (..., 3)
-        Y, Cb, Cr on a [0, 1] scale.
-
-    Returns
-    -------
-    ndarray, same shape and dtype
-        RGB, 1 is white. Values are not clamped: many YCbCr triples lie outside the RGB cube.
-
-    Raises
-    ------
-    ValueError
-        If the last axis is not 3 or the dtype is not float32 or float64.
-    """
-    image = _check_rgb(image)
-    return (image - YCBCR_OFFSET.astype(image.dtype)) @ YCBCR_TO_RGB.T.astype(image.dtype)
-
-
 def to_linear(coded: Samples) -> Samples:
     """Decode sRGB to linear light: ``x / 12.92``, above 0.04045 ``((x + 0.055) / 1.055)^2.4``.
 

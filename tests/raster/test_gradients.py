@@ -13,7 +13,8 @@ from _helpers.sets import few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import concatenate
-from eigengs_dr.image.color import from_log, ycbcr_to_rgb
+from eigengs_dr.image.color import from_log
+from eigengs_dr.image.space import YCBCR
 from eigengs_dr.raster.render import bin_gaussians, render
 
 COUNT = 7
@@ -21,7 +22,7 @@ NAMES = ("mean", "factor", "color", "background")
 WIDE = 9.0
 """A cutoff at which a splat's edge, exp(-40), is nothing: finite differences may cross it."""
 
-SHOWN = {"data": lambda image: image, "ycbcr": ycbcr_to_rgb, "log": from_log}
+SHOWN = {"data": lambda image: image, "ycbcr": YCBCR.decode_image, "log": from_log}
 """What is shown of a sum, by the space."""
 
 asked_sizes = pytest.mark.parametrize(
