@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import glob
 import importlib
-import importlib.metadata
 import os
 import platform
 import re
@@ -152,9 +151,11 @@ def version_of(package: str) -> str | None:
     str or None
         None if the package is not installed.
     """
+    from importlib import metadata  # takes 20 ms
+
     try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
         return None
 
 
