@@ -310,13 +310,16 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
             refinements = [refinement]
         else:
             problem = problem.balanced(problem.first_count)
-            objective, begun, chosen = begin_fit(problem)
-            if objective.pictures[0].base is not None:
-                mean_image = objective.picture(objective.pictures[0].base).numpy()
+            pixels, begun, chosen = begin_fit(problem)
+            if pixels.pictures[0].base is not None:
+                mean_image = pixels.picture(pixels.pictures[0].base).numpy()
+            # The score must not refer to the descent that holds it: only the collector would free
+            # the arrays of such a circle, and in a frozen function of the user Dr.Jit then hangs.
+            objective = problem.objective(pixels)
             descent = Descent(
-                problem.objective(objective),
+                objective,
                 problem.options.method,
-                lambda g: problem.measure(g, descent.objective, time.perf_counter() - started),
+                lambda g: problem.measure(g, objective, time.perf_counter() - started),
                 problem.options.seed,
                 progress,
                 interrupted,

@@ -1,5 +1,6 @@
 """`fit`: one image to Gaussians, whatever the image and the options; how a fit ends."""
 
+import gc
 import signal
 from dataclasses import replace
 
@@ -355,3 +356,27 @@ def test_progress(backend):
     assert {t[1] for t in told} == {45}
     assert all(row in result.trace for *_, row in told)
     assert told[-1][2] == result.trace[-1]
+
+
+@pytest.mark.parametrize("kind", ["image", "maps"])
+def test_a_fit_leaves_no_arrays_to_the_collector(kind, backend):
+    """In a frozen function of the user, Dr.Jit waits forever if the collector frees an array."""
+    image = picture()
+    target = image if kind == "image" else {"albedo": image, "roughness": image[..., 0]}
+
+    def run():
+        fit(target, SPLATS, 3, progress=False, backend=backend)
+
+    run()  # what a first call imports and compiles may leave circles
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        run()
+        gc.collect()
+        left = {f"{type(o).__module__}.{type(o).__name__}" for o in gc.garbage}
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert not [name for name in left if name.startswith(("drjit.", "eigengs_dr."))]
