@@ -1,4 +1,7 @@
-"""Mitsuba plugins. `register_plugins` registers them with the current variant and later ones."""
+"""Mitsuba: texture, environment, `photo_loss`; the folder `plugins/` at the top.
+
+`register_plugins` registers them with the current variant and later ones.
+"""
 
 try:
     import mitsuba  # noqa: F401

@@ -386,6 +386,19 @@ def test_names_are_where_the_manual_says(check):
     assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.nothing")
 
 
+def test_the_folders_are_those_of_the_layers():
+    """Write them anew by ``python docs/folders.py``."""
+    assert runpy.run_path(str(FOLDER / "folders.py"))["outdated"]() == {}
+
+
+def test_the_architecture_names_files_that_exist():
+    page = (FOLDER / "architecture.md").read_text("utf-8")
+    files = re.findall(r"`([a-z_]+/[\w/]+\.py)`", page)
+    roots = Path(eg.__file__).parent, FOLDER.parent
+    assert len(files) > 12
+    assert [name for name in files if not any((root / name).exists() for root in roots)] == []
+
+
 def test_figures_of_the_manual_can_be_traced(check):
     assert check["untraced"]() == []
 

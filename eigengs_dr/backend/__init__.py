@@ -1,4 +1,4 @@
-"""Access to Dr.Jit on this machine, and messages to the user.
+"""Dr.Jit on this machine: libLLVM, the choice of a backend, arrays, frozen programs, doors.
 
 - ``selection``: finds a libLLVM that works, before Dr.Jit loads one, and picks llvm or cuda
 - ``arrays``: matching array types; copies of NumPy arrays; exact arithmetic on cuda

@@ -1,1 +1,1 @@
-"""The command line: each command parses its options, calls the package and prints the result."""
+"""The command line: one file for each command."""

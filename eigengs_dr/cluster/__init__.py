@@ -1,4 +1,4 @@
-"""Execution on many machines with Dask; the only folder that imports dask and distributed.
+"""Dask workers; the only folder that imports Dask.
 
 - ``executor``: connection to a cluster, and its `eigengs_dr.backend.executor.Executor`
 - ``worker``: execution of tasks on a worker

@@ -1,4 +1,4 @@
-"""Compression of sets of Gaussians.
+"""Few bytes: the files `.egs`.
 
 - ``quantization``: Gaussians as integers
 - ``exact_math``: functions whose results are bit-identical on every machine

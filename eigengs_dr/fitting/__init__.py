@@ -1,17 +1,13 @@
-"""From an image to its Gaussians.
+"""From an image, maps or a loss to Gaussians: problem, placement, loop, controls, search.
 
-- ``fit``: `fit`, from the image to the result
-- ``loop``: a descent with a trace, which keeps the best set
-- ``descent``: the loop over the steps, the state between them, and the program of one step
-- ``objective``: what a picture should match, and its quadratic model
+- ``fit``: `fit`, from its arguments to the result
+- ``problem``, ``options``: what a fit was given, and its checks; ``start``: a start of the user
+- ``objective``: what a picture should match, and its quadratic model; ``loss``: a loss of the user
+- ``loop``: a descent with a trace, which keeps the best set; ``step``, ``state``: one step of it
 - ``method``: a method as a value: placement, optimiser, rates, controls
-- ``control``: adds, moves and removes Gaussians between steps, by means of ``exchange``
-- ``place``: where Gaussians start; ``placement``: the placement by the image
-- ``solve``: colours by linear least squares
-- ``variables``, ``optimizer``: what a step moves, and how far
-- ``fewest``: the smallest number of Gaussians for a PSNR
-- ``levels``: levels of detail
-- ``maps``: several maps as one image of many channels
-- ``options``, ``pixels``, ``start``: checks of what the caller gives
+- ``control``: adds, moves and removes Gaussians between steps
+- ``place``, ``placement``: where Gaussians start; ``solve``: their colours by linear least squares
+- ``search``: the smallest number of Gaussians for a goal; ``levels``: levels of detail
+- ``coarse``, ``from_loss``: a fit without an image, by texels
 - ``measure``: PSNRs of a set
 """

@@ -1,4 +1,4 @@
-"""The representation: sets of 2D Gaussians.
+"""The set of Gaussians: its maps, covariances, tensors and files.
 
 - ``gaussians``: the set, its bounds, its tensors; the union of several sets
 - ``covariance``: factors, Cholesky factors, logarithms, eigenvalues

@@ -1,4 +1,4 @@
-"""Images: files, pixels, colour spaces and metrics. This folder knows no Gaussians.
+"""Images: files, pixels, spaces of colour, metrics. This folder knows no Gaussians.
 
 - ``io``: image files, and photos of scikit-image
 - ``formats``: who reads and writes which files

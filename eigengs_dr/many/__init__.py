@@ -1,4 +1,4 @@
-"""Runs over pieces: many images, and the blocks of a large one, in this process or on workers.
+"""Runs over pieces: many images, and the blocks of a large one, here or on workers.
 
 - ``run``: the run over pieces; groups of images in this process, chunks of images on a cluster
 - ``manifest``: the images of a run, a row for each, and all rows of a folder

@@ -1,4 +1,4 @@
-"""Rasterization: the weight of a Gaussian at a pixel, and the sum over all Gaussians.
+"""What a Gaussian contributes to a pixel, and the sum; at scattered points too.
 
 - ``evaluate``: the weight of one Gaussian at a block of pixels, and its derivatives
 - ``parameters``: Gaussians in the units of the kernels, and their layout in memory
