@@ -670,4 +670,6 @@ def picture_pixels(image: Image) -> tuple[Pixels, str]:
 
 def is_picture(image: object) -> TypeGuard[Image]:
     """Return whether an image is a `PIL.Image.Image`, without importing Pillow."""
-    return "PIL.Image" in sys.modules and isinstance(image, sys.modules["PIL.Image"].Image)
+    # While another thread imports Pillow, the module is there and has no classes yet.
+    kind = getattr(sys.modules.get("PIL.Image"), "Image", None)
+    return kind is not None and isinstance(image, kind)

@@ -65,7 +65,7 @@ def test_cuda_is_the_default_where_there_is_a_gpu(monkeypatch):
 
 
 def test_a_gpu_that_ends_the_process_does_not_agree():
-    found = doctor.compare("fit", "cuda")
+    found = doctor.compare_backends("fit", "cuda")
     if found.gpu.problem == "":
         pytest.skip("a GPU is here")
     assert not found.agrees and "no CUDA GPU or driver" in found.gpu.problem
@@ -74,10 +74,10 @@ def test_a_gpu_that_ends_the_process_does_not_agree():
 def test_figures_are_compared_by_their_largest_difference(monkeypatch):
     figures = {"llvm": [2.0, -4.0], "cuda": [2.0, -4.002]}
     monkeypatch.setattr(doctor, "run_trial", lambda name, b: doctor.Trial(1.0, figures[b]))
-    row = doctor.compare("scene", "cuda")
+    row = doctor.compare_backends("scene", "cuda")
     assert row.agrees and row.difference == pytest.approx(5e-4)
     figures["cuda"] = [2.0]
-    assert not doctor.compare("scene", "cuda").agrees
+    assert not doctor.compare_backends("scene", "cuda").agrees
 
 
 def test_metal_by_its_names(monkeypatch):
@@ -137,7 +137,8 @@ def test_a_mitsuba_for_another_drjit_is_explained(tmp_path):
     (facts / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: mitsuba\nVersion: 3.8.0\nRequires-Dist: drjit ==1.2.0\n"
     )
-    code = "from eigengs_dr.backend.doctor import describe, report; print(describe(report()))"
+    names = "from eigengs_dr.backend.doctor import describe_machine, report"
+    code = f"{names}; print(describe_machine(report()))"
     told = run_python(code, PYTHONPATH=str(tmp_path)).stdout.splitlines()
     assert told[-1].startswith("mitsuba  3.8.0: cannot be imported; it needs drjit ==1.2.0, and")
     assert told[-1].endswith("is installed: pip install 'mitsuba>=3.9,<4'")

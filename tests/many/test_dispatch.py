@@ -61,7 +61,7 @@ def test_images_of_a_lost_chunk_are_done_one_by_one(photos, tmp_path):
 
 def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path, monkeypatch):
     """As a full disk of one worker, and of all."""
-    output, full, write = tmp_path / "fits", ["03.npz", "03.npz", "02.npz"], run.write
+    output, full, write = tmp_path / "fits", ["03.npz", "03.npz", "02.npz"], run.write_set
 
     def write_if_there_is_room(path, *content):
         if path.name in full:
@@ -69,7 +69,7 @@ def test_a_failure_that_may_pass_is_tried_again(photos, tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         write(path, *content)
 
-    monkeypatch.setattr(run, "write", write_if_there_is_room)
+    monkeypatch.setattr(run, "write_set", write_if_there_is_room)
     executor = Here()
     rows = eg.fit_many(photos, output, client=executor, **QUICK)
     assert [row.name for row in rows if row.status == "failed"] == ["03"]
