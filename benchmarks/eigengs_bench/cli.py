@@ -142,20 +142,15 @@ def tables() -> None:
 
 @question("pictures")
 @data_argument
-@several("--picture", "pictures", PICTURES, "What to draw, by default all that DATA suffices for")
-@number("--images", "Test images per set, for curves and radii.", 8, 1)
+@several("--picture", "pictures", PICTURES, "What to draw, by default all")
+@number("--images", "Images per set, for curves.", 8, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def pictures() -> None:
-    """Draw the curves, histograms and pictures of the paper from our fits.
+    """Draw the curves of the paper from our fits, and where Gaussians show as tiles.
 
     \b
-    iterations  fits at iterations 0, 10, 100 and the last, by every method
-    colors      fits in YCbCr and in RGB, and their errors
-    curves      PSNR every 50 iterations
-    tiles       a slow gradient by every method, and its errors
-    radii       sizes of Gaussians, with and without the frequency-aware split
-    split       what Gaussians for low and for high frequencies render alone
-    cross       images projected on bases of other images
+    curves  PSNR every 50 iterations
+    tiles   a slow gradient by every method, and its errors
     """
 
 

@@ -23,11 +23,11 @@ SETS = {
     "samples": ImageSet("", 256, 256, 5000),  # photos of scikit-image, which need no data
 }
 PAPER_SETS = ("faces256", "cats256", "cars256", "natural256", "cats512")
-NATURAL, CATS, SAMPLES = "natural256", "cats256", "samples"
+NATURAL, SAMPLES = "natural256", "samples"
 
 PRESETS = ("default", "gaussianimage", "eigengs")
 TABLES = ("main", "ablation", "cross")
-PICTURES = ("iterations", "colors", "curves", "tiles", "radii", "split", "cross")
+PICTURES = ("curves", "tiles")
 PARTS = ("pixels", "splats", "small")
 TEXTURE_PARTS = ("posters", "lights", "ball")
 PEERS = ("splatthis", "texels", "JPEG", "AVIF")
