@@ -80,7 +80,7 @@ def photo_loss(
     held_out : float, optional
         Share of the pixels of four photos that no step sees, in [0, 1). Their error is then the
         ``loss`` of the trace, and the number of Gaussians doubles while it falls; by default there
-        is one for 16 texels. It takes many photos: with few, a held-out pixel leaves a hole in the
+        is one for 4 texels. It takes many photos: with few, a held-out pixel leaves a hole in the
         texture that no other photo sees, and the number that suits holes is far too small.
     bounds : (float, float), optional
         See `eigengs_dr.Loss`.

@@ -13,15 +13,14 @@ from itertools import pairwise
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from ..backend.arrays import types_of
 from ..backend.recording import freeze_program
-from ..backend.types import Float, UInt
+from ..backend.types import Float, Rows, UInt
 from .loss import LossObjective
 from .method import DEFAULT
 from .place import Adaptive
-from .state import Adam, Optimizer
+from .state import Adam, Optimizer, debias
 
 LEAST_SIDE = 4
 """Smallest length of the shorter side of the coarsest level, in texels."""
@@ -29,6 +28,62 @@ LEAST_SIDE = 4
 
 NOISY = Adam(0.5, 0.999, 1e-8)
 """Adam for derivatives with the noise of a rendering."""
+
+
+@dataclass(frozen=True)
+class Agreeing(Adam):
+    """Adam whose rate rises while derivatives agree with the way so far, and falls if they do not.
+
+    With the derivative g of the values p of a variable, and the moments m and v of `Adam`::
+
+        a_t = memory a_{t-1} + (1 - memory) p_t
+        r_t = r_{t-1} exp(-gain g_t (p_t - a_t) / (|g_t| |p_t - a_t|))      from least to 1
+        p_t = p_{t-1} - lr r_t m_t / (sqrt(v_t + floor mean(v_t)) + epsilon)
+
+    While derivatives lead on, an error is left and steps are too short; if they lead back, noise
+    has moved the values (Kesten, "Accelerated stochastic approximation", 1958). Values with little
+    derivative, which Adam moves as far as others, move less: what moves them is noise.
+
+    Parameters
+    ----------
+    memory : float, optional
+        Decay factor of the average of values, in [0, 1).
+    gain : float, optional
+        Change of the logarithm of the rate for derivatives that agree.
+    first, least : float, optional
+        The rate r at the start, and its lower bound, in (0, 1].
+    floor : float, optional
+        Share of the mean of v that is added to each.
+    """
+
+    beta_1: float = 0.5
+    memory: float = 0.9
+    gain: float = 0.2
+    first: float = 0.2
+    least: float = 0.02
+    floor: float = 0.05
+
+    def start(self, value: Rows) -> tuple[Rows, ...]:
+        """Return the moments, the average of values and the logarithm of the rate."""
+        log_rate = dr.opaque(types_of(value).Float, math.log(self.first))
+        return *super().start(value), type(value)(value), log_rate
+
+    def step(
+        self, value: Rows, gradient: Rows, moments: tuple[Rows, ...], rate: Float, time: Float
+    ) -> tuple[Rows, tuple[Rows, ...]]:
+        """Return the value and the moments after a step; see `Optimizer`."""
+        m, v, average, log_rate = moments
+        m = dr.lerp(gradient, m, self.beta_1)
+        v = dr.lerp(dr.square(gradient), v, self.beta_2)
+        way = value - average
+        lengths = dr.sum(dr.square(gradient), axis=None) * dr.sum(dr.square(way), axis=None)
+        back = dr.sum(gradient * way, axis=None) * dr.select(lengths > 0, dr.rsqrt(lengths), 0)
+        log_rate = dr.clip(log_rate - self.gain * back, math.log(self.least), 0)
+        scale = rate * dr.exp(log_rate) / debias(self.beta_1, time)
+        scale *= dr.sqrt(debias(self.beta_2, time))
+        floored = dr.sqrt(v + self.floor * dr.mean(v, axis=None)) + self.epsilon
+        average = dr.lerp(value, average, self.memory)
+        return value - scale * (m / floored), (m, v, average, log_rate)
 
 
 @dataclass(frozen=True)
@@ -51,9 +106,9 @@ class Coarse(Adaptive):
     """
 
     share: float = 0.5
-    rate: float = 0.005
+    rate: float = 0.025
     decay: float = 0.05
-    optimizer: Optimizer = NOISY
+    optimizer: Optimizer = Agreeing()
     fit_steps: int = 150
 
 
@@ -74,38 +129,27 @@ with the photo "coffee"."""
 
 @dataclass(frozen=True)
 class TexelLevel:
-    """The texels of a level of a pyramid.
+    """The texels of a level of a pyramid, row after row.
 
     Attributes
     ----------
-    width, height, channels : int
+    width, height : int
     """
 
     width: int
     height: int
-    channels: int
 
     @property
-    def values(self) -> int:
-        """Number of values."""
-        return self.width * self.height * self.channels
-
-    def place(self, UInt: type) -> tuple[UInt, UInt, UInt]:
-        """Return the row, the column and the channel of each value."""
-        value = dr.arange(UInt, self.values)
-        pixel = value // self.channels
-        return pixel // self.width, pixel % self.width, value % self.channels
-
-    def at(self, row: UInt, column: UInt, channel: UInt) -> UInt:
-        """Return the index of a value."""
-        return (row * self.width + column) * self.channels + channel
+    def texels(self) -> int:
+        """Number of texels."""
+        return self.width * self.height
 
 
-def texel_levels(width: int, height: int, channels: int) -> list[TexelLevel]:
+def texel_levels(width: int, height: int) -> list[TexelLevel]:
     """Return the levels of a pyramid from fine to coarse, each of half the size, rounded up."""
-    levels = [TexelLevel(width, height, channels)]
+    levels = [TexelLevel(width, height)]
     while min(levels[-1].width, levels[-1].height) >= 2 * LEAST_SIDE:
-        levels.append(TexelLevel(-(-levels[-1].width // 2), -(-levels[-1].height // 2), channels))
+        levels.append(TexelLevel(-(-levels[-1].width // 2), -(-levels[-1].height // 2)))
     return levels
 
 
@@ -115,25 +159,26 @@ def enlarge(values: Float, coarse: TexelLevel, fine: TexelLevel) -> Float:
     The weights along an axis are 3/4 for the texel that holds the centre, and 1/4 for the next.
     """
     types = types_of(values)
-    row, column, channel = fine.place(types.UInt)
+    texel = dr.arange(types.UInt, fine.texels)
+    row, column = texel // fine.width, texel % fine.width
     total = types.Float(0)
     for y, at_y in _parents(row, coarse.height):
         for x, at_x in _parents(column, coarse.width):
-            texel = dr.gather(types.Float, values, coarse.at(y, x, channel))
-            total = dr.fma(at_y * at_x, texel, total)
+            total = dr.fma(at_y * at_x, dr.gather(types.Float, values, y * coarse.width + x), total)
     return total
 
 
 def shrink(values: Float, fine: TexelLevel, coarse: TexelLevel) -> Float:
     """Return the transpose of `enlarge`: from a derivative by the finer level to the coarser."""
     types = types_of(values)
-    row, column, channel = coarse.place(types.UInt)
+    texel = dr.arange(types.UInt, coarse.texels)
+    row, column = texel // coarse.width, texel % coarse.width
     total = types.Float(0)
     for y, at_y in _children(row, coarse.height, fine.height):
         for x, at_x in _children(column, coarse.width, fine.width):
             weight = at_y * at_x
-            texel = dr.gather(types.Float, values, fine.at(y, x, channel), weight > 0)
-            total = dr.fma(weight, texel, total)
+            child = dr.gather(types.Float, values, y * fine.width + x, weight > 0)
+            total = dr.fma(weight, child, total)
     return total
 
 
@@ -158,10 +203,10 @@ def _children(place: UInt, count: int, fine: int) -> list[tuple[UInt, Float]]:
     return children
 
 
-def _sum_levels(values: Sequence[Float], levels: Sequence[TexelLevel]) -> Float:
+def _sum_levels(values: Sequence[list[Float]], levels: Sequence[TexelLevel]) -> list[Float]:
     total = values[-1]
     for value, (fine, coarse) in zip(values[-2::-1], [*pairwise(levels)][::-1], strict=True):
-        total = enlarge(total, coarse, fine) + value
+        total = [enlarge(t, coarse, fine) + v for t, v in zip(total, value, strict=True)]
         dr.eval(total)
     return total
 
@@ -169,7 +214,7 @@ def _sum_levels(values: Sequence[Float], levels: Sequence[TexelLevel]) -> Float:
 def texel_sums(
     objective: LossObjective, coarse: Coarse, steps: int, start: Sequence[float], unit: float = 1.0
 ) -> Generator[Float, None, None]:
-    """Descend on a loss by a pyramid of texels.
+    """Descend on a loss by a pyramid of texels; each channel of a level is a variable.
 
     Parameters
     ----------
@@ -186,8 +231,8 @@ def texel_sums(
     Float, shape (H * W * C,)
         The sums of all levels before the first step and after each, as rows of pixels.
     """
-    types, optimizer = objective.types, coarse.optimizer
-    levels = texel_levels(*objective.size, objective.channels)
+    types, optimizer, channels = objective.types, coarse.optimizer, objective.channels
+    levels = texel_levels(*objective.size)
 
     def advance(
         values: list,
@@ -197,23 +242,25 @@ def texel_sums(
         slopes: list[Float],
         size: Float,
     ) -> tuple[list, list, Float, Float, list[Float]]:
-        slope: Any = objective.pull_back(sums, slopes)
+        slope: Any = _planes(objective.pull_back(sums, slopes), channels)
         rests, later = size == 0, time + 1  # without a derivative nothing moves
         falling = 0.5 + 0.5 * dr.cos(time * (math.pi / steps))
         rate = dr.fma(falling, (1 - coarse.decay), coarse.decay) * (coarse.rate * unit)
-        for k, value in enumerate(values):
+        for k, rows in enumerate(values):
             if k:
-                slope = shrink(slope, levels[k - 1], levels[k])
+                slope = [shrink(plane, levels[k - 1], levels[k]) for plane in slope]
             dr.eval(slope)
-            moved = optimizer.step(value, slope, moments[k], rate, later)
-            values[k], moments[k] = dr.select(rests, (value, moments[k]), moved)
-        sums = _sum_levels(values, levels)
+            for c, value in enumerate(rows):
+                moved = optimizer.step(value, slope[c], moments[k][c], rate, later)
+                rows[c], moments[k][c] = dr.select(rests, (value, moments[k][c]), moved)
+        sums = dr.ravel(types.FloatX(_sum_levels(values, levels)))
         return values, moments, dr.select(rests, time, later), sums, objective.seen(sums)
 
-    values: list = [dr.zeros(types.Float, level.values) for level in levels[:-1]]
-    values.append(types.Float(np.tile(start, levels[-1].values // len(start))))
+    values = [[dr.zeros(types.Float, level.texels) for _ in start] for level in levels[:-1]]
+    values.append([dr.full(types.Float, value, levels[-1].texels) for value in start])
     dr.make_opaque(values)
-    moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)
+    moments = [[optimizer.start(value) for value in rows] for rows in values]
+    sums = dr.ravel(types.FloatX(_sum_levels(values, levels)))
     pictures, time = objective.seen(sums), dr.opaque(types.Float, 0)
     with freeze_program(advance) as take_step:
         yield sums
@@ -223,3 +270,10 @@ def texel_sums(
                 values, moments, time, sums, slopes, size
             )
             yield sums
+
+
+def _planes(rows: Float, channels: int) -> list[Float]:
+    """Return the channels of rows of pixels, each as an array."""
+    types = types_of(rows)
+    pixel = dr.arange(types.UInt, dr.width(rows) // channels)
+    return [dr.gather(types.Float, rows, pixel * channels + c) for c in range(channels)]

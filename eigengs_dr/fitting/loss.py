@@ -185,6 +185,8 @@ class Calls:
         Whether a value depended on the picture, and whether all values were 0.
     broken : int or None
         The last step that `check_slopes` looked at, if its derivative was not finite.
+    since, sum : int, float
+        The step after the last call of `recent`, and the sum of the values checked from there on.
     """
 
     step: int = 0
@@ -194,6 +196,8 @@ class Calls:
     broken: int | None = None
     checked: int = 0
     total: Any = 0.0
+    since: int = 0
+    sum: float = 0.0
 
     def add(self, value: Any, size: Float) -> None:
         """Count a step, by the value and the size of its derivative; the first is checked."""
@@ -235,6 +239,14 @@ class Calls:
             steps = f"step {first}" if self.step - first == 1 else f"steps {first}-{self.step - 1}"
             raise ValueError(f"loss: its value is {total:g} at {steps}; it must be finite")
         self.is_zero &= total == 0
+        self.sum += total
+
+    def recent(self) -> float:
+        """Return the mean value of the steps since the last call of this."""
+        self.check()
+        mean = self.sum / max(1, self.step - self.since)
+        self.since, self.sum = self.step, 0.0
+        return mean
 
     def check_use(self) -> None:
         """Raise ValueError if no step of a fit had a derivative, unless its loss was least, 0."""
@@ -416,10 +428,14 @@ class LossObjective(Pixels):
         The last set is the best if losses are not comparable: with parameters, which are those of
         the last step; or with neither an image nor a judge, where steps may see other cameras.
         """
-        compares = self.loss.judge is not None or bool(self.pictures)
-        if self.loss.parameters is not None or not compares:
+        if self.loss.parameters is not None or not self.compares:
             return float(row["iteration"])
         return -float(row["loss"])
+
+    @property
+    def compares(self) -> bool:
+        """Whether losses of two sets say which is better, as those of other cameras do not."""
+        return self.loss.judge is not None or bool(self.pictures)
 
     def judge(self, pictures: Sequence[Float]) -> float:
         """Return the value by which pictures, as rows of pixels, are compared."""

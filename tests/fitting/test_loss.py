@@ -572,19 +572,19 @@ def test_the_curvature_of_the_squared_error_is_its_weight():
 @pytest.mark.parametrize("size", [(16, 16), (21, 13), (9, 40)])
 def test_levels_of_a_pyramid(backend, size):
     """The transpose is one, a constant stays one, and a ramp a ramp but at its ends."""
-    levels = texel_levels(*size, 2)
-    assert min(levels[-1].width, levels[-1].height) >= 4 and levels[0].values == 2 * np.prod(size)
+    levels = texel_levels(*size)
+    assert min(levels[-1].width, levels[-1].height) >= 4 and levels[0].texels == np.prod(size)
     types, random = types_in(select(backend)), np.random.default_rng(3)
     fine, coarse = levels[0], levels[1]
-    x, y = (random.normal(size=level.values).astype(np.float32) for level in (coarse, fine))
+    x, y = (random.normal(size=level.texels).astype(np.float32) for level in (coarse, fine))
     up = enlarge(types.Float(x), coarse, fine).numpy()
     down = shrink(types.Float(y), fine, coarse).numpy()
     assert np.dot(up, y) == pytest.approx(np.dot(x, down), rel=1e-4, abs=1e-3)
-    ones = enlarge(types.Float(np.ones(coarse.values)), coarse, fine).numpy()
+    ones = enlarge(types.Float(np.ones(coarse.texels)), coarse, fine).numpy()
     np.testing.assert_allclose(ones, 1, rtol=1e-6)
-    ramp = np.tile(np.arange(coarse.width, dtype=np.float32)[None, :, None], (coarse.height, 1, 2))
+    ramp = np.tile(np.arange(coarse.width, dtype=np.float32), (coarse.height, 1))
     shown = enlarge(types.Float(ramp.ravel()), coarse, fine).numpy()
-    row = shown.reshape(fine.height, fine.width, 2)[0, 1:-1, 0]
+    row = shown.reshape(fine.height, fine.width)[0, 1:-1]
     inner = row[: 2 * (coarse.width - 1)][: len(row)]
     np.testing.assert_allclose(np.diff(inner[: 2 * coarse.width - 3]), 0.5, rtol=1e-5)
 

@@ -4,7 +4,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.coarse import Agreeing
 from eigengs_dr.fitting.state import Adam
 from eigengs_dr.paper.adan import Adan
 
@@ -50,16 +52,35 @@ def adan_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
     return np.array(path)
 
 
+def agreeing_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
+    """The equations of its docstring, at its default settings."""
+    m, v, average, r, path = np.zeros_like(x), np.zeros_like(x), x, 0.2, []
+    for t in range(1, steps + 1):
+        g, way = gradient(x), x - average
+        m = betas[0] * m + (1 - betas[0]) * g
+        v = betas[1] * v + (1 - betas[1]) * g**2
+        if way.any():
+            r = np.clip(
+                r * np.exp(-0.2 * g @ way / np.linalg.norm(g) / np.linalg.norm(way)), 0.02, 1
+            )
+        scale = rate * r * np.sqrt(1 - betas[1] ** t) / (1 - betas[0] ** t)
+        average = 0.9 * average + 0.1 * x
+        x = x - scale * m / (np.sqrt(v + 0.05 * v.mean()) + epsilon)
+        path.append(x)
+    return np.array(path)
+
+
 @pytest.mark.parametrize(
     ("optimizer", "by_hand", "betas"),
     [
         (Adam(0.9, 0.9, 1e-12), adam_by_hand, (0.9, 0.9)),
         (Adam(0.9, 0.99, 1e-12), adam_by_hand, (0.9, 0.99)),
         (Adam(0.0, 0.5, 1e-12), adam_by_hand, (0.0, 0.5)),
+        (Agreeing(), agreeing_by_hand, (0.5, 0.999)),
         (Adan(), adan_by_hand, (0.98, 0.92, 0.99)),
         (Adan((0.9, 0.5, 0.95)), adan_by_hand, (0.9, 0.5, 0.95)),
     ],
-    ids=["adam", "long memory", "no momentum", "adan", "short memory"],
+    ids=["adam", "long memory", "no momentum", "agreeing", "adan", "short memory"],
 )
 def test_steps_are_those_of_the_paper(types, optimizer, by_hand, betas):
     """Of a variable whose gradient is always 0 too: it rests."""
@@ -99,3 +120,19 @@ def test_betas_that_are_refused(betas):
         Adam(*betas)
     with pytest.raises(ValueError, match="betas"):
         Adan(betas=(*betas, 0.9))
+
+
+def test_the_rate_rises_with_an_error_and_falls_with_noise():
+    """Of a quadratic: far from its minimum, and near it with derivatives that are mostly noise."""
+    types, random = types_in(select("llvm")), np.random.default_rng(1)
+    noise = random.normal(size=(100, 500)).astype(np.float32)
+    rates = []
+    for start, share in ((5.0, 0.0), (0.0, 5.0)):
+        optimizer, value = Agreeing(), dr.full(types.Float, start, 500)
+        moments = optimizer.start(value)
+        for step, row in enumerate(noise):
+            slope = value + share * types.Float(row)
+            time = types.Float(step + 1)
+            value, moments = optimizer.step(value, slope, moments, types.Float(0.05), time)
+        rates.append(float(np.exp(moments[-1].numpy()[0])))
+    assert rates[0] > 0.9 and rates[1] < Agreeing().first
