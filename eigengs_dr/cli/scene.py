@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ..backend.doors import label_of
 from ..backend.selection import backend_of, name_of, select
 from ..backend.types import Record
 from ..storage.atomic import atomic_write
@@ -283,8 +284,12 @@ def convert(
 
     started = time.perf_counter()
     with scene_errors(scene), bar(run.quiet) as show:
+
+        def progress(done: int, total: int, row: Record) -> None:
+            show(label_of(row), done, total)
+
         converted = convert_scene(
-            scene, output, target_psnr, iterations, spp, definitions, replace_all, progress=show
+            scene, output, target_psnr, iterations, spp, definitions, replace_all, progress
         )
     before = sum(texture.bytes for texture in converted.textures)
     after = sum(texture.gaussian_bytes for texture in converted.textures)

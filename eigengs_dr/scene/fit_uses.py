@@ -26,7 +26,7 @@ from ..image.metrics import psnr
 from ..image.space import DATA
 from ..plugins.versions import Properties
 from .bitmaps import GAUSSIANS, KEPT, RELIEF, SKY, SKY_KEPT, Parsed, Unsuitable, Use, texture_space
-from .fit_scene import FINER, fit_seen, halved
+from .fit_scene import FINER, fit_seen, halved, seen_image
 from .rendering import Progress, pictures
 from .target import MARGIN
 from .visibility import visibility
@@ -125,10 +125,10 @@ def fit_picture(
     original: Original,
     group: list[Use],
     pixels: NDArray[np.float32],
-    target_psnr: float,
+    goal: Goal,
     iterations: int,
     file: Path,
-    show: Progress,
+    tell: Progress,
     share: int = 1,
 ) -> tuple[Gaussians, float]:
     """Fit an image for its uses, and save the set.
@@ -151,24 +151,15 @@ def fit_picture(
     def aim(gaussians: Gaussians, seen: float) -> float:
         gaussians.save(file)
         lost = seen - original.psnr_with(partial(replace_bitmap, file=str(file)), group)
-        needed = target_psnr + 10 * math.log10(share) + lost
-        return min(max(needed, target_psnr), target_psnr + MARGIN)
+        needed = goal.psnr + 10 * math.log10(share) + lost
+        return min(max(needed, goal.psnr), goal.psnr + MARGIN)
 
-    use = group[0]
-    result = fit_seen(
-        original.scene,
-        original.textures(group),
-        pixels,
-        target_psnr,
-        # Raw colours are still colours; pixels in memory are usually raw.
-        texture_space(pixels, use.raw and pixels.shape[2] == 1),
-        None,
-        iterations,
-        [use.wrap for use in group],
-        "linear",
-        show,
-        None if original.spp == 0 else aim,
-    )
+    # Raw colours are still colours; pixels in memory are usually raw.
+    space = texture_space(pixels, group[0].raw and pixels.shape[2] == 1)
+    tell(0, 1, {"stage": "rays"})
+    textures, wraps = original.textures(group), [use.wrap for use in group]
+    seen = seen_image(original.scene, textures, pixels, space, wraps, "linear")
+    result = fit_seen(seen, goal, iterations, tell, None if original.spp == 0 else aim)
     result.gaussians.save(file)
     return result.gaussians, min(result.psnr)
 
@@ -180,7 +171,7 @@ def fit_relief(
     goal: Goal,
     iterations: int,
     file: Path,
-    show: Progress,
+    tell: Progress,
 ) -> tuple[Gaussians, float]:
     """Fit the heights of bump maps or the vectors of normal maps, and save the set.
 
@@ -204,11 +195,11 @@ def fit_relief(
     texture_space(values, True)  # it raises where Gaussians cannot hold them
     height, width, _ = values.shape
     wraps = [use.wrap for use in group]
-    show("rays", 0, 1)
+    tell(0, 1, {"stage": "rays"})
     seen = visibility(original.scene, original.textures(group), width, height, wraps)
     fitted, weight = (halved(v, seen) for v in (values, np.float32(seen.seen)[..., None]))
     if fitted.shape == values.shape and height * width <= LARGEST:
-        show("trial", 0, 1)
+        tell(0, 1, {"stage": "trial"})
         kept = original.psnr_with(partial(_make_smooth, values), group)
         if kept < goal.psnr - FACETS:
             raise Unsuitable(
@@ -224,7 +215,7 @@ def fit_relief(
             iterations=iterations,
             space=DATA,
             weight=weight[..., 0],
-            progress=lambda step, steps, row: show("search", step, steps),
+            progress=lambda step, steps, row: tell(step, steps, row | {"stage": "search"}),
         )
         gaussians = result.gaussians.scaled(width, height)
         gaussians.save(file)

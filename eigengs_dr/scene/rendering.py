@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,17 +11,35 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.interrupts import defer_interrupts
+from ..backend.types import Record
 from ..image.color import to_coded
 from ..image.io import save_image
 from ..image.metrics import psnr
 from ..plugins.follow import follow_where_asked
 
-Progress = Callable[[str, int, int], None]
-"""``progress(label, done, total)``."""
+Progress = Callable[[int, int, Record], None]
+"""``progress(done, total, row)``; the row names the ``stage``."""
 
 
-def silent(label: str, done: int, total: int) -> None:
-    """Show no progress."""
+@contextmanager
+def stages(progress: Progress | None) -> Iterator[Progress]:
+    """Defer Ctrl-C and SIGTERM in a block to where it tells its progress.
+
+    Yields
+    ------
+    callable
+        ``tell(done, total, row)`` calls `progress`. After a signal it raises `KeyboardInterrupt`.
+    """
+    with defer_interrupts() as interrupted:
+
+        def tell(done: int, total: int, row: Record) -> None:
+            if progress:
+                progress(done, total, row)
+            if interrupted():
+                raise KeyboardInterrupt
+
+        yield tell
 
 
 SAMPLES_PER_PASS = 1 << 24
