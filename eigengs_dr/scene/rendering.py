@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.interrupts import defer_interrupts
+from ..backend.recording import collector_off
 from ..backend.types import Record
 from ..image.color import to_coded
 from ..image.io import save_image
@@ -117,7 +118,10 @@ def render_in_passes(
     done = 0
     while done < total:
         count = min(max_count, total - done)
-        part = mi.render(scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done)
+        with collector_off():  # also between the lookups, whose doors make objects
+            part = mi.render(
+                scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done
+            )
         pixels = pixels + count * np.array(part, np.float64)
         done += count
         show(done, total)
