@@ -210,12 +210,6 @@ def uses_of(
     return uses, left
 
 
-def environment_of(parsed: Parsed) -> int | None:
-    """Return the index of the environment map of a scene, which has at most one."""
-    names = [node.props.plugin_name() for node in parsed.state.nodes]
-    return names.index("envmap") if "envmap" in names else None
-
-
 def is_bitmap(node: mi.parser.SceneNode) -> bool:
     """Return whether a node of a parsed scene is a bitmap texture."""
     return node.type == texture_kind() and node.props.plugin_name() == "bitmap"

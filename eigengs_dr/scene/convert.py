@@ -33,7 +33,6 @@ from .bitmaps import (
     Parsed,
     Unsuitable,
     Use,
-    environment_of,
     file_keys,
     is_bitmap,
     label,
@@ -43,7 +42,7 @@ from .bitmaps import (
     uses_of,
 )
 from .fit_environment import BYTES, fit_environment
-from .fit_uses import Original, fit_picture, fit_relief, replace_bitmap
+from .fit_uses import Group, Original, fit_picture, fit_relief, replace_bitmap
 from .rendering import Progress, compare, pictures, stages
 
 SCENE = "scene.xml"
@@ -222,7 +221,8 @@ def convert_scene(
         raise ValueError(f"iterations is {iterations}; it must be at least 0")
     refuse_url(output)
     target = Path(os.path.realpath(output))  # of a link, the folder that it names
-    _check_empty(output, target)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise ValueError(f"{output}: exists and is not empty; choose another folder")
     settings = Settings(target_psnr, iterations, spp, replace_all)
     result = ConvertedScene(Path(output) / SCENE, [], [], [], [], [])
     with lock_output(output), stages(progress) as tell:
@@ -252,12 +252,6 @@ class Settings(NamedTuple):
     replace_all: bool
 
 
-def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
-    """Raise ValueError if the output folder is not empty."""
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise ValueError(f"{output}: exists and is not empty; choose another folder")
-
-
 def _convert_into(
     work: Path,
     target: Path,
@@ -275,11 +269,12 @@ def _convert_into(
     groups: dict[tuple[str, bool, str], list[Use]] = {}
     on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
-        if any(original.textures([use])[0] in hierarchy for hierarchy in on_shapes):
+        if any(original.texture(use) in hierarchy for hierarchy in on_shapes):
             groups.setdefault((use.file, use.raw, use.relief), []).append(use)
         else:
             result.left.append((use.name, NO_SHAPE))
-    sky = environment_of(parsed)
+    plugins = [node.props.plugin_name() for node in parsed.state.nodes]
+    sky = plugins.index("envmap") if "envmap" in plugins else None  # a scene has at most one
     total = len(groups) + (sky is not None)
 
     def add(outcome: ConvertedTexture | str, nodes: dict[int, str]) -> None:
@@ -300,9 +295,8 @@ def _convert_into(
     for number, group in enumerate(groups.values(), 1):
         used = {texture.file for texture in result.textures}
         file = work / _file_name(group[0].file, group[0].raw, used)
-        pixels = read_pixels(parsed.state.nodes[group[0].node].props)
         told = told_of(number, Path(group[0].file).name)
-        outcome = _convert(original, group, pixels, file, settings, told, len(groups))
+        outcome = _convert(Group(original, group, file, told), settings, len(groups))
         add(outcome, {use.node: use.name for use in group})
     if sky is not None:
         props = parsed.state.nodes[sky].props
@@ -328,40 +322,29 @@ def _convert_into(
 # --- The textures --------------------------------------------------------------------------------
 
 
-def _convert(
-    original: Original,
-    group: list[Use],
-    pixels: NDArray[np.float32],
-    file: Path,
-    settings: Settings,
-    tell: Progress,
-    share: int,
-) -> ConvertedTexture | str:
+def _convert(group: Group, settings: Settings, share: int) -> ConvertedTexture | str:
     """Fit the image of some uses and save the set, or return why it must stay.
 
     Of the errors that renderings may have, it gets one of so many shares. If the bitmap is better,
     there is no file.
     """
-    use, bitmaps = group[0], original.textures(group)
-    held = sum(map(resident_bytes, bitmaps))
+    held, file = sum(map(resident_bytes, group.textures)), group.file
     try:
-        if use.relief:
+        if group.uses[0].relief:
             most = None if settings.replace_all else (held + NEGLIGIBLE) // BYTES
             needed = settings.target_psnr + 10 * math.log10(share)
             goal = Goal(needed, max_gaussians=most)
-            g, seen = fit_relief(original, group, pixels, goal, settings.iterations, file, tell)
+            g, seen = fit_relief(group, goal, settings.iterations)
         else:
             goal = Goal(settings.target_psnr)
-            g, seen = fit_picture(
-                original, group, pixels, goal, settings.iterations, file, tell, share
-            )
+            g, seen = fit_picture(group, goal, settings.iterations, share)
     except (Unsuitable, ImageError) as error:
         file.unlink(missing_ok=True)
         return str(error)
-    saved, wraps = {"type": GAUSSIANS, "filename": str(file)}, {use.wrap for use in group}
-    sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted(wraps)]
+    saved = {"type": GAUSSIANS, "filename": str(file)}
+    sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted({*group.wraps})]
     both = [held, sum(map(resident_bytes, sets))]
-    return _chosen(tuple(use.name for use in group), file, g, seen, both, settings)
+    return _chosen(tuple(use.name for use in group.uses), file, g, seen, both, settings)
 
 
 def _convert_sky(

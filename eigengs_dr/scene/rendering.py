@@ -189,14 +189,12 @@ def pictures(scene: mi.Scene, spp: int | None, seed: int = 0) -> list[NDArray[np
     -------
     list of ndarray of float32, shape (H, W, 3) or (H, W, 1)
     """
-    return [_picture(scene, number, spp, seed) for number in range(len(scene.sensors()))]
-
-
-def _picture(scene: mi.Scene, camera: int, spp: int | None, seed: int) -> NDArray[np.float32]:
-    """Render a scene from a camera in sRGB."""
     renderer = scene.integrator() or mi.load_dict({"type": "path"})
-    rendering = render_in_passes(scene, camera, spp, integrator=renderer, seed=seed)
-    light = rendering.picture("RGB")
-    if not light.size:  # a renderer of AOVs alone
-        light = rendering.pixels[..., :1]
-    return np.clip(to_coded(np.maximum(light, 0)), 0, 1).astype(np.float32)
+    shown = []
+    for camera in range(len(scene.sensors())):
+        rendering = render_in_passes(scene, camera, spp, integrator=renderer, seed=seed)
+        light = rendering.picture("RGB")
+        if not light.size:  # a renderer of AOVs alone
+            light = rendering.pixels[..., :1]
+        shown.append(np.clip(to_coded(np.maximum(light, 0)), 0, 1).astype(np.float32))
+    return shown
