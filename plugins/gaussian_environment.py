@@ -96,7 +96,7 @@ def gaussian_environment() -> type:
             self.read(props, WRAP, False)
             properties.check_light(self.source.start, self.plugin)
             self.to_world = self.world_transform()
-            self.scale = dr.opaque(mi.Float, properties.scale(props))
+            self.scale = dr.opaque(mi.Float, properties.light_scale(props))
             properties.check_known(props)
             self.daylight: Any = mi.load_dict({"type": "d65"}) if mi.is_spectral else None
             self.bounds: tuple | None = None

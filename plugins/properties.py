@@ -134,7 +134,7 @@ def prefilter(props: Properties) -> tuple[float, bool]:
     return check_angle(value, props.plugin_name()), False
 
 
-def scale(props: Properties) -> float:
+def light_scale(props: Properties) -> float:
     """Read ``scale``, the factor of light."""
     value = float(_read(props, "scale", 1.0, float, "a number"))
     if not 0 <= value < math.inf:

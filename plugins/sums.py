@@ -14,11 +14,12 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.types import Bool, Float
+from eigengs_dr.raster.lookup.points import sum_at_points, value_terms
 
 from . import properties
 from .color import shown_channels, upload_table
 from .cone import current_angle
-from .lookup import list_gaussians, make_table, sum_here, sum_over_footprint, table_of_file
+from .lookup import list_gaussians, make_table, sum_over_footprint, table_of_file
 from .parameters import SHAPES
 from .versions import Properties
 
@@ -132,7 +133,9 @@ def plugin_of_sums(base: type) -> Any:
             """Sum all channels of the table, in all lanes; `seen` is the metric of a footprint."""
             (x, _), (y, _) = column, row
             if seen is None:
-                return sum_here(self.table, x, y, inside)
+                packed = self.table.packed
+                cells = self.table.lists.cells
+                return sum_at_points(cells, packed, x, y, inside, value_terms(packed))
             return sum_over_footprint(self.table, column, row, inside, seen)
 
         def display(self, sums: list) -> list:

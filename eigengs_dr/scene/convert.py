@@ -42,6 +42,7 @@ from .bitmaps import (
     uses_of,
 )
 from .fit_environment import BYTES, fit_environment
+from .fit_scene import check_asked
 from .fit_uses import Group, Original, fit_picture, fit_relief, replace_bitmap
 from .rendering import Progress, compare, pictures, stages
 
@@ -215,10 +216,7 @@ def convert_scene(
         raise ValueError("no variant is set; call mi.set_variant('llvm_ad_rgb') first")
     if isinstance(scene, mi.Scene):
         raise TypeError("convert_scene: scene is loaded; give its XML file or its dictionary")
-    if not 0 < target_psnr < 60:
-        raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
-    if iterations < 0:
-        raise ValueError(f"iterations is {iterations}; it must be at least 0")
+    check_asked(target_psnr, iterations)
     refuse_url(output)
     target = Path(os.path.realpath(output))  # of a link, the folder that it names
     if target.exists() and (not target.is_dir() or any(target.iterdir())):

@@ -172,13 +172,7 @@ def fit_for_scene(
     check_scene("fit_for_scene", scene)
     if space not in COLORS:
         raise ValueError(f"space {space!r} is unknown; textures hold {' or '.join(COLORS)}")
-    if not 0 < target_psnr < 60:  # from 59 dB on, 8-bit values have no error
-        raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
-    if iterations < 0 or (max_gaussians is not None and max_gaussians < 1):
-        raise ValueError(
-            f"iterations is {iterations} and max_gaussians is {max_gaussians}; they must be at "
-            "least 0 and at least 1"
-        )
+    check_asked(target_psnr, iterations)
     goal = Goal(target_psnr, max_gaussians=max_gaussians)
     with stages(progress) as tell:
         try:
@@ -189,6 +183,14 @@ def fit_for_scene(
             raise
         except KeyboardInterrupt:
             raise Interrupted(None, "fit_for_scene was interrupted before its search") from None
+
+
+def check_asked(target_psnr: float, iterations: int) -> None:
+    """Raise ValueError if a PSNR or a number of steps is out of range."""
+    if not 0 < target_psnr < 60:  # from 59 dB on, 8-bit values have no error
+        raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
+    if iterations < 0:
+        raise ValueError(f"iterations is {iterations}; it must be at least 0")
 
 
 @dataclass(frozen=True)
