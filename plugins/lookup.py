@@ -36,7 +36,6 @@ from eigengs_dr.raster.parameters import KernelParameters, kernel_radius
 
 from .color import keep_finite
 from .parameters import Arrays, SharedFile, derived
-from .versions import Interaction
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,11 @@ _lookups = _Lookups()
 
 
 def reused(
-    table: Table, where: tuple, si: Interaction, inputs: tuple, look_up: Callable[[], list]
+    table: Table,
+    where: tuple,
+    si: mi.SurfaceInteraction3f,
+    inputs: tuple,
+    look_up: Callable[[], list],
 ) -> list:
     """Return the result of a lookup, from an earlier one with the same inputs if there is one.
 

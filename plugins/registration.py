@@ -13,7 +13,7 @@ from eigengs_dr.backend import recording
 
 from .gaussian_environment import gaussian_environment
 from .gaussian_texture import gaussian_texture
-from .versions import Properties, register_emitter, register_texture
+from .versions import register_emitter, register_texture
 
 PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
     "gaussian_texture": (register_texture, gaussian_texture),
@@ -62,7 +62,7 @@ def _register(variant: str) -> None:
         register(name, partial(_refuse, name) if scalar else create())
 
 
-def _refuse(name: str, props: Properties) -> None:
+def _refuse(name: str, props: mi.Properties) -> None:
     raise RuntimeError(
         f"{name} does not support the variant {mi.variant()}; "
         "use mi.set_variant('llvm_ad_rgb') or another variant of llvm, cuda or metal"

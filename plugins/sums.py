@@ -21,7 +21,6 @@ from .color import shown_channels, upload_table
 from .cone import current_angle
 from .lookup import list_gaussians, make_table, sum_over_footprint, table_of_file
 from .parameters import SHAPES
-from .versions import Properties
 
 
 def plugin_of_sums(base: type) -> Any:
@@ -47,7 +46,7 @@ def plugin_of_sums(base: type) -> Any:
         transform_name: str
         others: frozenset[str]
 
-        def read(self, props: Properties, wrap: str, raw: bool) -> None:
+        def read(self, props: mi.Properties, wrap: str, raw: bool) -> None:
             """Read the properties that all plugins have; `wrap` continues the picture."""
             self.plugin = props.plugin_name()
             self.source = properties.source_of(props)

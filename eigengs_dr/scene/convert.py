@@ -25,7 +25,6 @@ from ..image.io import ImageError
 from ..image.metrics import psnr
 from ..plugins import resident_bytes
 from ..plugins.properties import check_rotation, source_of, to_uv
-from ..plugins.versions import Properties
 from ..storage.atomic import atomic_folder, lock_output, refuse_url, remove_stale
 from .bitmaps import (
     GAUSSIANS,
@@ -452,7 +451,7 @@ def _rewrite(parsed: Parsed, replacements: dict[int, str], work: Path, target: P
                 props[key] = os.path.relpath(path, target)
 
 
-def _save_set(props: Properties, folder: Path, file: str) -> None:
+def _save_set(props: mi.Properties, folder: Path, file: str) -> None:
     """Write the arrays of a plugin of Gaussians, or a model with its coefficients, to a file."""
     source = source_of(props)
     source.gaussians(source.tensors).save(folder / file)
@@ -485,7 +484,7 @@ def _to_xml(parsed: Parsed) -> str:
 
 
 def _write_ids(
-    element: ElementTree.Element, props: Properties, nodes: list[mi.parser.SceneNode]
+    element: ElementTree.Element, props: mi.Properties, nodes: list[mi.parser.SceneNode]
 ) -> None:
     """Give an element and those in it the ids of their nodes, which the writer visits in turn."""
     if props.id():

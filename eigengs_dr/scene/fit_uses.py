@@ -24,7 +24,6 @@ from ..fitting.options import Goal
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import psnr
 from ..image.space import DATA
-from ..plugins.versions import Properties
 from .bitmaps import (
     GAUSSIANS,
     KEPT,
@@ -148,7 +147,7 @@ class Group:
         """Their wrap modes."""
         return [use.wrap for use in self.uses]
 
-    def psnr_with(self, change: Callable[[Properties], None]) -> float:
+    def psnr_with(self, change: Callable[[mi.Properties], None]) -> float:
         """Return the lowest PSNR of a camera if only the bitmaps of these uses are changed."""
         other = self.original.source.copied()
         for use in self.uses:
@@ -162,7 +161,7 @@ class Group:
         return self.psnr_with(partial(replace_bitmap, file=str(self.file)))
 
 
-def replace_bitmap(props: Properties, file: str) -> None:
+def replace_bitmap(props: mi.Properties, file: str) -> None:
     """Turn the properties of a bitmap or an ``envmap`` into those of a plugin of Gaussians."""
     plugin, kept = (SKY, SKY_KEPT) if props.plugin_name() == "envmap" else (GAUSSIANS, KEPT)
     for key in list(props.keys()):
@@ -263,7 +262,7 @@ def fit_relief(group: Group, goal: Goal, iterations: int) -> tuple[Gaussians, fl
     raise Unsuitable(f"{relief}: the renderings keep {', '.join(reached)}")
 
 
-def _make_smooth(values: NDArray[np.float32], props: Properties) -> None:
+def _make_smooth(values: NDArray[np.float32], props: mi.Properties) -> None:
     """Turn the properties of a bitmap into those of a smooth surface through its texels."""
     mode = SPLINES[str(props.get("wrap_mode", "repeat"))]
     finer = zoom(values, (FINER, FINER, 1), order=3, mode=mode, grid_mode=True)
