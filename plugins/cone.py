@@ -15,7 +15,7 @@ from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.messages import warn
 from eigengs_dr.backend.types import Bool, Float
 
-from .versions import Interaction, footprint_of, has_footprints
+from .versions import footprint_of, has_footprints
 
 PIXEL = 0.4
 """Standard deviation of a footprint in pixels. The random positions of samples in a pixel already
@@ -66,7 +66,7 @@ def footprint_inputs() -> tuple[str, ...]:
 
 
 def seen_metric(
-    si: Interaction, inverse: tuple, angle: Float | None, plugin: str
+    si: mi.SurfaceInteraction3f, inverse: tuple, angle: Float | None, plugin: str
 ) -> tuple[list, Bool]:
     """Return the metric of the renderer's footprint, or of the cone's where there is none.
 
@@ -154,7 +154,7 @@ def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Bool]:
     return [n00 * n00 + n10 * n10, n00 * n01 + n10 * n11, n01 * n01 + n11 * n11], present
 
 
-def metric(si: Interaction, inverse: tuple, angle: Float) -> tuple[list, Bool]:
+def metric(si: mi.SurfaceInteraction3f, inverse: tuple, angle: Float) -> tuple[list, Bool]:
     """Return the metric of the texture plane in which the footprint of a pixel is the unit circle.
 
     At the distance t along the ray direction d, the cone of a pixel has the radius

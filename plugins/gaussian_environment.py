@@ -26,7 +26,6 @@ from .emission import Spacing, light_at, make_survey
 from .importance import SIDE, importance_of
 from .memory import resident_bytes
 from .sums import plugin_of_sums
-from .versions import Interaction, Properties
 
 FAR = 1e8
 """Distance that stands for infinity where the bounds of the scene are unknown."""
@@ -90,13 +89,13 @@ def gaussian_environment() -> type:
         others = frozenset({"to_world", "scale", "sampling_weight", "prefilter"})
 
         @guest()  # a thread of Mitsuba, whose caller may hold the lock
-        def __init__(self, props: Properties) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.m_flags = mi.EmitterFlags.Infinite | mi.EmitterFlags.SpatiallyVarying
             self.read(props, WRAP, False)
             properties.check_light(self.source.start, self.plugin)
             self.to_world = self.world_transform()
-            self.scale = dr.opaque(mi.Float, properties.scale(props))
+            self.scale = dr.opaque(mi.Float, properties.light_scale(props))
             properties.check_known(props)
             self.daylight: Any = mi.load_dict({"type": "d65"}) if mi.is_spectral else None
             self.bounds: tuple | None = None
@@ -142,12 +141,12 @@ def gaussian_environment() -> type:
         # For why the collector is off, see `eigengs_dr.plugins.gaussian_texture`.
 
         @collector_off()
-        def eval(self, si: Interaction, active: Mask = True) -> mi.Spectrum:
+        def eval(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> mi.Spectrum:
             return _emitted(self._light(self._uv(-si.wi), si.wavelengths, active))
 
         @collector_off()
         def eval_direction(
-            self, it: Interaction, ds: mi.DirectionSample3f, active: Mask = True
+            self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Mask = True
         ) -> mi.Spectrum:
             return _emitted(self._light(self._uv(ds.d), it.wavelengths, active))
 
@@ -211,7 +210,7 @@ def gaussian_environment() -> type:
 
         @collector_off()
         def sample_direction(
-            self, it: Interaction, sample: mi.Point2f, active: Mask = True
+            self, it: mi.Interaction3f, sample: mi.Point2f, active: Mask = True
         ) -> tuple:
             uv, density = self.importance.sample(sample, active)
             d, jacobian = self._direction(uv)
@@ -228,7 +227,7 @@ def gaussian_environment() -> type:
 
         @collector_off()
         def pdf_direction(
-            self, it: Interaction, ds: mi.DirectionSample3f, active: Mask = True
+            self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Mask = True
         ) -> Float:
             uv = self._uv(ds.d)
             _, jacobian = self._direction(uv)
@@ -257,7 +256,9 @@ def gaussian_environment() -> type:
             return mi.Ray3f(si.p, -d, time, wavelengths), weight & active & (pdf > 0)
 
         @collector_off()
-        def sample_wavelengths(self, si: Interaction, sample: Float, active: Mask = True) -> tuple:
+        def sample_wavelengths(
+            self, si: mi.SurfaceInteraction3f, sample: Float, active: Mask = True
+        ) -> tuple:
             if not mi.is_spectral:
                 return mi.Color0f(), _emitted(self._light(si.uv, si.wavelengths, active))
             count = dr.size_v(mi.UnpolarizedSpectrum)

@@ -18,7 +18,7 @@ from .emission import Emission, Survey, emission_of, make_survey, outside_of_rec
 from .lookup import reused
 from .memory import resident_bytes
 from .sums import plugin_of_sums
-from .versions import Interaction, Properties, texture_class
+from .versions import texture_class
 
 
 def gaussian_texture() -> type:
@@ -75,7 +75,7 @@ def gaussian_texture() -> type:
         transform_name, others = "to_uv", frozenset({"to_uv", "prefilter"})
 
         @guest()  # a thread of Mitsuba, whose caller may hold the lock
-        def __init__(self, props: Properties) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.read(props, properties.wrap_mode(props), properties.raw(props))
             self.to_uv = properties.to_uv(props)
@@ -100,7 +100,7 @@ def gaussian_texture() -> type:
         # then, the program would lose that scene's textures, and read freed memory.
 
         @collector_off()
-        def eval(self, si: Interaction, active: Mask = True) -> mi.Spectrum:
+        def eval(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> mi.Spectrum:
             color = self._color(si, active)
             if len(color) == 1 or mi.is_monochromatic:
                 return mi.UnpolarizedSpectrum(luminance(color))
@@ -114,11 +114,11 @@ def gaussian_texture() -> type:
             return upsample(mi.Color3f(*color), si.wavelengths, self.spectra)
 
         @collector_off()
-        def eval_1(self, si: Interaction, active: Mask = True) -> Float:
+        def eval_1(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> Float:
             return luminance(self._color(si, active))
 
         @collector_off()
-        def eval_3(self, si: Interaction, active: Mask = True) -> mi.Color3f:
+        def eval_3(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> mi.Color3f:
             if self.channels == 1:
                 raise ValueError(
                     f"{self.label()}: a lookup of three channels, such as a normal map, needs a "
@@ -127,7 +127,7 @@ def gaussian_texture() -> type:
             return mi.Color3f(*self._color(si, active))
 
         @collector_off()
-        def eval_1_grad(self, si: Interaction, active: Mask = True) -> mi.Vector2f:
+        def eval_1_grad(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> mi.Vector2f:
             if self.channels == 2:
                 raise ValueError(
                     f"{self.label()}: a bump map needs heights; this set has x and y of normals"
@@ -148,7 +148,7 @@ def gaussian_texture() -> type:
             m = self.transform.matrix
             return mi.Vector2f(m[0, 0] * du + m[1, 0] * dv, m[0, 1] * du + m[1, 1] * dv)
 
-        def _color(self, si: Interaction, active: Mask) -> list:
+        def _color(self, si: mi.SurfaceInteraction3f, active: Mask) -> list:
             """Look up the channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
             where = (self.wrap, self.angle, id(self.sensor), *np.array(self.to_uv.matrix).flat)
             inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
@@ -156,7 +156,7 @@ def gaussian_texture() -> type:
             _, _, inside = self.point(si.uv)
             return [dr.select(inside & active, s, 0) for s in self.display(sums)]
 
-        def _look_up(self, si: Interaction) -> list:
+        def _look_up(self, si: mi.SurfaceInteraction3f) -> list:
             """Sum all channels of the table, in all lanes."""
             (x, sx), (y, sy), inside = self.point(si.uv)
             if not self.filtered():
@@ -198,7 +198,7 @@ def gaussian_texture() -> type:
 
         @collector_off()
         def sample_spectrum(
-            self, si: Interaction, sample: mi.Spectrum, active: Mask = True
+            self, si: mi.SurfaceInteraction3f, sample: mi.Spectrum, active: Mask = True
         ) -> tuple:
             if not mi.is_spectral:
                 return mi.Color0f(), self.eval(si, active)
@@ -207,7 +207,7 @@ def gaussian_texture() -> type:
             si.wavelengths = mi.MI_CIE_MIN + width * sample
             return si.wavelengths, self.eval(si, active) * width
 
-        def pdf_spectrum(self, si: Interaction, active: Mask = True) -> mi.Spectrum:
+        def pdf_spectrum(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> mi.Spectrum:
             if not mi.is_spectral:
                 return mi.Color0f()
             inside = (si.wavelengths >= mi.MI_CIE_MIN) & (si.wavelengths <= mi.MI_CIE_MAX)

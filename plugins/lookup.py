@@ -1,4 +1,4 @@
-"""What lookups of ``gaussian_texture`` read, and the lookups: at a point, or over a footprint.
+"""What lookups of ``gaussian_texture`` read, and the lookups over a footprint.
 
 A material that looks a point up twice pays once. A BSDF looks its textures up in its evaluation
 and again in its sampling, often in one recorded program. Dr.Jit merges equal gathers of a bitmap,
@@ -16,11 +16,11 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import indices_of, scope
-from eigengs_dr.backend.types import Bool, Float
+from eigengs_dr.backend.types import Bool
 from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.footprint import bound_covariance
-from eigengs_dr.raster.lookup.points import Packed, invert, sum_at_points, value_terms
+from eigengs_dr.raster.lookup.points import Packed, invert
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered, where_any
 from eigengs_dr.raster.lookup.pyramid import (
     GaussianPyramid,
@@ -36,7 +36,6 @@ from eigengs_dr.raster.parameters import KernelParameters, kernel_radius
 
 from .color import keep_finite
 from .parameters import Arrays, SharedFile, derived
-from .versions import Interaction
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,11 @@ _lookups = _Lookups()
 
 
 def reused(
-    table: Table, where: tuple, si: Interaction, inputs: tuple, look_up: Callable[[], list]
+    table: Table,
+    where: tuple,
+    si: mi.SurfaceInteraction3f,
+    inputs: tuple,
+    look_up: Callable[[], list],
 ) -> list:
     """Return the result of a lookup, from an earlier one with the same inputs if there is one.
 
@@ -214,25 +217,6 @@ def _is_traced() -> bool:
     results of an earlier program are freed meanwhile.
     """
     return dr.flag(dr.JitFlag.SymbolicScope) and not dr.flag(dr.JitFlag.FreezingScope)
-
-
-def sum_here(table: Table, x: Float, y: Float, active: Bool) -> list:
-    """Sum the Gaussians at a point.
-
-    Parameters
-    ----------
-    table : Table
-    x, y : Float
-        In pixels, inside the image.
-    active : Bool
-
-    Returns
-    -------
-    list of Float
-        One sum for each channel, without the background.
-    """
-    packed = table.packed
-    return sum_at_points(table.lists.cells, packed, x, y, active, value_terms(packed))
 
 
 def sum_over_footprint(

@@ -17,17 +17,16 @@ from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
 
 from .parameters import TextureParameters, model_source, shared_file, without_arrays
-from .versions import Properties
 
 WRAPS = ("repeat", "mirror", "clamp")
 """Names of the ways to continue an image outside of its borders."""
 
 
-def _mistake(props: Properties, key: str, value: object, must: str) -> ValueError:
+def _mistake(props: mi.Properties, key: str, value: object, must: str) -> ValueError:
     return ValueError(f"{props.plugin_name()}: {key} is {value!r}; it must be {must}")
 
 
-def _read(props: Properties, key: str, default: object, kind: type, must: str) -> Any:
+def _read(props: mi.Properties, key: str, default: object, kind: type, must: str) -> Any:
     """Read a property of a type. A boolean is no number, and an integer is one."""
     value = props.get(key, default)
     allowed = (int, float) if kind is float else kind
@@ -36,7 +35,7 @@ def _read(props: Properties, key: str, default: object, kind: type, must: str) -
     return kind(value)
 
 
-def source_of(props: Properties) -> TextureParameters:
+def source_of(props: mi.Properties) -> TextureParameters:
     """Read the Gaussians from the properties ``filename``, ``model`` or ``mean``, ...
 
     Raises
@@ -83,7 +82,7 @@ def source_of(props: Properties) -> TextureParameters:
     return source
 
 
-def _from_arrays(props: Properties, backend: str | None) -> Gaussians:
+def _from_arrays(props: mi.Properties, backend: str | None) -> Gaussians:
     """Read a set from the properties of `texture_of`."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
     if missing:
@@ -96,22 +95,22 @@ def _from_arrays(props: Properties, backend: str | None) -> Gaussians:
     return Gaussians.from_arrays(mean, factor, color, flat, size=size, space=space, backend=backend)
 
 
-def _path(props: Properties, key: str) -> str:
+def _path(props: mi.Properties, key: str) -> str:
     """Return the path of a file by Mitsuba's resolver, which also looks beside the scene."""
     return str(mi.file_resolver().resolve(props[key]))
 
 
-def file_name(props: Properties) -> str:
+def file_name(props: mi.Properties) -> str:
     """Return the name of the file of the Gaussians, without folders; "" if there is no file."""
     return next((Path(props[key]).name for key in ("filename", "model") if key in props), "")
 
 
-def raw(props: Properties) -> bool:
+def raw(props: mi.Properties) -> bool:
     """Read ``raw``: whether lookups skip decoding and clamping."""
     return bool(_read(props, "raw", False, bool, "a boolean"))
 
 
-def cutoff(props: Properties, default: float) -> float:
+def cutoff(props: mi.Properties, default: float) -> float:
     """Read ``cutoff`` in standard deviations; by default the cutoff of the set."""
     value = float(_read(props, "cutoff", default, float, "a number"))
     if not 0 < value <= MAX_CUTOFF:
@@ -119,7 +118,7 @@ def cutoff(props: Properties, default: float) -> float:
     return value
 
 
-def prefilter(props: Properties) -> tuple[float, bool]:
+def prefilter(props: mi.Properties) -> tuple[float, bool]:
     """Read ``prefilter``: the angle of a pixel in radians, or 0 for lookups at points.
 
     Returns
@@ -134,7 +133,7 @@ def prefilter(props: Properties) -> tuple[float, bool]:
     return check_angle(value, props.plugin_name()), False
 
 
-def scale(props: Properties) -> float:
+def light_scale(props: mi.Properties) -> float:
     """Read ``scale``, the factor of light."""
     value = float(_read(props, "scale", 1.0, float, "a number"))
     if not 0 <= value < math.inf:
@@ -175,13 +174,13 @@ def check_angle(value: float, plugin: str) -> float:
     return value
 
 
-def check_known(props: Properties) -> None:
+def check_known(props: mi.Properties) -> None:
     """Raise `ValueError` if there are properties that were not read."""
     if unknown := props.unqueried():
         raise ValueError(f"{props.plugin_name()}: it has no property {' and '.join(unknown)}")
 
 
-def wrap_mode(props: Properties) -> str:
+def wrap_mode(props: mi.Properties) -> str:
     """Read ``wrap_mode``, one of `WRAPS`."""
     wrap = str(props.get("wrap_mode", "repeat"))
     if wrap not in WRAPS:
@@ -191,7 +190,7 @@ def wrap_mode(props: Properties) -> str:
     return wrap
 
 
-def to_uv(props: Properties) -> mi.ScalarTransform3f:
+def to_uv(props: mi.Properties) -> mi.ScalarTransform3f:
     """Read ``to_uv``, by default the identity.
 
     Parameters

@@ -1,8 +1,8 @@
-"""Registration of the plugins with the variants of Mitsuba."""
+"""Registration of the plugins with the variants of Mitsuba, and of the objects of all scenes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from typing import Any
 
@@ -13,8 +13,7 @@ from eigengs_dr.backend import recording
 
 from .gaussian_environment import gaussian_environment
 from .gaussian_texture import gaussian_texture
-from .living import living_objects
-from .versions import Properties, register_emitter, register_texture
+from .versions import register_emitter, register_texture
 
 PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
     "gaussian_texture": (register_texture, gaussian_texture),
@@ -63,8 +62,47 @@ def _register(variant: str) -> None:
         register(name, partial(_refuse, name) if scalar else create())
 
 
-def _refuse(name: str, props: Properties) -> None:
+def _refuse(name: str, props: mi.Properties) -> None:
     raise RuntimeError(
         f"{name} does not support the variant {mi.variant()}; "
         "use mi.set_variant('llvm_ad_rgb') or another variant of llvm, cuda or metal"
     )
+
+
+# --- The objects of all scenes: another thread may drop them while one records a rendering -------
+
+KINDS = ("BSDF", "Emitter", "Medium", "PhaseFunction", "Sensor", "Shape", "Texture")
+"""Classes with virtual calls. Dr.Jit records a call for all objects of a class in the process, one
+after the other, and ends the process or reads freed memory if one is freed meanwhile. Mitsuba
+renders without Python's lock, so another thread that drops a scene does not wait for it."""
+
+NONE = 0xFFFFFFFF
+"""A number that no object has."""
+
+
+def living_objects() -> list[object]:
+    """Return the objects of all scenes of the current variant."""
+    if not mi.variant() or mi.variant().startswith("scalar"):
+        return []
+    return [one for kind in KINDS for one in _living(getattr(mi, f"{kind}Ptr"))]
+
+
+def _living(pointer: type) -> Iterator[object]:
+    """Yield the objects of a class. Dr.Jit numbers them from 1; some numbers are free."""
+
+    def known(number: int) -> object:
+        return dr.reinterpret_array(pointer, mi.UInt32(number))[0]
+
+    try:
+        known(NONE)  # raises, unless there never was an object
+        return
+    except RuntimeError:
+        number = 1
+    while True:
+        try:
+            one = known(number)
+        except RuntimeError:  # that was the last one
+            return
+        if one is not None:
+            yield one
+        number += 1

@@ -14,13 +14,13 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.types import Bool, Float
+from eigengs_dr.raster.lookup.points import sum_at_points, value_terms
 
 from . import properties
 from .color import shown_channels, upload_table
 from .cone import current_angle
-from .lookup import list_gaussians, make_table, sum_here, sum_over_footprint, table_of_file
+from .lookup import list_gaussians, make_table, sum_over_footprint, table_of_file
 from .parameters import SHAPES
-from .versions import Properties
 
 
 def plugin_of_sums(base: type) -> Any:
@@ -46,7 +46,7 @@ def plugin_of_sums(base: type) -> Any:
         transform_name: str
         others: frozenset[str]
 
-        def read(self, props: Properties, wrap: str, raw: bool) -> None:
+        def read(self, props: mi.Properties, wrap: str, raw: bool) -> None:
             """Read the properties that all plugins have; `wrap` continues the picture."""
             self.plugin = props.plugin_name()
             self.source = properties.source_of(props)
@@ -132,7 +132,9 @@ def plugin_of_sums(base: type) -> Any:
             """Sum all channels of the table, in all lanes; `seen` is the metric of a footprint."""
             (x, _), (y, _) = column, row
             if seen is None:
-                return sum_here(self.table, x, y, inside)
+                packed = self.table.packed
+                cells = self.table.lists.cells
+                return sum_at_points(cells, packed, x, y, inside, value_terms(packed))
             return sum_over_footprint(self.table, column, row, inside, seen)
 
         def display(self, sums: list) -> list:

@@ -20,12 +20,6 @@ from eigengs_dr.backend.types import Float, Mask
 Texture = Any
 """A ``mitsuba.Texture`` of the current variant."""
 
-Interaction = Any
-"""A ``mitsuba.SurfaceInteraction3f`` of the current variant."""
-
-Properties = Any
-"""``mitsuba.Properties``."""
-
 
 def _renamed(holder: Any, before: str, after: str) -> Any:
     return getattr(holder, before if hasattr(holder, before) else after)
@@ -42,7 +36,7 @@ def texture_kind() -> object:
     return _renamed(mi.ObjectType, "Texture", "Field")
 
 
-def register_texture(name: str, create: Callable[[Properties], Texture]) -> None:
+def register_texture(name: str, create: Callable[[mi.Properties], Texture]) -> None:
     """Register a texture with the current variant, by the type of the plugin in scenes.
 
     Parameters
@@ -58,7 +52,7 @@ def register_texture(name: str, create: Callable[[Properties], Texture]) -> None
         mi.register_field(name, reason_first(field))
 
 
-def register_emitter(name: str, create: Callable[[Properties], Any]) -> None:
+def register_emitter(name: str, create: Callable[[mi.Properties], Any]) -> None:
     """Register an emitter with the current variant, by the type of the plugin in scenes."""
     mi.register_emitter(name, reason_first(create))
 
@@ -80,7 +74,7 @@ _ended: Generator[None] = (_ for _ in ())
 _ended.close()  # its method `throw` raises an error, and adds no traceback
 
 
-def reason_first(create: Callable[[Properties], Any]) -> type:
+def reason_first(create: Callable[[mi.Properties], Any]) -> type:
     """Return a class that calls `create` and raises its errors without a traceback.
 
     Mitsuba prints an error of a plugin as nanobind does: the traceback, then what went wrong. Every
@@ -91,7 +85,7 @@ def reason_first(create: Callable[[Properties], Any]) -> type:
     class Created:
         made = create
 
-        def __new__(cls, props: Properties) -> Any:
+        def __new__(cls, props: mi.Properties) -> Any:
             try:
                 return create(props)
             except Exception as error:
@@ -129,13 +123,17 @@ def _as_field(texture: Any) -> type:
         def supports_surface_queries(self) -> bool:
             return True
 
-        def eval_1(self, si: Interaction, *rest: Mask, active: Mask = True) -> object:
+        def eval_1(self, si: mi.SurfaceInteraction3f, *rest: Mask, active: Mask = True) -> object:
             return super().eval_1(si, rest[-1] if rest else active)
 
-        def eval_color3(self, si: Interaction, *rest: Mask, active: Mask = True) -> object:
+        def eval_color3(
+            self, si: mi.SurfaceInteraction3f, *rest: Mask, active: Mask = True
+        ) -> object:
             return super().eval_3(si, rest[-1] if rest else active)
 
-        def eval_spec(self, si: Interaction, *rest: Mask, active: Mask = True) -> object:
+        def eval_spec(
+            self, si: mi.SurfaceInteraction3f, *rest: Mask, active: Mask = True
+        ) -> object:
             return super().eval(si, rest[-1] if rest else active)
 
     return SurfaceField
@@ -146,7 +144,7 @@ def has_footprints() -> bool:
     return hasattr(mi.SurfaceInteraction3f, "footprint")
 
 
-def footprint_of(si: Interaction) -> tuple[Float, ...] | None:
+def footprint_of(si: mi.SurfaceInteraction3f) -> tuple[Float, ...] | None:
     """Return the footprint from the renderer, without gradients.
 
     Parameters

@@ -91,6 +91,25 @@ def test_every_long_function_takes_a_bar_or_a_function(progress, at_once, photo)
     assert callable(progress) or all(name in terminal.getvalue() for name in names)
 
 
+def test_a_bar_is_called_by_the_image_and_the_stage(at_once):
+    @doors.shows_progress
+    def convert(progress=None):
+        progress(0, 1, {"stage": "scene"})
+        for step in range(4):
+            progress(step, 4, {"image": "1/1 photo.png", "stage": "search", "psnr_rgb": 30.0})
+            time.sleep(0.05)
+        progress(1, 2, {"stage": "renderings"})
+        time.sleep(0.2)
+        progress(2, 2, {"stage": "renderings"})
+
+    with redirect_stderr(Terminal()) as terminal:
+        convert()
+    shown = terminal.getvalue().replace("\r", "\n")
+    assert "1/1 photo.png: search: " in shown and "30.00 dB" in shown
+    last = [line for line in shown.splitlines() if line.startswith("renderings: ")][-1]
+    assert "2/2" in last and "dB" not in last  # each stage has its own figures
+
+
 def test_a_line_stands_above_the_bar_of_a_command(at_once):
     with redirect_stderr(Terminal()) as terminal, console.bar(False) as show:
         show("photos", 3, 4, {"psnr_rgb": 31.2})

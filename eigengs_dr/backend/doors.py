@@ -152,9 +152,9 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
     Yields
     ------
     callable or None
-        ``show(done, total, row)``, optionally with a label as the first argument; a new label
-        restarts the bar. The bar shows ``psnr_rgb`` of the row, or its loss; the row may be left
-        out. None if no bar is visible.
+        ``show(done, total, row)``, optionally with a label as the first argument, by default that
+        of the row, see `label_of`; a new label restarts the bar. The bar shows ``psnr_rgb`` of the
+        row, or its loss; the row may be left out. None if no bar is visible.
     """
     if callable(progress):
         yield progress
@@ -169,15 +169,19 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
     with tqdm(desc=name, delay=DELAY, leave=False) as bar:
 
         def show(*values: Any) -> None:
+            label = ""
             if isinstance(values[0], str):
                 label, *values = values  # type: ignore[assignment]
-                if label != bar.desc:
-                    bar.set_description_str(label, refresh=False)
-                    if bar.n:  # otherwise the bar would appear at once
-                        bar.reset()
-            done, bar.total, *rest = values
+            done, total, *rest = values
             row = rest[0] if rest else None
             figures = row if isinstance(row, dict) else {"psnr_rgb": getattr(row, "psnr_rgb", None)}
+            label = label or label_of(figures)
+            if label and label != bar.desc:
+                bar.set_description_str(label, refresh=False)
+                bar.set_postfix_str("", refresh=False)
+                if bar.n:  # otherwise the bar would appear at once
+                    bar.reset()
+            bar.total = total
             if figures.get("psnr_rgb") is not None:
                 bar.set_postfix_str(f"psnr_rgb {figures['psnr_rgb']:.2f} dB", refresh=False)
             elif "loss" in figures:
@@ -185,6 +189,11 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
             bar.update(done - bar.n)
 
         yield show
+
+
+def label_of(row: Record) -> str:
+    """Return the image and the stage that a row of progress names, if it names any."""
+    return ": ".join(row[key] for key in ("image", "stage") if key in row)
 
 
 def _is_watched() -> bool:

@@ -18,11 +18,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ..backend.doors import label_of
+from ..backend.interrupts import INTERRUPTED, Interrupted
 from ..backend.selection import backend_of, name_of, select
 from ..backend.types import Record
 from ..storage.atomic import atomic_write
 from . import options
-from .console import MISSED, bar, table
+from .console import MISSED, bar, print_message, table
 from .outputs import check_outputs, lock_outputs, name_outputs
 
 if TYPE_CHECKING:
@@ -282,10 +284,15 @@ def convert(
     from ..scene.convert import convert_scene
 
     started = time.perf_counter()
-    with scene_errors(scene), bar(run.quiet) as show:
-        converted = convert_scene(
-            scene, output, target_psnr, iterations, spp, definitions, replace_all, progress=show
-        )
+    try:
+        with scene_errors(scene), bar(run.quiet) as show:
+            converted = convert_scene(
+                scene, output, target_psnr, iterations, spp, definitions, replace_all,
+                lambda done, total, row: show(label_of(row), done, total),
+            )  # fmt: skip
+    except Interrupted:
+        print_message("interrupted")
+        run.context.exit(INTERRUPTED)
     before = sum(texture.bytes for texture in converted.textures)
     after = sum(texture.gaussian_bytes for texture in converted.textures)
     figures: dict[str, object] = {"output": converted.scene, "bytes_before": before, "bytes": after}

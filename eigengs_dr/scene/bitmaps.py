@@ -16,7 +16,7 @@ from ..backend.types import PathLike, Record
 from ..image.color import to_coded
 from ..image.space import DATA, LINEAR, RADIANCE, Space
 from ..plugins import register_plugins  # first: its error says what to install
-from ..plugins.versions import Properties, texture_kind
+from ..plugins.versions import texture_kind
 
 # isort: split
 import mitsuba as mi
@@ -139,7 +139,7 @@ def _own_resolver() -> Iterator[mi.FileResolver]:
         mi.set_file_resolver(before)
 
 
-def _make_absolute(props: Properties) -> None:
+def _make_absolute(props: mi.Properties) -> None:
     """Look up files as Mitsuba does: in the folders of ``<path>``, then beside the scene."""
     for key in file_keys(props):
         path = Path(str(mi.file_resolver().resolve(props[key])))
@@ -152,14 +152,14 @@ def _make_absolute(props: Properties) -> None:
             )
 
 
-def file_keys(props: Properties) -> list[str]:
+def file_keys(props: mi.Properties) -> list[str]:
     """Return the properties that name files."""
     has_model = props.plugin_name() in (GAUSSIANS, SKY)
     named = ("filename", "model") if has_model else ("filename",)
     return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 
 
-def references(props: Properties) -> dict[str, int]:
+def references(props: mi.Properties) -> dict[str, int]:
     """Return the indices of the nodes that a parsed node has in its slots."""
     kind = mi.Properties.Type.ResolvedReference
     slots = (slot for slot in props.keys() if props.type(slot) == kind)  # noqa: SIM118
@@ -210,24 +210,18 @@ def uses_of(
     return uses, left
 
 
-def environment_of(parsed: Parsed) -> int | None:
-    """Return the index of the environment map of a scene, which has at most one."""
-    names = [node.props.plugin_name() for node in parsed.state.nodes]
-    return names.index("envmap") if "envmap" in names else None
-
-
 def is_bitmap(node: mi.parser.SceneNode) -> bool:
     """Return whether a node of a parsed scene is a bitmap texture."""
     return node.type == texture_kind() and node.props.plugin_name() == "bitmap"
 
 
-def label(props: Properties, place: str) -> str:
+def label(props: mi.Properties, place: str) -> str:
     """Name a bitmap by its file and where it is."""
     file = Path(str(props["filename"])).name if "filename" in props else "a bitmap in memory"
     return f"{file} ({place})"
 
 
-def _reason(props: Properties, parents: list[str]) -> str:
+def _reason(props: mi.Properties, parents: list[str]) -> str:
     """Return why the properties or users of a bitmap require a bitmap, or nothing."""
     if not parents:
         return "nothing uses it"
@@ -238,7 +232,7 @@ def _reason(props: Properties, parents: list[str]) -> str:
     return ""
 
 
-def read_pixels(props: Properties) -> NDArray[np.float32]:
+def read_pixels(props: mi.Properties) -> NDArray[np.float32]:
     """Return the pixels of a bitmap or an environment map as Mitsuba reads them.
 
     Returns

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.doors import door, shows_progress
+from ..backend.interrupts import Interrupted
 from ..backend.messages import warn
 from ..backend.types import PathLike, Record
 from ..fitting.options import Goal
@@ -24,7 +25,6 @@ from ..image.io import ImageError
 from ..image.metrics import psnr
 from ..plugins import resident_bytes
 from ..plugins.properties import check_rotation, source_of, to_uv
-from ..plugins.versions import Properties
 from ..storage.atomic import atomic_folder, lock_output, refuse_url, remove_stale
 from .bitmaps import (
     GAUSSIANS,
@@ -32,7 +32,6 @@ from .bitmaps import (
     Parsed,
     Unsuitable,
     Use,
-    environment_of,
     file_keys,
     is_bitmap,
     label,
@@ -42,8 +41,9 @@ from .bitmaps import (
     uses_of,
 )
 from .fit_environment import BYTES, fit_environment
-from .fit_uses import Original, fit_picture, fit_relief, replace_bitmap
-from .rendering import Progress, compare, pictures, silent
+from .fit_scene import check_asked
+from .fit_uses import Group, Original, fit_picture, fit_relief, replace_bitmap
+from .rendering import Progress, compare, pictures, stages
 
 SCENE = "scene.xml"
 """Name of the new scene in its folder."""
@@ -175,7 +175,10 @@ def convert_scene(
         Whether to replace better bitmaps too: Gaussians are differentiable, and have no texels.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
-        ``progress(label, done, total)``.
+        A function is called as ``progress(done, total, row)``; the ``stage`` of the row is "scene",
+        "rays", "target", "trial", "search" or "renderings". In the stages of an image the row also
+        has the ``image``, such as "1/3 photo.png", and a search adds the last row of its trace. The
+        function may raise `KeyboardInterrupt` to end the call.
 
     Returns
     -------
@@ -192,6 +195,9 @@ def convert_scene(
         Mitsuba's error, if the scene does not parse.
     OSError
         If the folder cannot be written.
+    Interrupted
+        After Ctrl-C, SIGTERM, or a `KeyboardInterrupt` of `progress`; its ``result`` is a
+        ConvertedScene with the images that were decided. Nothing is written.
 
     Warns
     -----
@@ -209,25 +215,29 @@ def convert_scene(
         raise ValueError("no variant is set; call mi.set_variant('llvm_ad_rgb') first")
     if isinstance(scene, mi.Scene):
         raise TypeError("convert_scene: scene is loaded; give its XML file or its dictionary")
-    if not 0 < target_psnr < 60:
-        raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
-    if iterations < 0:
-        raise ValueError(f"iterations is {iterations}; it must be at least 0")
+    check_asked(target_psnr, iterations)
     refuse_url(output)
     target = Path(os.path.realpath(output))  # of a link, the folder that it names
-    _check_empty(output, target)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise ValueError(f"{output}: exists and is not empty; choose another folder")
     settings = Settings(target_psnr, iterations, spp, replace_all)
-    with lock_output(output):
+    result = ConvertedScene(Path(output) / SCENE, [], [], [], [], [])
+    with lock_output(output), stages(progress) as tell:
         remove_stale(target.parent)
-        with atomic_folder(output) as work:
-            parsed = parse(scene, parameters)
-            result = _convert_into(work, target, parsed, settings, progress or silent)
+        try:
+            with atomic_folder(output) as work:
+                _convert_into(work, target, parse(scene, parameters), settings, result, tell)
+        except KeyboardInterrupt:
+            raise Interrupted(
+                result, "the conversion was interrupted, and nothing is written; .result holds "
+                "the images that were decided"
+            ) from None  # fmt: skip
     for camera in result.missed(target_psnr):
         warn(
             f"{output}: camera {camera} sees psnr_rgb {result.psnr[camera - 1]:.1f} dB between the "
             f"renderings, below the goal of {target_psnr:g}; look at difference-{camera}.png"
         )
-    return result._replace(scene=Path(output) / SCENE)
+    return result
 
 
 class Settings(NamedTuple):
@@ -239,113 +249,99 @@ class Settings(NamedTuple):
     replace_all: bool
 
 
-def _check_empty(output: str | os.PathLike[str], target: Path) -> None:
-    """Raise ValueError if the output folder is not empty."""
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise ValueError(f"{output}: exists and is not empty; choose another folder")
-
-
 def _convert_into(
     work: Path,
     target: Path,
     parsed: Parsed,
     settings: Settings,
-    progress: Progress,
-) -> ConvertedScene:
-    """Write a scene and its files into a folder that becomes the target."""
-    progress("scene", 0, 1)
+    result: ConvertedScene,
+    tell: Progress,
+) -> None:
+    """Write a scene and its files into a folder that becomes the target, and fill in the result."""
+    tell(0, 1, {"stage": "scene"})
     original = Original(parsed, settings.spp)
     uses, left = uses_of(parsed, original.key_of)
-    result = ConvertedScene(work / SCENE, [], [], left, [], [])
+    result.left.extend(left)
     replacements = dict[int, str]()
     groups: dict[tuple[str, bool, str], list[Use]] = {}
     on_shapes = [mi.traverse(shape).hierarchy for shape in original.scene.shapes()]
     for use in uses:
-        if any(original.textures([use])[0] in hierarchy for hierarchy in on_shapes):
+        if any(original.texture(use) in hierarchy for hierarchy in on_shapes):
             groups.setdefault((use.file, use.raw, use.relief), []).append(use)
         else:
-            left.append((use.name, NO_SHAPE))
-    sky = environment_of(parsed)
+            result.left.append((use.name, NO_SHAPE))
+    plugins = [node.props.plugin_name() for node in parsed.state.nodes]
+    sky = plugins.index("envmap") if "envmap" in plugins else None  # a scene has at most one
     total = len(groups) + (sky is not None)
 
     def add(outcome: ConvertedTexture | str, nodes: dict[int, str]) -> None:
         """Record the outcome for an image, with the names of its nodes."""
         if isinstance(outcome, str):
-            left.extend((name, outcome) for name in nodes.values())
+            result.left.extend((name, outcome) for name in nodes.values())
         elif not outcome.file:
             result.better.append(outcome)
         else:
             result.textures.append(outcome)
             replacements.update(dict.fromkeys(nodes, outcome.file))
 
-    def shown(number: int, name: str) -> Progress:
-        """Return what shows the stages of one of the images."""
-        return lambda label, *done: progress(f"{number}/{total} {name}: {label}", *done)
+    def told_of(number: int, name: str) -> Progress:
+        """Return what tells the stages of one of the images."""
+        image = {"image": f"{number}/{total} {name}"}
+        return lambda done, steps, row: tell(done, steps, row | image)
 
     for number, group in enumerate(groups.values(), 1):
         used = {texture.file for texture in result.textures}
         file = work / _file_name(group[0].file, group[0].raw, used)
-        pixels = read_pixels(parsed.state.nodes[group[0].node].props)
-        show = shown(number, Path(group[0].file).name)
-        outcome = _convert(original, group, pixels, file, settings, show, len(groups))
+        told = told_of(number, Path(group[0].file).name)
+        outcome = _convert(Group(original, group, file, told), settings, len(groups))
         add(outcome, {use.node: use.name for use in group})
     if sky is not None:
         props = parsed.state.nodes[sky].props
         name = label(props, original.keys.get(original.scene.environment(), "environment"))
         path = str(props["filename"]) if "filename" in props else "sky"
         file = work / _file_name(path, False, {texture.file for texture in result.textures})
-        show = shown(total, Path(path).name)
-        add(_convert_sky(original, name, read_pixels(props), file, settings, show), {sky: name})
+        told = told_of(total, Path(path).name)
+        add(_convert_sky(original, name, read_pixels(props), file, settings, told), {sky: name})
     _mark_integrator(original, parsed)
     _rewrite(parsed, replacements, work, target)
-    result.scene.write_text(_to_xml(parsed), encoding="utf-8")
+    (work / SCENE).write_text(_to_xml(parsed), encoding="utf-8")
     if settings.spp != 0:
-        progress("renderings", 0, 2)
-        after = pictures(mi.load_file(str(result.scene)), settings.spp)
-        progress("renderings", 1, 2)
+        tell(0, 2, {"stage": "renderings"})
+        after = pictures(mi.load_file(str(work / SCENE)), settings.spp)
+        tell(1, 2, {"stage": "renderings"})
         result.psnr.extend(compare(original.pictures, after, work))
         if sky in replacements:
             others = pictures(original.scene, settings.spp, seed=1 << 16)
             result.noise.extend(map(psnr, original.pictures, others))
-        progress("renderings", 2, 2)
-    return result
+        tell(2, 2, {"stage": "renderings"})
 
 
 # --- The textures --------------------------------------------------------------------------------
 
 
-def _convert(
-    original: Original,
-    group: list[Use],
-    pixels: NDArray[np.float32],
-    file: Path,
-    settings: Settings,
-    show: Progress,
-    share: int,
-) -> ConvertedTexture | str:
+def _convert(group: Group, settings: Settings, share: int) -> ConvertedTexture | str:
     """Fit the image of some uses and save the set, or return why it must stay.
 
     Of the errors that renderings may have, it gets one of so many shares. If the bitmap is better,
     there is no file.
     """
-    use, bitmaps = group[0], original.textures(group)
-    held = sum(map(resident_bytes, bitmaps))
+    held, file = sum(map(resident_bytes, group.textures)), group.file
     try:
-        if use.relief:
+        if group.uses[0].relief:
             most = None if settings.replace_all else (held + NEGLIGIBLE) // BYTES
             needed = settings.target_psnr + 10 * math.log10(share)
             goal = Goal(needed, max_gaussians=most)
-            g, seen = fit_relief(original, group, pixels, goal, settings.iterations, file, show)
+            g, seen = fit_relief(group, goal, settings.iterations)
         else:
-            asked = settings.target_psnr, settings.iterations
-            g, seen = fit_picture(original, group, pixels, *asked, file, show, share)
+            goal = Goal(settings.target_psnr)
+            g, seen = fit_picture(group, goal, settings.iterations, share)
     except (Unsuitable, ImageError) as error:
         file.unlink(missing_ok=True)
         return str(error)
-    saved, wraps = {"type": GAUSSIANS, "filename": str(file)}, {use.wrap for use in group}
-    sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted(wraps)]
+    saved = {"type": GAUSSIANS, "filename": str(file)}
+    sets = [mi.load_dict({**saved, "wrap_mode": wrap}) for wrap in sorted({*group.wraps})]
     both = [held, sum(map(resident_bytes, sets))]
-    return _chosen(tuple(use.name for use in group), file, g, seen, both, settings)
+    return _chosen(tuple(use.name for use in group.uses), file, g, seen, both, settings)
 
 
 def _convert_sky(
@@ -354,14 +350,14 @@ def _convert_sky(
     pixels: NDArray[np.float32],
     file: Path,
     settings: Settings,
-    show: Progress,
+    tell: Progress,
 ) -> ConvertedTexture | str:
     """Fit an environment map and save the set, or return why it must stay."""
     sky = original.scene.environment()
     try:
         check_rotation(sky.world_transform())
         asked = settings.target_psnr, settings.iterations, resident_bytes(sky)
-        g, seen = fit_environment(original.scene, pixels, *asked, show)
+        g, seen = fit_environment(original.scene, pixels, *asked, tell)
     except (Unsuitable, ImageError) as error:
         return str(error)
     except ValueError:
@@ -455,7 +451,7 @@ def _rewrite(parsed: Parsed, replacements: dict[int, str], work: Path, target: P
                 props[key] = os.path.relpath(path, target)
 
 
-def _save_set(props: Properties, folder: Path, file: str) -> None:
+def _save_set(props: mi.Properties, folder: Path, file: str) -> None:
     """Write the arrays of a plugin of Gaussians, or a model with its coefficients, to a file."""
     source = source_of(props)
     source.gaussians(source.tensors).save(folder / file)
@@ -488,7 +484,7 @@ def _to_xml(parsed: Parsed) -> str:
 
 
 def _write_ids(
-    element: ElementTree.Element, props: Properties, nodes: list[mi.parser.SceneNode]
+    element: ElementTree.Element, props: mi.Properties, nodes: list[mi.parser.SceneNode]
 ) -> None:
     """Give an element and those in it the ids of their nodes, which the writer visits in turn."""
     if props.id():

@@ -26,7 +26,7 @@ from ..plugins.cone import pixel_angle
 from ..raster.render import render
 from .bitmaps import Unsuitable
 from .fit_scene import ENOUGH, shrunk
-from .rendering import Progress, silent
+from .rendering import Progress
 
 FINER = 2
 """Texels of the fit along a texel that cameras resolve, and points of the comparison along one of
@@ -53,7 +53,7 @@ def fit_environment(
     target_psnr: float,
     iterations: int,
     max_bytes: int,
-    show: Progress = silent,
+    tell: Progress = lambda done, total, row: None,
 ) -> tuple[Gaussians, float]:
     """Find the fewest Gaussians that show an environment map at a PSNR.
 
@@ -69,8 +69,8 @@ def fit_environment(
         Steps of the fits.
     max_bytes : int
         Largest memory of a set.
-    show : callable, optional
-        ``show(label, done, total)``.
+    tell : callable, optional
+        ``tell(done, total, row)``, whose row has the ``stage`` "search" and the figures of the fit.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def fit_environment(
             iterations=iterations,
             space=space,
             encoding="linear",
-            progress=lambda step, steps, row: show("search", step, steps),
+            progress=lambda step, steps, row: tell(step, steps, row | {"stage": "search"}),
         )
         balanced = with_mean_of(target, result.gaussians)
         kept = closeness(_means(balanced), target)

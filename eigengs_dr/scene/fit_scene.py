@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -20,13 +21,14 @@ from skimage.transform import resize_local_mean
 
 from ..backend.arrays import types_in
 from ..backend.doors import door, shows_progress
-from ..backend.interrupts import Interrupted, defer_interrupts
+from ..backend.interrupts import Interrupted
 from ..backend.selection import backend_of, select
 from ..backend.types import ArrayLike
 from ..fitting.loop import Descent
 from ..fitting.measure import Measured
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Pixels, restored
+from ..fitting.options import Goal
 from ..fitting.search import fewest
 from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
@@ -39,7 +41,7 @@ from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
 from ..raster.render import render
 from .bitmaps import Unsuitable
-from .rendering import Progress, silent
+from .rendering import Progress, stages
 from .target import error_weights, seen_by, smoothest_target
 from .visibility import Box, Visibility, visibility
 
@@ -142,7 +144,9 @@ def fit_for_scene(
         What the pixels are, see `eigengs_dr.fit`.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none.
-        ``progress(label, done, total)``.
+        A function is called as ``progress(done, total, row)``; the ``stage`` of the row is "rays",
+        "target" or "search". A search adds the last row of its trace. The function may raise
+        `KeyboardInterrupt` to end the call.
 
     Returns
     -------
@@ -154,7 +158,8 @@ def fit_for_scene(
         If the image or an argument is unusable, the scene has no such texture, no pixel sees it, or
         the largest number of Gaussians does not suffice.
     Interrupted
-        After Ctrl-C in the search; its ``result`` is the SceneFit of the best set so far.
+        After Ctrl-C, SIGTERM, or a `KeyboardInterrupt` of `progress`; its ``result`` is the
+        SceneFit of the best set so far, or None before the search.
 
     Examples
     --------
@@ -167,38 +172,113 @@ def fit_for_scene(
     check_scene("fit_for_scene", scene)
     if space not in COLORS:
         raise ValueError(f"space {space!r} is unknown; textures hold {' or '.join(COLORS)}")
+    check_asked(target_psnr, iterations)
+    goal = Goal(target_psnr, max_gaussians=max_gaussians)
+    with stages(progress) as tell:
+        try:
+            tell(0, 1, {"stage": "rays"})
+            seen = seen_image(scene, texture, image, space_of(space), wrap_mode, encoding)
+            return fit_seen(seen, goal, iterations, tell)
+        except Interrupted:
+            raise
+        except KeyboardInterrupt:
+            raise Interrupted(None, "fit_for_scene was interrupted before its search") from None
+
+
+def check_asked(target_psnr: float, iterations: int) -> None:
+    """Raise ValueError if a PSNR or a number of steps is out of range."""
     if not 0 < target_psnr < 60:  # from 59 dB on, 8-bit values have no error
         raise ValueError(f"target_psnr is {target_psnr:g}; it must be above 0 and below 60 dB")
-    if iterations < 0 or (max_gaussians is not None and max_gaussians < 1):
-        raise ValueError(
-            f"iterations is {iterations} and max_gaussians is {max_gaussians}; they must be at "
-            "least 0 and at least 1"
-        )
-    return fit_seen(
-        scene, texture, image, target_psnr, space_of(space), max_gaussians, iterations,
-        wrap_mode, encoding, progress or silent,
-    )  # fmt: skip
+    if iterations < 0:
+        raise ValueError(f"iterations is {iterations}; it must be at least 0")
 
 
-def fit_seen(
-    scene: Any,
+@dataclass(frozen=True)
+class SeenImage:
+    """An image as the cameras of a scene see it.
+
+    Attributes
+    ----------
+    space : Space
+        That of the image and of its Gaussians.
+    peak : float
+        Largest light, at least 1, by which the texels were divided.
+    native : Visibility
+        Of the texels of the image.
+    texels : ndarray of float32, shape (H, W, C)
+        The seen part of the image, enlarged or halved, see `ENOUGH`.
+    fine : Visibility
+        Of these texels.
+    corner : (int, int)
+        First column and row of these texels in the whole image.
+    size : (int, int)
+        Width and height of the whole image in these texels.
+    """
+
+    space: Space
+    peak: float
+    native: Visibility
+    texels: Image
+    fine: Visibility
+    corner: tuple[int, int]
+    size: tuple[int, int]
+
+    @property
+    def kind(self) -> Space:
+        """The space of the texels and of the fit."""
+        return LINEAR if self.space.is_light else DATA
+
+    @cached_property
+    def views(self) -> list[NDArray[np.floating]]:
+        """What each camera sees of the image."""
+        return self._seen(self.texels)
+
+    @cached_property
+    def away(self) -> NDArray[np.floating]:
+        """The distance of each texel from the nearest seen one."""
+        return np.asarray(distance_transform_edt(~self.fine.seen))
+
+    def _seen(self, candidate: Image) -> list[NDArray[np.floating]]:
+        rows_of_cameras = self.fine.pixel_to_texel
+        return [seen_by(candidate, rows, self.kind, self.peak) for rows in rows_of_cameras]
+
+    def psnr(self, candidate: Image) -> tuple[float, ...]:
+        """Return the PSNR in dB with which each camera takes texels for those of the image."""
+        compared = "rgb" if self.kind.is_color else "data"
+        pairs = zip(self._seen(candidate), self.views, strict=True)
+        return tuple(psnr_of(a, b, compared) for a, b in pairs)
+
+    def without_unseen(self, gaussians: Gaussians) -> Gaussians:
+        """Scale a set to the texels, and keep what may reach a seen one; at least one Gaussian.
+
+        The longer axes of the Gaussians tell.
+        """
+        height, width = self.fine.seen.shape
+        scaled = gaussians.scaled(width, height)
+        arrays = scaled.to_arrays()
+        column, row = arrays["mean"].astype(int).clip(0, (width - 1, height - 1)).T
+        far = self.away[row, column]
+        reach = CUTOFF * max_deviation(*arrays["factor"].T)
+        return scaled[np.flatnonzero(far <= np.maximum(reach, far.min()))]
+
+    def whole(self, gaussians: Gaussians) -> Gaussians:
+        """Return a set of the texels as one of the image."""
+        kept, (width, height) = self.without_unseen(gaussians), self.size
+        mean = kept.mean + type(kept.mean)(*self.corner)
+        placed = replace(kept, mean=mean, width=width, height=height, space=self.space)
+        rows, columns = self.native.seen.shape
+        return restored(placed.scaled(columns, rows), [Affine(self.peak)] * placed.channels)
+
+
+def seen_image(
+    scene: mi.Scene,
     texture: str | Texture | Sequence[str | Texture],
     image: ArrayLike,
-    target_psnr: float,
     space: Space,
-    max_gaussians: int | None,
-    iterations: int,
     wrap_mode: str | Sequence[str],
     encoding: str | None,
-    show: Progress,
-    aim: Callable[[Gaussians, float], float] | None = None,
-) -> SceneFit:
-    """Find the fewest Gaussians for an image; see `fit_for_scene`.
-
-    ``aim(gaussians, psnr)`` returns the PSNR to look for, once the cameras have seen a first set at
-    a PSNR; at most `eigengs_dr.scene.target.MARGIN` above `target_psnr`.
-    """
-    show("rays", 0, 1)
+) -> SeenImage:
+    """Find out what the cameras of a scene see of an image; for arguments see `fit_for_scene`."""
     checked = check_image(image, encoding=encoding) if space.is_color else check_data(image)
     low, high = float(checked.min()), float(checked.max())
     if not space.is_color and (low < -ROUNDING or high > 1 + ROUNDING):
@@ -209,78 +289,77 @@ def fit_seen(
     height, width = pixels.shape[:2]
     values = space.values_of(pixels)
     peak = 1.0 if space.bounded else max(1.0, float(values.max()))
-    values, kind = values / np.float32(peak), LINEAR if space.is_light else DATA
+    values = values / np.float32(peak)
     native = visibility(scene, texture, width, height, wrap_mode)
     texels, box = float(native.footprint.min() / PIXEL), Box(0, 0, width, height)
     if texels < ENOUGH:  # enlarged where it is seen: 8k texels would become 7 GB
         box = _seen_box(native.seen, margin=1)
         values = zoom(box.of(values), (FINER, FINER, 1), order=1, mode="nearest", grid_mode=True)
-        fine_width, fine_height = FINER * width, FINER * height
+        size = FINER * width, FINER * height
         box = Box(*(FINER * side for side in box))
     else:
         values = halved(values, native)
-        fine_height, fine_width = values.shape[:2]
-        box = Box(0, 0, fine_width, fine_height)
-    fine = native
-    if (fine_height, fine_width) != (height, width):
-        fine = visibility(scene, texture, fine_width, fine_height, wrap_mode, box)
+        size = values.shape[1], values.shape[0]
+        box = Box(0, 0, *size)
+    fine = native if size == (width, height) else visibility(scene, texture, *size, wrap_mode, box)
     values, fine, corner = _crop_to_seen(values, fine)
-    goal = [seen_by(values, rows, kind, peak) for rows in fine.pixel_to_texel]
+    place = box.left + corner.left, box.top + corner.top
+    return SeenImage(space, peak, native, values, fine, place, size)
 
-    def seen(candidate: Image) -> tuple[float, ...]:
-        compared = "rgb" if kind.is_color else "data"
-        pictures = (seen_by(candidate, rows, kind, peak) for rows in fine.pixel_to_texel)
-        return tuple(psnr_of(a, b, compared) for a, b in zip(pictures, goal, strict=True))
+
+def fit_seen(
+    image: SeenImage,
+    goal: Goal,
+    iterations: int,
+    tell: Progress,
+    aim: Callable[[Gaussians, float], float] | None = None,
+) -> SceneFit:
+    """Find the fewest Gaussians with which the cameras see an image; see `fit_for_scene`.
+
+    ``aim(gaussians, psnr)`` returns the PSNR to look for, once the cameras have seen a first set at
+    a PSNR; at most `eigengs_dr.scene.target.MARGIN` above that of the goal.
+    """
 
     def closeness(candidate: Image) -> float:
-        show("target", 0, 1)
-        return min(seen(candidate))
+        tell(0, 1, {"stage": "target"})
+        return min(image.psnr(candidate))
 
-    target = smoothest_target(values, fine, closeness, target_psnr)
-    weight = error_weights(fine, target, kind)
-
-    max_gaussians = min(max_gaussians or int(native.seen.sum()), fine.seen.size)
+    target = smoothest_target(image.texels, image.fine, closeness, goal.psnr)
+    weight = error_weights(image.fine, target, image.kind)
+    native = image.native
+    max_gaussians = min(goal.max_gaussians or int(native.seen.sum()), image.fine.seen.size)
     looks = np.minimum(PIXEL / native.footprint[native.seen], 1) ** 2  # pixels per texel, at most 1
     most = min(max(1, int(looks.sum()) // PIXELS), max_gaussians)
-    size = fine.seen.shape[1], fine.seen.shape[0]
-    away = distance_transform_edt(~fine.seen)
 
     def score(gaussians: Gaussians) -> list[Measured]:
-        psnr = seen(render(_without_unseen(gaussians.scaled(*size), away)).numpy())
+        psnr = image.psnr(render(image.without_unseen(gaussians)).numpy())
         return [Measured({"psnr": min(psnr), "psnr_of_cameras": psnr}, min(psnr) - aimed)]
 
-    def whole(gaussians: Gaussians) -> Gaussians:
-        kept = _without_unseen(gaussians.scaled(*size), away)
-        mean = kept.mean + type(kept.mean)(box.left + corner.left, box.top + corner.top)
-        placed = replace(kept, mean=mean, width=fine_width, height=fine_height, space=space)
-        return restored(placed.scaled(width, height), [Affine(peak)] * placed.channels)
-
-    aimed = target_psnr
+    aimed = goal.psnr
     for count in (-(-most // fewer) for fewer in FEWER):
-        objective = _objective(target, weight, fine.seen, count, kind)
+        objective = _objective(target, weight, image.fine.seen, count, image.kind)
         start = DEFAULT.place_and_solve(objective, count)
         [first] = score(start)
         if first.margin >= -GAIN:
             break
     if aim:
-        aimed = aim(whole(start), first.row["psnr"])
-    with defer_interrupts() as interrupted:
-        descent = Descent(
-            objective,
-            DEFAULT,
-            score,
-            progress=lambda step, steps, row: show("search", step, steps),
-            interrupted=interrupted,
-        )
-        search = fewest(descent, start, max_gaussians, iterations)
+        aimed = aim(image.whole(start), first.row["psnr"])
+    descent = Descent(
+        objective,
+        DEFAULT,
+        score,
+        progress=lambda step, steps, row: tell(step, steps, row | {"stage": "search"}),
+    )
+    search = fewest(descent, start, max_gaussians, iterations)
     reached = search.row["psnr"]
-    if search.stopped == "out of reach" and reached < target_psnr:
+    if search.stopped == "out of reach" and reached < goal.psnr:
         raise Unsuitable(
             f"{len(search.gaussians)} Gaussians reach {reached:.1f} dB, but the cameras shall see "
-            f"{target_psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
+            f"{goal.psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
         )
     tried = [(row["gaussians"], row["psnr"]) for row in search.trace]
-    found = SceneFit(whole(search.gaussians), search.row["psnr_of_cameras"], native, tried)
+    cameras = search.row["psnr_of_cameras"]
+    found = SceneFit(image.whole(search.gaussians), cameras, native, tried)
     if search.stopped == "interrupted":
         raise Interrupted(found, "the search was interrupted; .result holds the best set so far")
     return found
@@ -327,17 +406,3 @@ def _crop_to_seen(values: Image, view: Visibility) -> tuple[Image, Visibility, B
     lookups = [rows[:, texels] for rows in view.pixel_to_texel]
     cut = Visibility(box.of(view.footprint), lookups)
     return np.ascontiguousarray(box.of(values)), cut, box
-
-
-def _without_unseen(gaussians: Gaussians, away: NDArray[np.floating]) -> Gaussians:
-    """Keep the Gaussians that may reach a seen texel, by their longer axes; at least one.
-
-    `away` holds the distance of each texel from the nearest seen one.
-    """
-    arrays = gaussians.to_arrays()
-    mean, factor = arrays["mean"], arrays["factor"]
-    column = mean[:, 0].astype(int).clip(0, away.shape[1] - 1)
-    row = mean[:, 1].astype(int).clip(0, away.shape[0] - 1)
-    far = away[row, column]
-    reaches = far <= np.maximum(CUTOFF * max_deviation(*factor.T), far.min())
-    return gaussians[np.flatnonzero(reaches)]

@@ -24,9 +24,19 @@ from ..fitting.options import Goal
 from ..gaussian.gaussians import Gaussians
 from ..image.metrics import psnr
 from ..image.space import DATA
-from ..plugins.versions import Properties
-from .bitmaps import GAUSSIANS, KEPT, RELIEF, SKY, SKY_KEPT, Parsed, Unsuitable, Use, texture_space
-from .fit_scene import FINER, fit_seen, halved
+from .bitmaps import (
+    GAUSSIANS,
+    KEPT,
+    RELIEF,
+    SKY,
+    SKY_KEPT,
+    Parsed,
+    Unsuitable,
+    Use,
+    read_pixels,
+    texture_space,
+)
+from .fit_scene import FINER, fit_seen, halved, seen_image
 from .rendering import Progress, pictures
 from .target import MARGIN
 from .visibility import visibility
@@ -98,20 +108,60 @@ class Original:
         """Return the name of an object in `mitsuba.traverse`, see `keys`."""
         return self.keys.get(self.parsed.state.nodes[node].props[slot])
 
-    def textures(self, uses: list[Use]) -> list[mi.Texture]:
-        """Return the instances of bitmaps."""
-        return [self.parsed.state.nodes[use.parent].props[use.slot] for use in uses]
+    def texture(self, use: Use) -> mi.Texture:
+        """Return the instance of a bitmap."""
+        return self.parsed.state.nodes[use.parent].props[use.slot]
 
-    def psnr_with(self, change: Callable[[Properties], None], uses: list[Use]) -> float:
-        """Return the lowest PSNR of a camera if only the bitmaps of some uses are changed."""
-        other = self.source.copied()
-        for use in uses:
+
+@dataclass(frozen=True)
+class Group:
+    """The uses of one image in a scene.
+
+    Attributes
+    ----------
+    original : Original
+    uses : list of Use
+    file : Path
+        Where a set that replaces the image is saved.
+    tell : callable
+        Is told the stages of the fit.
+    """
+
+    original: Original
+    uses: list[Use]
+    file: Path
+    tell: Progress
+
+    @cached_property
+    def pixels(self) -> NDArray[np.float32]:
+        """The image, see `eigengs_dr.scene.bitmaps.read_pixels`."""
+        return read_pixels(self.original.source.state.nodes[self.uses[0].node].props)
+
+    @property
+    def textures(self) -> list[mi.Texture]:
+        """The instances of the bitmaps."""
+        return [self.original.texture(use) for use in self.uses]
+
+    @property
+    def wraps(self) -> list[str]:
+        """Their wrap modes."""
+        return [use.wrap for use in self.uses]
+
+    def psnr_with(self, change: Callable[[mi.Properties], None]) -> float:
+        """Return the lowest PSNR of a camera if only the bitmaps of these uses are changed."""
+        other = self.original.source.copied()
+        for use in self.uses:
             change(other.state.nodes[use.node].props)
-        seen = pictures(mi.parser.instantiate(other.config, other.state), self.spp)
-        return min(psnr(a, b) for a, b in zip(self.pictures, seen, strict=True))
+        seen = pictures(mi.parser.instantiate(other.config, other.state), self.original.spp)
+        return min(psnr(a, b) for a, b in zip(self.original.pictures, seen, strict=True))
+
+    def psnr_with_set(self, gaussians: Gaussians) -> float:
+        """Save a set; return the lowest PSNR of a camera if it replaces the bitmaps."""
+        gaussians.save(self.file)
+        return self.psnr_with(partial(replace_bitmap, file=str(self.file)))
 
 
-def replace_bitmap(props: Properties, file: str) -> None:
+def replace_bitmap(props: mi.Properties, file: str) -> None:
     """Turn the properties of a bitmap or an ``envmap`` into those of a plugin of Gaussians."""
     plugin, kept = (SKY, SKY_KEPT) if props.plugin_name() == "envmap" else (GAUSSIANS, KEPT)
     for key in list(props.keys()):
@@ -121,16 +171,7 @@ def replace_bitmap(props: Properties, file: str) -> None:
     props["filename"] = file
 
 
-def fit_picture(
-    original: Original,
-    group: list[Use],
-    pixels: NDArray[np.float32],
-    target_psnr: float,
-    iterations: int,
-    file: Path,
-    show: Progress,
-    share: int = 1,
-) -> tuple[Gaussians, float]:
+def fit_picture(group: Group, goal: Goal, iterations: int, share: int) -> tuple[Gaussians, float]:
     """Fit an image for its uses, and save the set.
 
     Cameras see it at the PSNR in even light. Lamps may amplify what is dark, and one of several
@@ -149,39 +190,22 @@ def fit_picture(
     """
 
     def aim(gaussians: Gaussians, seen: float) -> float:
-        gaussians.save(file)
-        lost = seen - original.psnr_with(partial(replace_bitmap, file=str(file)), group)
-        needed = target_psnr + 10 * math.log10(share) + lost
-        return min(max(needed, target_psnr), target_psnr + MARGIN)
+        lost = seen - group.psnr_with_set(gaussians)
+        needed = goal.psnr + 10 * math.log10(share) + lost
+        return min(max(needed, goal.psnr), goal.psnr + MARGIN)
 
-    use = group[0]
-    result = fit_seen(
-        original.scene,
-        original.textures(group),
-        pixels,
-        target_psnr,
-        # Raw colours are still colours; pixels in memory are usually raw.
-        texture_space(pixels, use.raw and pixels.shape[2] == 1),
-        None,
-        iterations,
-        [use.wrap for use in group],
-        "linear",
-        show,
-        None if original.spp == 0 else aim,
-    )
-    result.gaussians.save(file)
+    # Raw colours are still colours; pixels in memory are usually raw.
+    space = texture_space(group.pixels, group.uses[0].raw and group.pixels.shape[2] == 1)
+    group.tell(0, 1, {"stage": "rays"})
+    scene, textures = group.original.scene, group.textures
+    seen = seen_image(scene, textures, group.pixels, space, group.wraps, "linear")
+    by_renderings = None if group.original.spp == 0 else aim
+    result = fit_seen(seen, goal, iterations, group.tell, by_renderings)
+    result.gaussians.save(group.file)
     return result.gaussians, min(result.psnr)
 
 
-def fit_relief(
-    original: Original,
-    group: list[Use],
-    pixels: NDArray[np.float32],
-    goal: Goal,
-    iterations: int,
-    file: Path,
-    show: Progress,
-) -> tuple[Gaussians, float]:
+def fit_relief(group: Group, goal: Goal, iterations: int) -> tuple[Gaussians, float]:
     """Fit the heights of bump maps or the vectors of normal maps, and save the set.
 
     Returns
@@ -196,23 +220,22 @@ def fit_relief(
     Unsuitable
         If no set keeps the PSNR between the renderings, or nothing is to be rendered.
     """
-    use = group[0]
-    if original.spp == 0:
-        raise Unsuitable(f"{use.relief}: renderings decide, and none was asked for")
-    is_height = use.relief == RELIEF["bumpmap"]
+    relief, pixels, tell = group.uses[0].relief, group.pixels, group.tell
+    if group.original.spp == 0:
+        raise Unsuitable(f"{relief}: renderings decide, and none was asked for")
+    is_height = relief == RELIEF["bumpmap"]
     values = (pixels @ LUMINANCE)[..., None] if is_height and pixels.shape[2] == 3 else pixels
     texture_space(values, True)  # it raises where Gaussians cannot hold them
     height, width, _ = values.shape
-    wraps = [use.wrap for use in group]
-    show("rays", 0, 1)
-    seen = visibility(original.scene, original.textures(group), width, height, wraps)
+    tell(0, 1, {"stage": "rays"})
+    seen = visibility(group.original.scene, group.textures, width, height, group.wraps)
     fitted, weight = (halved(v, seen) for v in (values, np.float32(seen.seen)[..., None]))
     if fitted.shape == values.shape and height * width <= LARGEST:
-        show("trial", 0, 1)
-        kept = original.psnr_with(partial(_make_smooth, values), group)
+        tell(0, 1, {"stage": "trial"})
+        kept = group.psnr_with(partial(_make_smooth, values))
         if kept < goal.psnr - FACETS:
             raise Unsuitable(
-                f"{use.relief}: the renderings keep {kept:.1f} dB if they are only made smooth"
+                f"{relief}: the renderings keep {kept:.1f} dB if they are only made smooth"
             )
     reached, least = list[str](), 0.0
     for more in CLOSER:
@@ -224,23 +247,22 @@ def fit_relief(
             iterations=iterations,
             space=DATA,
             weight=weight[..., 0],
-            progress=lambda step, steps, row: show("search", step, steps),
+            progress=lambda step, steps, row: tell(step, steps, row | {"stage": "search"}),
         )
         gaussians = result.gaussians.scaled(width, height)
-        gaussians.save(file)
-        kept = original.psnr_with(partial(replace_bitmap, file=str(file)), group)
+        kept = group.psnr_with_set(gaussians)
         if kept >= goal.psnr:
             return gaussians, kept
-        file.unlink()
+        group.file.unlink()
         reached.append(f"{kept:.1f} dB with {len(gaussians):,} Gaussians")
         if result.stopped == "out of reach":
             reached[-1] += ", the most that are allowed"
             break
         least = more + goal.psnr - kept
-    raise Unsuitable(f"{use.relief}: the renderings keep {', '.join(reached)}")
+    raise Unsuitable(f"{relief}: the renderings keep {', '.join(reached)}")
 
 
-def _make_smooth(values: NDArray[np.float32], props: Properties) -> None:
+def _make_smooth(values: NDArray[np.float32], props: mi.Properties) -> None:
     """Turn the properties of a bitmap into those of a smooth surface through its texels."""
     mode = SPLINES[str(props.get("wrap_mode", "repeat"))]
     finer = zoom(values, (FINER, FINER, 1), order=3, mode=mode, grid_mode=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,17 +11,36 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.interrupts import defer_interrupts
+from ..backend.recording import collector_off
+from ..backend.types import Record
 from ..image.color import to_coded
 from ..image.io import save_image
 from ..image.metrics import psnr
 from ..plugins.follow import follow_where_asked
 
-Progress = Callable[[str, int, int], None]
-"""``progress(label, done, total)``."""
+Progress = Callable[[int, int, Record], None]
+"""``progress(done, total, row)``; the row names the ``stage``."""
 
 
-def silent(label: str, done: int, total: int) -> None:
-    """Show no progress."""
+@contextmanager
+def stages(progress: Progress | None) -> Iterator[Progress]:
+    """Defer Ctrl-C and SIGTERM in a block to where it tells its progress.
+
+    Yields
+    ------
+    callable
+        ``tell(done, total, row)`` calls `progress`. After a signal it raises `KeyboardInterrupt`.
+    """
+    with defer_interrupts() as interrupted:
+
+        def tell(done: int, total: int, row: Record) -> None:
+            if progress:
+                progress(done, total, row)
+            if interrupted():
+                raise KeyboardInterrupt
+
+        yield tell
 
 
 SAMPLES_PER_PASS = 1 << 24
@@ -98,7 +118,10 @@ def render_in_passes(
     done = 0
     while done < total:
         count = min(max_count, total - done)
-        part = mi.render(scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done)
+        with collector_off():  # also between the lookups, whose doors make objects
+            part = mi.render(
+                scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done
+            )
         pixels = pixels + count * np.array(part, np.float64)
         done += count
         show(done, total)
@@ -166,14 +189,12 @@ def pictures(scene: mi.Scene, spp: int | None, seed: int = 0) -> list[NDArray[np
     -------
     list of ndarray of float32, shape (H, W, 3) or (H, W, 1)
     """
-    return [_picture(scene, number, spp, seed) for number in range(len(scene.sensors()))]
-
-
-def _picture(scene: mi.Scene, camera: int, spp: int | None, seed: int) -> NDArray[np.float32]:
-    """Render a scene from a camera in sRGB."""
     renderer = scene.integrator() or mi.load_dict({"type": "path"})
-    rendering = render_in_passes(scene, camera, spp, integrator=renderer, seed=seed)
-    light = rendering.picture("RGB")
-    if not light.size:  # a renderer of AOVs alone
-        light = rendering.pixels[..., :1]
-    return np.clip(to_coded(np.maximum(light, 0)), 0, 1).astype(np.float32)
+    shown = []
+    for camera in range(len(scene.sensors())):
+        rendering = render_in_passes(scene, camera, spp, integrator=renderer, seed=seed)
+        light = rendering.picture("RGB")
+        if not light.size:  # a renderer of AOVs alone
+            light = rendering.pixels[..., :1]
+        shown.append(np.clip(to_coded(np.maximum(light, 0)), 0, 1).astype(np.float32))
+    return shown

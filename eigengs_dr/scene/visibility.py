@@ -28,7 +28,7 @@ from ..backend.arrays import upload
 from ..backend.types import Float, Floats
 from ..plugins.cone import PIXEL
 from ..plugins.properties import WRAPS, to_uv
-from ..plugins.versions import Interaction, Texture, texture_class
+from ..plugins.versions import Texture, texture_class
 from ..raster.lookup.points import fold
 from .bitmaps import Unsuitable
 
@@ -49,16 +49,6 @@ MAX_LAYERS = 16
 
 LAMP_BLOCKS = 16
 """Number of blocks along a side of a lamp. Their means count like what a pixel sees."""
-
-
-Ray = Any
-"""A ``mitsuba.Ray3f`` of the current variant."""
-
-Point = Any
-"""A ``mitsuba.Point2f`` of the current variant."""
-
-Vector = Any
-"""A ``mitsuba.Vector2f`` of the current variant."""
 
 
 class View(NamedTuple):
@@ -148,14 +138,16 @@ def _trace_batch(view: View, pixels: NDArray[np.uint32], side: int) -> Iterator[
                 onward = si.spawn_ray(ray.d)
 
 
-def _rays(view: View, corner: Point, place: Point) -> tuple[Ray, list[tuple[Ray, Float]]]:
+def _rays(
+    view: View, corner: mi.Point2f, place: mi.Point2f
+) -> tuple[mi.Ray3f, list[tuple[mi.Ray3f, Float]]]:
     """Return rays through places in pixels, and two others with their steps to the right and down.
 
     They are half a pixel away, towards its middle: in a batch of cameras, the next pixel may be
     that of another camera.
     """
 
-    def through(place: Point) -> Ray:
+    def through(place: mi.Point2f) -> mi.Ray3f:
         film = (corner + place) / mi.Point2f(view.sensor.film().crop_size())
         return view.sensor.sample_ray(0.0, 0.5, film, mi.Point2f(0.5))[0]
 
@@ -164,7 +156,7 @@ def _rays(view: View, corner: Point, place: Point) -> tuple[Ray, list[tuple[Ray,
     return through(place), [(right, x), (down, y)]
 
 
-def _uv_at(si: Interaction, ray: Ray) -> Vector:
+def _uv_at(si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Vector2f:
     """Return the step in uv from a hit to where another ray meets its tangent plane.
 
     The step p in space is ``dp_du u + dp_dv v``, which two equations of the least squares solve.
@@ -179,7 +171,7 @@ def _uv_at(si: Interaction, ray: Ray) -> Vector:
 
 
 def _on_texture(
-    si: Interaction, partials: list[Vector], view: View
+    si: mi.SurfaceInteraction3f, partials: list[mi.Vector2f], view: View
 ) -> tuple[Float, Float, Float, Float]:
     """Return the position (x, y) of a hit and the singular values of J, all in texels."""
     at = view.to_texels @ si.uv

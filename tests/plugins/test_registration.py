@@ -91,7 +91,7 @@ def test_textures_of_files_load_while_the_caller_holds_the_lock(tmp_path):
 def test_a_block_keeps_the_scenes_that_another_thread_drops():
     """Mitsuba renders without Python's lock: what the thread frees would end the process."""
     from eigengs_dr.backend.recording import exclusive
-    from eigengs_dr.plugins.living import living_objects
+    from eigengs_dr.plugins.registration import living_objects
 
     mi.set_variant("llvm_ad_rgb")
     eg.register_plugins()

@@ -1,6 +1,7 @@
 """A scene whose bitmaps become Gaussians: what is converted, what stays, and mistakes."""
 
 import shutil
+import signal
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -260,10 +261,31 @@ def test_progress_from_the_first_second(folder, tmp_path):
     scene = plain(mi, folder, {"type": "bitmap", "filename": str(folder / "photo.png")})
     show = lambda *call: calls.append(call)  # noqa: E731
     eg.convert_scene(scene, tmp_path / "new", progress=show, **QUICKEST)
-    labels = list(dict.fromkeys(label for label, _, _ in calls))
-    stages = ("rays", "target", "search")
-    assert labels == ["scene", *(f"1/1 photo.png: {s}" for s in stages), "renderings"]
-    assert all(0 <= done <= total for _, done, total in calls)
+    labels = list(dict.fromkeys((row.get("image"), row["stage"]) for _, _, row in calls))
+    stages = [("1/1 photo.png", stage) for stage in ("rays", "target", "search")]
+    assert labels == [(None, "scene"), *stages, (None, "renderings")]
+    assert all(0 <= done <= total for done, total, _ in calls)
+
+
+@pytest.mark.parametrize("stops", ["by a signal", "by progress"])
+@pytest.mark.parametrize(
+    ("stage", "decided"), [("scene", 0), ("rays", 1), ("search", 1), ("renderings", 3)]
+)
+def test_ctrl_c_writes_nothing(folder, tmp_path, stage, decided, stops):
+    """The error holds the images that were decided; the second one is interrupted."""
+    scene = wall(folder)
+
+    def stop(done, total, row):
+        if row["stage"] == stage and row.get("image", "2/3").startswith("2/3"):
+            if stops == "by progress":
+                raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(eg.Interrupted, match="nothing is written") as stopped:
+        eg.convert_scene(scene, tmp_path / "new", progress=stop, **QUICKEST)
+    found = stopped.value.result
+    assert len([*found.textures, *found.better, *found.left]) == decided and found.psnr == []
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_rendered_on_request(folder, tmp_path):

@@ -1,5 +1,7 @@
 """No more Gaussians than cameras resolve: the target, the search, and what a renderer then sees."""
 
+import signal
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -206,9 +208,10 @@ def test_mistakes_cost_a_line(arguments, words):
 def test_ctrl_c_keeps_the_best_set():
     calls = []
 
-    def stop(label, done, total):
-        calls.append(label)
-        if label == "search" and done >= 20:
+    def stop(done, total, row):
+        calls.append(row["stage"])
+        if row["stage"] == "search" and done >= 20:
+            assert row["gaussians"] > 0 and row["psnr"] == min(row["psnr_of_cameras"])
             raise KeyboardInterrupt
 
     scene = scene_of(camera([0, 0, 5.0]))
@@ -219,3 +222,21 @@ def test_ctrl_c_keeps_the_best_set():
     assert min(found.psnr) in [psnr for _, psnr in found.tried]
     text = f"SceneFit({len(found.gaussians)} Gaussians, 48x48 pixels, psnr=({found.psnr[0]:.2f}))"
     assert repr(found) == text
+
+
+@pytest.mark.parametrize("stage", ["rays", "target", "search"])
+def test_a_signal_in_any_stage(stage):
+    """It ends the call where progress is told next; before the search there is no set."""
+    calls = []
+
+    def stop(done, total, row):
+        calls.append(row["stage"])
+        if row["stage"] == stage and calls.count(stage) == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    scene = scene_of(camera([0, 0, 5.0]))
+    with pytest.raises(eg.Interrupted, match="interrupted") as stopped:
+        eg.fit_for_scene(scene, NAME, photo(), BOUND, iterations=STEPS, progress=stop)
+    assert calls[-1] == stage and calls.count(stage) == 1
+    assert (stopped.value.result is not None) == (stage == "search")
+    assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
