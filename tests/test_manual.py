@@ -261,7 +261,7 @@ def is_mitsuba(page):
 
 def cases():
     for page in PAGES:
-        name = str(page.relative_to(FOLDER if "docs" in page.parts else ROOT))
+        name = str(page.relative_to(FOLDER if page.is_relative_to(FOLDER) else ROOT))
         if BLOCK.search(page.read_text()) and name not in RUN_AS_A_WHOLE:
             marks = [pytest.mark.mitsuba] if is_mitsuba(page) else []
             yield pytest.param(page, id=name, marks=marks)

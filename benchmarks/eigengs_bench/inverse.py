@@ -344,29 +344,17 @@ MARKERS = dict(zip(METHODS, "vsoDP", strict=True))
 
 
 def summarize(rows: Sequence[Row]) -> Section:
-    """Lay out PSNR, seconds and parameters of each descent, and the gain at equal seconds."""
+    """Lay out the gain of each descent at equal seconds, and draw PSNR over seconds."""
     curves: dict[tuple, dict[str, dict[int, Row]]] = {}
     for row in rows:
         job = row["job"]
         case = job["scene"], job["cameras"], job["spp"]
         curves.setdefault(case, {}).setdefault(job["method"], {})[job["steps"]] = row
-    tables = [_methods(curves), _gains(curves), _materials(curves)]
     pairs = [methods for methods in curves.values() if {"pyramid", "fit"} <= methods.keys()]
     gains = [decibels for methods in pairs for decibels in gain(methods)]
     ends = {"behind": -min(gains), "ahead": max(gains)} if gains else {}
     figures = {name: f"{number(value)} dB" for name, value in ends.items()}
-    return Section([t for t in tables if len(t.frame)], {"inverse": _chart(curves)}, figures)
-
-
-def _methods(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
-    lines = []
-    for (scene, cameras, spp), methods in curves.items():
-        for steps in sorted({steps for curve in methods.values() for steps in curve}):
-            found = [methods.get(name, {}).get(steps) for name in METHODS]
-            cells = [f"{r['psnr_rgb']:.1f} dB, {r['seconds']:.1f} s" if r else "" for r in found]
-            lines.append((f"{scene}, {cameras} cameras, {spp} spp", f"{steps}", *cells))
-    columns = ("photos", "steps", *METHODS)
-    return table("psnr_rgb and seconds of a descent", columns, lines, name="methods")
+    return Section([_gains(curves)], {"inverse": _chart(curves)}, figures)
 
 
 def gain(
@@ -412,20 +400,6 @@ def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
         f"{' or '.join(sorted(shares))} of its parameters"
     )
     return table(caption, columns, lines, name="gains")
-
-
-def _materials(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
-    lines = []
-    for (scene, cameras, spp), methods in curves.items():
-        for method in METHODS if scene == "material" else ():
-            for steps, row in sorted(methods.get(method, {}).items()):
-                name = f"{cameras} cameras, {spp} spp"
-                figures = [row["seconds"], row["albedo"], row["roughness"]]
-                cells = [number(value) for value in [*figures, row["roughness_constant"]]]
-                lines.append((name, method, f"{steps}", *cells))
-    columns = ("photos", "method", "steps", "seconds", "albedo", "roughness", "best constant")
-    caption = "PSNRs of the maps of a material in dB, weighed by what photos see"
-    return table(caption, columns, lines, name="materials")
 
 
 def _chart(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Figure:

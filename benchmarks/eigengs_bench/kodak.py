@@ -127,6 +127,8 @@ def _by_counts(both: pd.DataFrame) -> fr.Table:
     for (method, steps), part in both.groupby(["method", "steps"], sort=False):
         cells = dict(zip(part.gaussians, part.cell, strict=True))
         name = f"{method}, {steps:,.0f} steps" if steps else str(method)
+        source = part.source.iloc[0]
+        name += "" if source == "measured" else f" ({source})"
         lines.append((name, *(cells.get(count, "") for count in KODAK_COUNTS)))
     caption = (
         "PSNR in RGB in dB of the Kodak photos by numbers of Gaussians, and the median seconds of "

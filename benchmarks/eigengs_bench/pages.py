@@ -127,7 +127,7 @@ def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
 def _with_source(measured: Table, rows: Sequence[Row]) -> str:
     """Lay out a table for a page: the caption below it, and its sources folded away."""
     cells = as_text(measured, "pipe").removeprefix(measured.caption).strip()
-    sources = sources_of(rows if measured.rows is None else measured.rows)
+    sources = sources_of(rows if measured.rows is None else measured.rows, versions=False)
     if not sources:
         return f"{cells}\n\n*{measured.caption}.*"
     lines = "\n".join(f"- {line}" for line in sources)

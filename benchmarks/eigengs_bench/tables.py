@@ -6,7 +6,7 @@ list of `score`.
 Tai et al., "EigenGS Representation", CVPR 2025: tables 1 (FFHQ), 2 (transfer) and 3 (ablation).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from importlib.resources import files
 from typing import Any, NamedTuple
@@ -95,35 +95,23 @@ def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:
 # ---------------------------------------------------------------------------------------------
 
 KEY = ["set", "iterations", *Method._fields]
-KINDS = {"main": "Methods", "cross": "Bases of other images", "ablation": "Colour space and split"}
-ENDS: dict[str, Any] = {
-    "RGB": ("psnr_rgb", fr.mean),
-    "SSIM": ("ssim", partial(fr.mean, decimals=3)),
-    "MS-SSIM": ("ms_ssim", partial(fr.mean, decimals=3)),
-    "s": ("seconds", fr.median),
-    "% above 35 dB": ("psnr_ycbcr", lambda values: fr.number(100 * (values > 35).mean(), 0)),
-    "% above 40 dB": ("psnr_ycbcr", lambda values: fr.number(100 * (values > 40).mean(), 0)),
-}
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Make two tables for each kind and number of steps: with all figures, and with few.
+    """Make a table for each kind and number of steps.
 
-    A line is a set and a method: psnr_ycbcr by steps, means over the images, and figures of the
-    start and of the last step. What the paper prints stands beside it in brackets.
+    A line is a set and a method, or a setting of the ablation: means over the images. What the
+    paper prints stands beside them in brackets.
     """
     fits, tables = fr.frame_of(rows, "moments"), []
     for length in sorted(fits.iterations.unique()):
-        for kind, title in KINDS.items():
+        for kind in TABLES:
             chosen = _chosen(fits[fits.iterations == length], kind)
             if chosen.method.nunique() > 1:
-                few = _ablation if kind == "ablation" else _few
                 shown = set(chosen[KEY].itertuples(index=False, name=None))
                 used = [row for row in rows if tuple(row["job"][k] for k in KEY) in shown]
-                caption = f"{title}, {length:,} steps: PSNR YCbCr / dB by steps"
-                both = [_by_steps(caption, chosen), few(chosen)]
-                names = (f"{kind}_{length}_all", f"{kind}_{length}")
-                tables += [t._replace(name=n, rows=used) for t, n in zip(both, names, strict=True)]
+                made = _ablation(chosen) if kind == "ablation" else _few(chosen)
+                tables.append(made._replace(name=f"{kind}_{length}", rows=used))
     caption = (
         "What the paper prints of FFHQ, 512 x 512 pixels, 20,000 Gaussians: PSNR / dB by steps"
     )
@@ -153,17 +141,6 @@ def label(method: Method, name: str) -> str:
     basis = {NATURAL: "universal", name: "own"}.get(method.source, method.source)
     text = f"{method.preset}, {method.components} components, {basis} basis"
     return text if method.split == "auto" else f"{method.preset}, {method.space}, {method.split}"
-
-
-def _by_steps(caption: str, fits: pd.DataFrame) -> fr.Table:
-    first, last = fits.iteration == 0, fits.iteration == fits.iterations
-    columns: dict[str, Any] = {"images": ("image", lambda values: str(values.nunique()))}
-    columns["s, start"] = "seconds", _where(first, partial(fr.median, decimals=3))
-    for step in sorted(fits.iteration.unique()):
-        columns[f"{step:,}"] = "psnr_ycbcr", _where(fits.iteration == step, fr.mean)
-    for title, (figure, write) in ENDS.items():
-        columns[title] = figure, _where(last, write)
-    return fr.grouped(caption, fits, ["set", "method"], columns)
 
 
 SHOWN = (0, 100, 1000, 10000)
@@ -220,7 +197,3 @@ def _ablation(fits: pd.DataFrame) -> fr.Table:
 
 def _bracket(printed: str) -> str:
     return f" ({printed})" if printed not in ("", "-") else ""
-
-
-def _where(rows: pd.Series, write: Callable[[pd.Series], str]) -> Callable[[pd.Series], str]:
-    return lambda values: write(values[rows.loc[values.index].to_numpy()])
