@@ -491,9 +491,14 @@ def test_inverse(monkeypatch, tmp_path):
 
 
 def test_gain_at_equal_seconds():
-    """Half-way in the logarithm of the seconds lies half the gain of the pyramid."""
+    """Half-way in the logarithm of the seconds lies half the gain; the best rival counts."""
     from eigengs_bench import inverse
 
     pyramid = {k: {"seconds": s, "psnr_rgb": p} for k, s, p in ((1, 1, 30), (2, 4, 40))}
-    fits = {k: {"seconds": s, "psnr_rgb": 36} for k, s in ((1, 2), (2, 8), (3, 0.5))}
+    texels = {1: {"seconds": 6, "psnr_rgb": 35}}
+    seconds = ((1, 2 / inverse.SLOWER), (2, 8), (3, 0.5))
+    fits = {k: {"seconds": s, "psnr_rgb": 36} for k, s in seconds}
     assert inverse.gain({"pyramid": pyramid, "fit": fits}) == pytest.approx([1, -4, 6])
+    assert inverse.gain({"pyramid": pyramid, "texels": texels, "fit": fits}) == pytest.approx(
+        [1, -4, 1]
+    )
