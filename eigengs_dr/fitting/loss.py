@@ -49,7 +49,8 @@ class Loss:
         tensor of Dr.Jit of one value that depends on the picture; where it does not, at some steps,
         nothing moves. The step is the number of steps taken before, over the whole fit: it may
         choose a camera, or seed random numbers. Rows of the trace call the function for step 0,
-        and controls between steps for the next one.
+        and controls between steps for the next one. Without an image, a judge or a target, rows
+        between the first and the last hold the mean of the steps since the row before instead.
     bounds : (float, float), optional
         Smallest and largest value of the picture, such as ``(0, 1)``: the function sees the picture
         clipped, and sums outside are pulled back.

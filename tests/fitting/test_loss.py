@@ -589,6 +589,23 @@ def test_levels_of_a_pyramid(backend, size):
     np.testing.assert_allclose(np.diff(inner[: 2 * coarse.width - 3]), 0.5, rtol=1e-5)
 
 
+def test_rows_between_the_ends_call_no_loss():
+    """Their loss is the mean of the steps since the row before; the ends measure their sets."""
+    calls = []
+
+    def counted(picture, step):
+        calls.append(step)
+        return squares(picture)
+
+    options = {"size": (SIDE, SIDE), "gaussians": 50, "iterations": 60, "space": "rgb"}
+    found = eg.fit(loss=counted, **options)
+    assert len(calls) == 60 + 2 and calls.count(0) == 1 + 2
+    picture = dr.llvm.ad.TensorXf(eg.render(found.gaussians))
+    assert found.loss == pytest.approx(squares(picture).array[0], rel=1e-5)
+    losses = [row["loss"] for row in found.trace]
+    assert losses[0] > losses[-1] and len(losses) == 5  # texels; 0, 10, 20 and 30 steps after
+
+
 def test_the_average_of_sets_is_quieter_than_the_last():
     """With noisy derivatives, at equal rates."""
 
