@@ -1,4 +1,4 @@
-"""The table of the folders of `eigengs_dr/`, in the architecture page and in CONTRIBUTING.md.
+"""The table of the folders of `eigengs_dr/`, in CONTRIBUTING.md.
 
 ``python docs/folders.py`` writes it between its marks: the order is that of the layers in
 pyproject.toml, the text is the first line of each folder.
@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-PAGES = (ROOT / "docs/architecture.md", ROOT / "CONTRIBUTING.md")
+PAGES = (ROOT / "CONTRIBUTING.md",)
 LAYERS = re.compile(r"^layers = \[(.*?)^\]", re.S | re.M)
 MARKS = re.compile(r"(<!-- folders -->\n).*?(<!-- end -->)", re.S)
 
