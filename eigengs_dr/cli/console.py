@@ -188,7 +188,7 @@ def open_cluster(cluster: str | None) -> Iterator[Any]:
         from ..cluster.executor import connect
     except ModuleNotFoundError as error:
         raise ClusterError(
-            f"--cluster needs {error.name}; type: pip install 'eigengs-dr[cluster]'"
+            f"--cluster needs {error.name}; in the checkout, type: pip install -e '.[cluster]'"
         ) from None
     # Batch schedulers send SIGTERM; the workers of ``local`` have to end too.
     with terminate_as_interrupt(), connect(cluster) as client:

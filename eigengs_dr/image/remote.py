@@ -162,7 +162,7 @@ def _system(url: str) -> tuple[Any, str]:
         options = {kind: _web_options() for kind in web}
     except ImportError as error:
         raise ImageError(
-            f"images at URLs need {error.name}; type: pip install 'eigengs-dr[cluster]'"
+            f"images at URLs need {error.name}; in the checkout, type: pip install -e '.[cluster]'"
         ) from None
     pair: tuple[Any, str] = fsspec.core.url_to_fs(url, **options)
     return pair

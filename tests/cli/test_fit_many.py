@@ -182,7 +182,7 @@ def test_without_dask_one_line_says_what_to_install(photos, tmp_path, monkeypatc
     monkeypatch.delitem(sys.modules, "eigengs_dr.cluster.executor", raising=False)
     monkeypatch.setitem(sys.modules, "distributed", None)
     result = run("fit", photos, "-o", tmp_path / "fits", *QUICK, "--cluster", "local")
-    assert_refused(result, "distributed", "pip install 'eigengs-dr[cluster]'")
+    assert_refused(result, "distributed", "pip install -e '.[cluster]'")
 
 
 def test_a_scheduler_that_does_not_answer(photos, tmp_path, monkeypatch):
