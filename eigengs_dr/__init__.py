@@ -32,9 +32,9 @@ select_libllvm()
 
 # Folders that know nothing of the codec and the viewer use them through these functions.
 def _make_html(value: object) -> str:
-    from .viewer.notebook import to_html
+    from .viewer.view import html_of
 
-    return to_html(value)
+    return html_of(value)
 
 
 def _read_packed(path: Path, sections: int | None) -> SetData:

@@ -30,8 +30,7 @@ def _escaped(character: str) -> str:
 
 
 make_html: Callable[[object], str] = repr
-"""`eigengs_dr.viewer.notebook.to_html`, a layer above, which `eigengs_dr` assigns
-here."""
+"""`eigengs_dr.viewer.view.html_of`, a layer above, which `eigengs_dr` assigns here."""
 
 
 def to_html(value: object) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ import click
 import eigengs_dr as eg
 
 from ..backend.selection import select
+from ..backend.types import Record
 from ..image.space import SPACES, YCBCR, space_of
 from . import options
 from .console import FAILED, INTERRUPTED, MISSED, bar, open_cluster, prefix_errors, print_message
@@ -26,8 +27,11 @@ if TYPE_CHECKING:
     from ..fitting.method import Method
     from ..fitting.options import FitOptions
 
-Record = dict[str, Any]
-"""The figures of one image, for its lines in the terminal and for the report."""
+Show = Callable[..., None]
+"""Shows the progress of a fit, see `bar`."""
+
+Fitted = tuple[list[Record], list[str]]
+"""The figures of each image, for the report, and the lines for the terminal."""
 
 INITS = ("adaptive", "grid", "random")
 """Names of the initial placements."""
@@ -150,9 +154,14 @@ def fit(
         raise ValueError("--blocks fits one image; run the command for each image")
     if not several:
         check_replaceable(outputs[0], bool(maps))
+    has_blocks = _has_blocks(settings, preview)
     if not (several or maps or blocks):
-        _check_memory(run, files[0], settings, _has_blocks(settings, preview))
-    if blocks and not _has_blocks(settings, preview):
+        from .memory import check_memory
+
+        line = check_memory(files[0], settings, has_blocks)
+        if line and not run.quiet:
+            print_message(line)
+    if blocks and not has_blocks:
         raise ValueError(
             "--blocks needs the default preset and init; leave out --target-psnr, --levels and "
             "--preview"
@@ -161,13 +170,16 @@ def fit(
         select(run.backend)
     if settings.method.needs_model:
         print_message("note: the file holds only the Gaussians; the mean image stays in the basis")
-    with open_cluster(run.cluster) as client:
+    with open_cluster(run.cluster) as client, bar(run.quiet) as show:
         if several:
-            records = _fit_several(run, files, outputs, pictures, settings, overwrite, client)
+            given = _given_options(run.context, settings) | {"overwrite": overwrite}
+            records, lines = _fit_several(show, files, outputs, pictures, settings, given, client)
         elif blocks:
-            records = [_fit_by_blocks(run, files[0], outputs[0], blocks, settings, client)]
+            records, lines = _fit_by_blocks(show, files[0], outputs[0], settings, blocks, client)
         else:
-            records = [_fit_at_once(run, maps or files[0], outputs[0], pictures[0], settings)]
+            source = maps or files[0]
+            records, lines = _fit_at_once(show, source, outputs[0], pictures[0], settings)
+    run.tell(*lines)
     used = choices | {"space": settings.space or YCBCR}
     if settings.start is not None:
         used["basis"] = basis or DEFAULT_BASIS
@@ -252,18 +264,18 @@ def _expand(source: Path | str, recursive: bool) -> Sequence[Path | str]:
 
 
 def _fit_at_once(
-    run: options.Run,
+    show: Show,
     source: Path | str | dict[str, MapFile],
     output: Path,
     picture: Path | None,
     settings: FitOptions,
-) -> Record:
-    """Fit one image, or maps, without blocks; write its files, and return its figures."""
+) -> Fitted:
+    """Fit one image, or maps, without blocks, and write its files."""
     started = time.perf_counter()
     lock_outputs(output)
     maps = source if isinstance(source, dict) else {}
     name = (output if isinstance(source, dict) else Path(source)).name
-    with bar(run.quiet) as show, prefix_errors("--map" if maps else str(source)):
+    with prefix_errors("--map" if maps else str(source)):
         show(f"{name}: load", 0, 1)
         image = load_images(source, settings.space or "ycbcr", settings.encoding)
         loaded, target = time.perf_counter(), image
@@ -276,14 +288,13 @@ def _fit_at_once(
             print_message(f"interrupted; the best fit so far is in {output}")
         replace(result, source=name).save(output)
         show(f"{name}: measure", 0, 1)
-        record = {"input": {name: m.path for name, m in maps.items()} or source, "output": output}
+        inputs = {name: m.path for name, m in maps.items()} or source
+        record: Record = {"input": inputs, "output": output}
         record |= _figures(result) | _similarity(image, result)
         if picture:
             eg.save_image(picture, _comparison(image, result.gaussians, result.image))
-    times = {"seconds_load": loaded - started, "seconds_total": time.perf_counter() - started}
-    title = str(output if maps else source)
-    run.tell(*_summary(title, record | times, settings, picture))
-    return record | times
+    record |= {"seconds_load": loaded - started, "seconds_total": time.perf_counter() - started}
+    return [record], _summary(str(output if maps else source), record, settings, picture)
 
 
 def load_images(source: Path | str | dict[str, MapFile], space: str, encoding: str | None) -> Any:
@@ -412,17 +423,16 @@ def _exit_code(records: list[Record], expected: int, settings: FitOptions) -> in
 
 
 def _fit_several(
-    run: options.Run,
+    show: Show,
     files: Sequence[Path | str],
     outputs: list[Path],
     pictures: Sequence[Path | None],
     settings: FitOptions,
-    overwrite: bool,
+    given: Record,
     client: Any,
-) -> list[Record]:
-    """Fit images into a folder, report failures at once, and return the finished records."""
+) -> Fitted:
+    """Fit images into a folder, and report failures at once."""
     started, folder = time.perf_counter(), outputs[0].parent
-    given = _given_options(run.context, settings)
     picture_of = {path.stem: picture for path, picture in zip(outputs, pictures, strict=True)}
 
     def note(done: int, total: int | None, row: eg.ImageRow) -> None:
@@ -440,19 +450,16 @@ def _fit_several(
                 eg.save_image(picture, compared)
         show(folder.name, done, total, row)
 
-    with bar(run.quiet) as show:
-        try:
-            rows = eg.fit_many(
-                files, folder, overwrite=overwrite, progress=note, client=client, **given
-            )
-        except eg.Interrupted as stop:
-            rows = stop.result
-            done = f"{len(rows)} of {len(files)} images are done"
-            print_message(f"interrupted; {done}; repeat the command to fit the others")
+    try:
+        rows = eg.fit_many(files, folder, progress=note, client=client, **given)
+    except eg.Interrupted as stop:
+        rows = stop.result
+        done = f"{len(rows)} of {len(files)} images are done"
+        print_message(f"interrupted; {done}; repeat the command to fit the others")
     space, seconds = settings.space or "ycbcr", time.perf_counter() - started
-    run.tell(*_summary_of_all(rows, folder, seconds, space))
     known = [{k: v for k, v in vars(row).items() if v not in (None, "")} for row in rows]
-    return [{"stopped": record["status"]} | record for record in known]
+    records = [{"stopped": record["status"]} | record for record in known]
+    return records, _summary_of_all(rows, folder, seconds, space)
 
 
 def _compared(row: eg.ImageRow, settings: FitOptions) -> Any:
@@ -510,11 +517,8 @@ def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space
 
 
 # ---------------------------------------------------------------------------------------------
-#  A large image by blocks, and the estimated memory of a fit
+#  A large image by blocks
 # ---------------------------------------------------------------------------------------------
-
-REPORTED_BYTES = 1_000_000_000
-"""Estimated memory from which a fit reports it, in bytes."""
 
 
 def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
@@ -523,58 +527,25 @@ def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
     return default and settings.goal is None and not settings.has_levels and preview is None
 
 
-def _check_memory(
-    run: options.Run, path: Path | str, settings: FitOptions, has_blocks: bool
-) -> None:
-    """Report the memory of a large fit, estimated from the header of the file.
-
-    Errors in the file are left to its reader.
-
-    Raises
-    ------
-    ValueError
-        If this process may not use enough memory.
-    """
-    from ..many.windows import image_size
-    from . import memory
-
-    size = image_size(path)
-    if size is None:
-        return
-    height, width, channels = size
-    pixels, data = width * height, not (settings.space or YCBCR).is_color
-    channels = channels if data else 3
-    first = settings.goal is not None
-    count = settings.first_try(pixels, channels) if first else settings.count_for(pixels)
-    problem = width, height, channels, count
-    with prefix_errors(path):
-        line = memory.check_memory(*problem, has_blocks)
-    if memory.estimate_memory(*problem) >= REPORTED_BYTES and not run.quiet:
-        print_message(line)
-
-
 def _fit_by_blocks(
-    run: options.Run, path: Path | str, output: Path, side: int, settings: FitOptions, client: Any
-) -> Record:
+    show: Show, path: Path | str, output: Path, settings: FitOptions, side: int, client: Any
+) -> Fitted:
     """Fit one image by blocks into a file; an interrupt keeps the finished blocks beside it."""
-    names = ("gaussians", "iterations", "space", "method", "seed", "backend", "encoding")
-    choices = {name: getattr(settings, name) for name in names}
-    choices["space"] = settings.space or YCBCR
-    with bar(run.quiet) as show:
+    names = ("gaussians", "iterations", "method", "seed", "backend", "encoding")
+    choices: Record = {name: getattr(settings, name) for name in names}
+    choices |= {"space": settings.space or YCBCR, "block": side, "client": client}
+    record: Record = {"input": path, "output": output}
 
-        def progress(done: int, total: int, row: eg.ImageRow) -> None:
-            show(f"{Path(path).name}: {row.status}", done, total)
+    def progress(done: int, total: int, row: eg.ImageRow) -> None:
+        show(f"{Path(path).name}: {row.status}", done, total)
 
-        try:
-            result = eg.fit_large(
-                path, output, block=side, progress=progress, client=client, **choices
-            )
-        except eg.Interrupted:
-            print_message(
-                f"interrupted; finished blocks are in {output}.checkpoint; repeat the command to "
-                "continue"
-            )
-            return {"input": path, "output": output, "stopped": "interrupted"}
-    record = {"input": path, "output": output, "stopped": "iterations", **_figures(result)}
-    run.tell(*_summary(str(path), record, settings))
-    return record | {"blocks_resumed": result.resumed}
+    try:
+        result = eg.fit_large(path, output, progress=progress, **choices)
+    except eg.Interrupted:
+        print_message(
+            f"interrupted; finished blocks are in {output}.checkpoint; repeat the command to "
+            "continue"
+        )
+        return [record | {"stopped": "interrupted"}], []
+    record |= {"stopped": "iterations", **_figures(result), "blocks_resumed": result.resumed}
+    return [record], _summary(str(path), record, settings)

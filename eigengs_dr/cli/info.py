@@ -24,8 +24,6 @@ from .console import exit_if_failed, for_each, prefix_errors, table
 from .outputs import check_outputs, name_pictures
 from .scene import load_mitsuba, scene_errors
 
-Facts = Record
-
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE|FOLDER")
@@ -83,7 +81,7 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     exit_if_failed(facts)
 
 
-def _facts_of(file: Path, picture: Path | None, texture: bool) -> Facts:
+def _facts_of(file: Path, picture: Path | None, texture: bool) -> Record:
     """Return what a file holds, and draw it."""
     from ..eigenbasis.files import MODEL_FORMAT
 
@@ -94,7 +92,7 @@ def _facts_of(file: Path, picture: Path | None, texture: bool) -> Facts:
         expected = ", ".join(kinds)
         raise ValueError(f"{file}: format is {file_format[:40]!r}, expected one of {expected}")
     kind = "material" if packed and set_file.maps_of(file) else kinds[file_format]
-    facts: Facts = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
+    facts: Record = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
     if kind == "model":
         facts |= _describe_model(eg.EigenGS.load(file))
     elif packed:
@@ -113,17 +111,17 @@ def _facts_of(file: Path, picture: Path | None, texture: bool) -> Facts:
     return facts
 
 
-def _describe_set(data: SetData) -> Facts:
+def _describe_set(data: SetData) -> Record:
     """Describe a set; each map has its own space."""
     count, channels = data.arrays["color"].shape
-    facts: Facts = {"gaussians": count, "width": data.size[0], "height": data.size[1]}
+    facts: Record = {"gaussians": count, "width": data.size[0], "height": data.size[1]}
     facts |= {"channels": channels, "cutoff": data.cutoff}
     if data.maps:
         return facts | {"maps": [m._asdict() for m in data.maps]}
     return facts | {"space": data.space}
 
 
-def _describe_fit(file: Path) -> Facts:
+def _describe_fit(file: Path) -> Record:
     """Describe a set and its fit. The set is read completely, to check that it can be loaded."""
     data = set_file.read_set(file)
     facts = _describe_set(data)
@@ -135,7 +133,7 @@ def _describe_fit(file: Path) -> Facts:
     return facts
 
 
-def _describe_packed(file: Path) -> Facts:
+def _describe_packed(file: Path) -> Record:
     """Describe a packed set, with the Gaussians of each section and the quantisation steps."""
     from ..codec.egs import read_egs
 
@@ -148,7 +146,7 @@ def _describe_packed(file: Path) -> Facts:
     return facts | steps | ({"psnr": round(packed.psnr, 2)} if isfinite(packed.psnr) else {})
 
 
-def _describe_model(model: eg.EigenGS) -> Facts:
+def _describe_model(model: eg.EigenGS) -> Record:
     facts = _describe_set(model.gaussians.data())
     facts |= {"components": list(model.components), "frequency_aware": model.low > 0}
     if model.low:
@@ -159,7 +157,7 @@ def _describe_model(model: eg.EigenGS) -> Facts:
     return facts
 
 
-def _truncation(model: eg.EigenGS) -> list[Facts]:
+def _truncation(model: eg.EigenGS) -> list[Record]:
     """Return the truncation curve at 0, 1, 2, 5, 10, ... and all components."""
     curve = model.truncation_curve()
     if curve is None:
@@ -176,7 +174,7 @@ def _truncation(model: eg.EigenGS) -> list[Facts]:
     return rows
 
 
-def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Facts:
+def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Record:
     """Return the memory of textures of a file in bytes, without and with a prefilter."""
     mi = load_mitsuba(None, quiet=True)
     from ..plugins import resident_bytes

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from ..fitting.control import Surplus
+from ..fitting.options import FitOptions
+from ..image.space import YCBCR
+from ..many.windows import image_size
 from ..storage.memory import usable_memory
 
 BASE_BYTES = 165e6
@@ -18,6 +23,9 @@ largest resident memory of processes that fit a mosaic of photos with the backen
 | 2,048x2,048 | 1 | 320,000 | 0.60 GB | 0.57 GB |
 | 4,000x3,000 | 3 | 5,000 | 1.42 GB | 1.43 GB |
 | 4,096x4,096 | 3 | 1,280,000 | 2.62 GB | 2.69 GB |"""
+
+REPORTED_BYTES = 1_000_000_000
+"""Estimated memory from which a fit reports it, in bytes."""
 
 BYTES_PER_PIXEL = 24.0
 """Memory of the density and of the tile lists, per pixel."""
@@ -57,16 +65,34 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
     )
 
 
-def check_memory(width: int, height: int, channels: int, gaussians: int, has_blocks: bool) -> str:
-    """Return a line with the estimated memory of a fit, and check that there is enough.
+def check_memory(path: Path | str, settings: FitOptions, has_blocks: bool) -> str | None:
+    """Check that the memory suffices for a fit, estimated from the header of the file.
 
-    For the parameters see `estimate_memory`; `has_blocks` says whether blocks are an advice.
+    Parameters
+    ----------
+    path : Path or str
+        Errors in the file are left to its reader.
+    settings : FitOptions
+    has_blocks : bool
+        Whether blocks are an advice.
+
+    Returns
+    -------
+    str or None
+        A line with the memory, if that is large.
 
     Raises
     ------
     ValueError
         If this process may use less memory; the message is one line with advice.
     """
+    if (size := image_size(path)) is None:
+        return None
+    height, width, channels = size
+    pixels, channels = width * height, 3 if (settings.space or YCBCR).is_color else channels
+    gaussians = (
+        settings.first_try(pixels, channels) if settings.goal else settings.count_for(pixels)
+    )
     needed, usable = estimate_memory(width, height, channels, gaussians), usable_memory()
     line = (
         f"{gaussians:,} Gaussians on {width}x{height} pixels take about {needed / 1e9:.1f} GB "
@@ -75,7 +101,7 @@ def check_memory(width: int, height: int, channels: int, gaussians: int, has_blo
     if usable is not None and needed > usable:
         blocks = "fit it with --blocks 1024, " if has_blocks else ""
         raise ValueError(
-            f"{line}, but this process may use {usable / 1e9:.1f} GB; "
+            f"{path}: {line}, but this process may use {usable / 1e9:.1f} GB; "
             f"{blocks}scale the image down or use fewer Gaussians"
         )
-    return line
+    return line if needed >= REPORTED_BYTES else None

@@ -20,9 +20,6 @@ SUFFIX, BUDGET = ".egs", 0.5
 """Suffix of packed files and default loss in dB, repeated here because `eigengs_dr.codec` imports
 Dr.Jit."""
 
-COMPARED_IN = {"linear": "sRGB", "radiance": "PU21"}
-"""Space in which the PSNR of a set of light is measured; other sets use their own space."""
-
 
 @click.command()
 @click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
@@ -106,9 +103,7 @@ def _pack(
     against = "the original" if images else "the rendering of the input"
     psnr = packed.psnr if isinstance(packed.psnr, dict) else {"": packed.psnr}
     values = ", ".join(f"{key} {value:.2f} dB".strip() for key, value in psnr.items())
-    name = COMPARED_IN.get(gaussians.space, f"psnr in {gaussians.space}")
-    if gaussians.maps:
-        name = "psnr_rgb"
+    name = "psnr_rgb" if gaussians.maps else gaussians.space.comparable_name
     run.tell(
         f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes",
         f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel",

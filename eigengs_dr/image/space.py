@@ -267,6 +267,11 @@ class Space(str):
         """Convert values to those whose squared errors a packed file keeps small."""
         return values
 
+    @property
+    def comparable_name(self) -> str:
+        """What the PSNR of `comparable` values is called."""
+        return f"psnr in {self}"
+
     # --- A texture, whose sums are decoded already if that is affine ------------------------------
 
     @property
@@ -361,6 +366,10 @@ class _Linear(_Light):
     def comparable(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
         return np.asarray(self.display(values))
 
+    @property
+    def comparable_name(self) -> str:
+        return "sRGB"
+
 
 class _Radiance(_Linear):
     """Light that may exceed 1. A fit divides it by its mean."""
@@ -373,6 +382,10 @@ class _Radiance(_Linear):
 
     def comparable(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
         return np.asarray(color.to_pu21(values))
+
+    @property
+    def comparable_name(self) -> str:
+        return "PU21"
 
 
 class _Log(_Light):

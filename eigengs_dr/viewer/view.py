@@ -1,15 +1,15 @@
-"""The function `view`, which makes a page of a set, a fit or a model.
+"""What a browser shows: the page of a set, a fit or a model, and their HTML in a notebook.
 
-A page is one HTML file that needs neither other files nor a network.
+A page, which `view` makes, is one HTML file that needs neither other files nor a network.
 """
 
 from __future__ import annotations
 
 import os
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, singledispatch
 from html import escape
 from pathlib import Path
 
@@ -18,13 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.types import ArrayLike, Record
+from ..eigenbasis.basis import Eigenbasis
 from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
 from ..image.pixels import check_encoding
+from ..image.resize import resample
+from ..raster.render import picture_of
 from ..storage.atomic import atomic_write
-from .pictures import check_aspect, displayed, photo_uri
+from .pictures import check_aspect, displayed, first_components, photo_uri, within
 
 
 @dataclass(frozen=True, repr=False)
@@ -133,9 +136,12 @@ def view(
     model = source if isinstance(source, EigenGS) else None
     gaussians = one_image(set_of(source)) if model is None else model.gaussians
     pixels = None if image is None else displayed(image, gaussians.space, encoding)
-    model_facts = None if model is None else describe_model(model, pixels)
-    if pixels is not None and model is not None:
-        gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
+    model_facts, note = None, ""
+    if model is not None:
+        counts = kept_counts(model)
+        model_facts, note = describe_model(model, counts, pixels), describe_share(model, counts)
+        if pixels is not None:
+            gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
     elif pixels is not None:
         check_aspect(pixels, (gaussians.width, gaussians.height))
     views = channel_views(gaussians.channels)
@@ -150,7 +156,7 @@ def view(
         title=title,
         summary=f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels",
         facts=facts,
-        model_note="" if model is None else describe_share(model),
+        model_note=note,
         views=views,
         bright=not gaussians.space.bounded,
         color_name="Colour" if gaussians.space.is_color else "Values",
@@ -240,16 +246,20 @@ MIN_COMPONENTS = 8
 """Number of components of each channel that a page always has: those with a slider."""
 
 
-def describe_model(model: EigenGS, image: NDArray[np.float32] | None = None) -> Record:
+def describe_model(
+    model: EigenGS, counts: Sequence[int], image: NDArray[np.float32] | None = None
+) -> Record:
     """Return the components of a model for a page.
 
     Parameters
     ----------
     model : EigenGS
+    counts : sequence of int
+        See `kept_counts`.
     image : ndarray of float32, shape (H, W, 3), optional
         A photo in sRGB, which is encoded as the start of the sliders.
     """
-    space, counts = model.gaussians.space, kept_counts(model)
+    space = model.gaussians.space
     deviations = [np.sqrt(v[:n]) for v, n in zip(model.eigenvalues, counts, strict=True)]
     channels = []
     for name, weights, deviation in zip(space.names, model.weights, deviations, strict=True):
@@ -277,9 +287,9 @@ def kept_counts(model: EigenGS) -> list[int]:
     return [max(min(MIN_COMPONENTS, len(v)), int((v >= least).sum())) for v in model.eigenvalues]
 
 
-def describe_share(model: EigenGS) -> str:
+def describe_share(model: EigenGS, counts: Sequence[int]) -> str:
     """Return a sentence about the components that a page leaves out; empty if there are none."""
-    counts, components = kept_counts(model), sum(model.components)
+    components = sum(model.components)
     if sum(counts) == components:
         return ""
     kept = sum(v[:n].sum() for v, n in zip(model.eigenvalues, counts, strict=True))
@@ -288,3 +298,65 @@ def describe_share(model: EigenGS) -> str:
         f"A random image uses the first {sum(counts)} of {components} components, "
         f"with {kept / total:.0%} of their variance."
     )
+
+
+# --- What a notebook shows: pictures and a line of figures ----------------------------------------
+
+MAX_PICTURE_SIDE = 480
+"""Largest side of the picture of a set, in pixels. Smaller sets are shown at their native size."""
+
+THUMBNAIL_WIDTH = 120
+"""Width of a component, in pixels."""
+
+
+@singledispatch
+def html_of(value: object) -> str:
+    """Return HTML of a set, a fit, a basis or a model."""
+    return f"<pre>{escape(repr(value))}</pre>"
+
+
+@html_of.register
+def _show_set(gaussians: Gaussians) -> str:
+    if len(gaussians) > MAX_GAUSSIANS:  # rendering would take seconds
+        return _block(repr(gaussians))
+    return _block(repr(gaussians), *_images(picture_of(gaussians, *_shown_size(gaussians))))
+
+
+@html_of.register
+def _show_fit(fit: Fit) -> str:
+    size = _shown_size(fit.gaussians)
+    if isinstance(fit.image, Mapping):
+        small = {name: resample(image, *size) for name, image in fit.image.items()}
+        return _block(repr(fit), *_images(small))
+    return _block(repr(fit), *_images(resample(fit.image, *size)))
+
+
+def _shown_size(gaussians: Gaussians) -> tuple[int, int]:
+    size = gaussians.width, gaussians.height
+    return within(min(MAX_PICTURE_SIDE, max(size)), *size)
+
+
+@html_of.register(Eigenbasis)
+@html_of.register(EigenGS)
+def _show_components(source: EigenGS | Eigenbasis) -> str:
+    return _block(repr(source), *_images(dict(first_components(source)), THUMBNAIL_WIDTH))
+
+
+def _images(
+    pictures: NDArray[np.float32] | Mapping[str, NDArray[np.float32]],
+    max_width: int = MAX_PICTURE_SIDE,
+) -> list[str]:
+    """Return a picture, or pictures with their names, as HTML."""
+    if isinstance(pictures, Mapping):
+        return [
+            f'<figure style="margin: 0; text-align: center">{_images(picture, max_width)[0]}'
+            f"<figcaption>{escape(name)}</figcaption></figure>"
+            for name, picture in pictures.items()
+        ]
+    style = f"max-width: min(100%, {max_width}px)"
+    return [f'<img src="{photo_uri(np.asarray(pictures, np.float32))}" style="{style}" alt="">']
+
+
+def _block(text: str, *parts: str) -> str:
+    style = "display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-end"
+    return f'<div><code>{escape(text)}</code><div style="{style}">{"".join(parts)}</div></div>'

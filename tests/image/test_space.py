@@ -85,6 +85,14 @@ def test_light_above_white_has_a_space_without_an_end():
     }
 
 
+@pytest.mark.parametrize("space", SPACES)
+def test_a_packed_file_keeps_errors_small_in_the_space_that_it_names(space):
+    values = np.linspace(0.01, 0.9, 9).reshape(1, 3, 3)
+    names = {"linear": "sRGB", "radiance": "PU21"}
+    assert space.comparable_name == names.get(str(space), f"psnr in {space}")
+    assert np.array_equal(space.comparable(values), values) == (str(space) not in names)
+
+
 def test_units_are_those_of_the_values():
     values = np.random.default_rng(0).uniform(2, 6, SIZE).astype(np.float32)
     unit = LOG.unit(Extent.of(values))
