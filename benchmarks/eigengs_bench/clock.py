@@ -13,11 +13,10 @@ import eigengs_dr as eg
 from eigengs_dr.fitting.control import Control, Perturb, Redistribute, Relocate, phase_of
 from eigengs_dr.fitting.fit import begin_fit
 from eigengs_dr.fitting.loop import descend
-from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.place import Adaptive
 from eigengs_dr.fitting.problem import problem_of_images
-from eigengs_dr.fitting.state import State, begin
+from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.metrics import MAX_PSNR
 from eigengs_dr.paper.eigengs import EIGENGS
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
@@ -46,38 +45,28 @@ class Moment(NamedTuple):
     picture: Image
 
 
-class Run(NamedTuple):
-    """A descent before its first step, and the RGB that is added to its pictures, or 0."""
-
-    objective: Pixels
-    state: State
-    mean_image: Image | float = 0.0
-
-
-def start(image: Image, options: FitOptions) -> Run:
-    """Start as `eigengs_dr.fit` does, which does not expose the state after each step."""
-    problem, method = problem_of_images([image], options), options.method
-    objective, begun, chosen = begin_fit(problem)
-    if begun is None:
-        placed = method.place_and_solve(objective, problem.first_count, options.seed)
-        return Run(objective, begin(placed, chosen=method.place != Adaptive()))
-    base = objective.pictures[0].base
-    mean_image = 0.0 if base is None else objective.picture(base).numpy()
-    return Run(objective, begin(begun, chosen=chosen), mean_image)
-
-
-def follow(
-    image: Image, iterations: int, marks: Collection[int], options: FitOptions
+def descent(
+    image: Image, iterations: int, marks: Collection[int], **options: Any
 ) -> Iterator[Moment]:
-    """Run a descent to its last step and yield its state after the steps in `marks`.
+    """Run the descent of a fit to its last step, and yield its state after the steps in `marks`.
 
-    It takes all steps and yields the set as it is, where `eigengs_dr.fit` stops early and keeps the
-    best. States with more Gaussians than requested, which a descent passes through, are left out.
-    The time of the start counts; the clock stops between moments.
+    `options` are those of `FitOptions`. The start is that of `eigengs_dr.fit`, which does not
+    expose the state after each step. All steps are taken, and sets are yielded as they are, where
+    `eigengs_dr.fit` stops early and keeps the best. States with more Gaussians than requested,
+    which a descent passes through, are left out. The time of the start counts; the clock stops
+    between moments.
     """
     spent, resumed = 0.0, time.perf_counter()
-    objective, state, mean_image = start(image, replace(options, iterations=iterations))
-    steps = descend(objective, options.method, state, iterations, options.seed)
+    chosen = FitOptions(iterations=iterations, **options)
+    problem, method = problem_of_images([image], chosen), chosen.method
+    objective, begun, is_placed = begin_fit(problem)
+    base = objective.pictures[0].base
+    mean_image = 0.0 if base is None else objective.picture(base).numpy()
+    if begun is None:
+        begun = method.place_and_solve(objective, problem.first_count, chosen.seed)
+        is_placed = method.place != Adaptive()
+    state = begin(begun, chosen=is_placed)
+    steps = descend(objective, method, state, iterations, chosen.seed)
     for iteration in range(iterations + 1):
         if iteration:
             state = next(steps)
@@ -91,19 +80,12 @@ def follow(
     steps.close()
 
 
-def descent(
-    image: Image, iterations: int, marks: Collection[int], **options: Any
-) -> Iterator[Moment]:
-    """Follow the descent of a fit; `options` are those of `FitOptions`."""
-    return follow(image, iterations, marks, FitOptions(**options))
-
-
 def warm_up(image: Image, iterations: int, **options: Any) -> None:
     """Compile the programs of a fit, also those of its controls."""
     method, steps = options.pop("method", eg.DEFAULT), min(WARM_STEPS, iterations)
     controls = tuple(SOON.get(phase_of(control) or "", control) for control in method.controls)
-    soon = FitOptions(method=replace(method, controls=controls), **options)
-    list(follow(image, steps, (0, steps), soon))
+    soon = replace(method, controls=controls)
+    list(descent(image, steps, (0, steps), method=soon, **options))
 
 
 def decibels(picture: Image, image: Image, space: str) -> float:

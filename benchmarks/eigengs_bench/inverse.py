@@ -21,6 +21,7 @@ import eigengs_dr as eg
 from eigengs_bench.clock import Image
 from eigengs_bench.report import Section, Table, number, table
 from eigengs_bench.rows import Job, Row, Task
+from eigengs_dr.cli.scene import load_mitsuba
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.resize import center_crop
@@ -153,12 +154,7 @@ def run(task: Task) -> list[Row]:
 
 
 def _jobs(task: Task) -> Iterator[Job]:
-    import mitsuba as mi
-
-    from eigengs_dr.plugins import register_plugins
-
-    mi.set_variant("cuda_ad_rgb" if task.backend == "cuda" else "llvm_ad_rgb")
-    register_plugins()
+    mi = load_mitsuba("cuda_ad_rgb" if task.backend == "cuda" else "llvm_ad_rgb", quiet=False)
     methods = [unknown.__name__ for unknown in UNKNOWNS] + [FROZEN, "fit"]
     for kind in PHOTOS:
         maps = maps_of(kind)

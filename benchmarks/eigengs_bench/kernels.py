@@ -15,11 +15,6 @@ from eigengs_bench.report import Section, number, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.loop import Descent, descend, last, refine
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.problem import problem_of_images
-from eigengs_dr.fitting.state import begin
-from eigengs_dr.image.resize import center_crop
 from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters
 from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize
@@ -27,8 +22,6 @@ from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize
 # The scene: Gaussians of equal size, spread evenly at random over a square picture.
 SIDE, COUNT, SIGMA, CUTOFF = 512, 20_000, 2.0, 3.0
 WARM_UP, ROUNDS = 3, 15  # rounds that compile and settle, and rounds that are measured
-FIT_STEPS, FIT_ROUNDS = 500, 5  # steps of the refinement behind `fit_over_steps`, and how often
-LONG = 1000  # steps of the descent of which one round is timed alone
 PEAK_LANES, PEAK_LOOPS, PEAK_UNROLL = 1 << 16, 100, 8  # size of the program that measures the peak
 
 
@@ -38,9 +31,6 @@ def run(task: Task) -> list[Row]:
     `step_ms` is forward and reverse together, with lists given and programs frozen.
     `peak_evals_per_ns` counts `exp`, `select` and 3 `fma` without memory; the fractions are
     evaluations inside the cutoff ellipses over that peak.
-    `fit_over_steps` is the time of a refinement over that of its steps alone, without relocation,
-    second placement and trace, and `round_in_steps` that of a round of relocation over that of such
-    a step.
     """
     job: Row = {"side": SIDE, "gaussians": COUNT, "at": time.time()}  # each call measures anew
     return task.measure("kernels", [(job, partial(measure, task))])
@@ -54,10 +44,29 @@ def summarize(rows: Sequence[Row]) -> Section:
 
 
 def measure(task: Task) -> Row:
-    """Measure the figures of `run`."""
+    """Time the renderer, the lists and the peak on a scene."""
     types = types_in(select(task.backend))
-    figures = kernel_figures(types, random_scene(types), partial(task.progress, "kernels"))
-    return figures | fit_figures(types, partial(task.progress, "fit"))
+    scene = random_scene(types)
+    forward, step = programs(scene)
+    seeds = dr.linspace(types.Float, 0, 1, PEAK_LANES)
+    dr.eval(seeds)
+    timed: dict[str, Callable[[], Any]] = {
+        "step_ms": step,
+        "forward_ms": forward,
+        "lists_ms": lambda: bin_gaussians(replace(scene, cutoff=CUTOFF)),
+        "peak_ms": lambda: _peak(seeds),
+    }
+    ms = interleaved(timed, WARM_UP, ROUNDS, partial(task.progress, "kernels"))
+    for program in (forward, step):
+        program.func.clear()  # left to the garbage collector, it may go while another is traced
+    useful = pixels_inside(scene)
+    peak = PEAK_LANES * PEAK_LOOPS * PEAK_UNROLL / (ms.pop("peak_ms") * 1e6)
+    return {
+        **ms,
+        "peak_evals_per_ns": peak,
+        "forward_peak_fraction": useful / (ms["forward_ms"] * 1e6) / peak,
+        "step_peak_fraction": 2 * useful / (ms["step_ms"] * 1e6) / peak,
+    }
 
 
 def random_scene(types: ArrayTypes) -> eg.Gaussians:
@@ -71,32 +80,6 @@ def random_scene(types: ArrayTypes) -> eg.Gaussians:
         space="rgb",
         backend=types.backend,
     )
-
-
-def kernel_figures(
-    types: ArrayTypes, scene: eg.Gaussians, progress: Callable[..., None] = lambda *_: None
-) -> Row:
-    """Time the renderer, the lists and the peak on a scene."""
-    forward, step = programs(scene)
-    seeds = dr.linspace(types.Float, 0, 1, PEAK_LANES)
-    dr.eval(seeds)
-    timed: dict[str, Callable[[], Any]] = {
-        "step_ms": step,
-        "forward_ms": forward,
-        "lists_ms": lambda: bin_gaussians(replace(scene, cutoff=CUTOFF)),
-        "peak_ms": lambda: _peak(seeds),
-    }
-    ms = interleaved(timed, WARM_UP, ROUNDS, progress)
-    for program in (forward, step):
-        program.func.clear()  # left to the garbage collector, it may go while another is traced
-    useful = pixels_inside(scene)
-    peak = PEAK_LANES * PEAK_LOOPS * PEAK_UNROLL / (ms.pop("peak_ms") * 1e6)
-    return {
-        **ms,
-        "peak_evals_per_ns": peak,
-        "forward_peak_fraction": useful / (ms["forward_ms"] * 1e6) / peak,
-        "step_peak_fraction": 2 * useful / (ms["step_ms"] * 1e6) / peak,
-    }
 
 
 def programs(scene: eg.Gaussians) -> tuple[Any, Any]:
@@ -155,37 +138,3 @@ def pixels_inside(scene: eg.Gaussians) -> int:
     dx2[(x < 0) | (x > SIDE)] = np.inf
     dy2[(y < 0) | (y > SIDE)] = np.inf
     return int((dx2[:, :, None] + dy2[:, None, :] <= (CUTOFF * SIGMA) ** 2).sum())
-
-
-def fit_figures(types: ArrayTypes, progress: Callable[..., None]) -> Row:
-    """Time a refinement, its steps alone, and a round of relocation."""
-    photo, method = center_crop(eg.sample("astronaut"), SIDE, SIDE), eg.DEFAULT
-    problem = problem_of_images([photo], FitOptions(backend=types.backend))
-    objective = problem.pixels()
-    start = method.place_and_solve(objective, COUNT)
-    bare = replace(method, controls=())
-    moves = [*method.in_phase("moves"), *method.in_phase("shakes")]
-    first = min(moves[0].steps(LONG))
-
-    measured = Descent(objective, method, lambda g: problem.measure(g, objective, 0.0))
-
-    def whole() -> eg.Gaussians:
-        return refine(measured, begin(start), FIT_STEPS)[0].gaussians
-
-    def steps() -> eg.Gaussians:
-        return last(descend(objective, bare, begin(start), FIT_STEPS), start)
-
-    def relocated() -> eg.Gaussians:
-        state = replace(begin(moved), lists=(lists,))
-        for control in moves:
-            state = control(state, objective, first, LONG, 0)
-        return state.gaussians
-
-    moved = steps()
-    lists = bin_gaussians(moved)
-    timed = {"fit": whole, "steps": steps, "round": relocated}
-    ms = interleaved(timed, 1, FIT_ROUNDS, progress)
-    return {
-        "fit_over_steps": ms["fit"] / ms["steps"],
-        "round_in_steps": ms["round"] / (ms["steps"] / FIT_STEPS),
-    }

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 import eigengs_dr as eg
 from eigengs_bench.clock import Image
 from eigengs_bench.rows import Job, Row
+from eigengs_dr.cli.scene import load_mitsuba
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.resize import center_crop, resample
 
@@ -90,12 +91,9 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
         `filtered_bytes` with a prefilter; `ratio`, of the bytes of Gaussians over those of the
         bitmap of 8 bits, and `ratio_floats`, over those of a bitmap of floats.
     """
-    import mitsuba as mi
+    mi = load_mitsuba(variant, quiet=False)
+    from eigengs_dr.plugins import resident_bytes
 
-    from eigengs_dr.plugins import register_plugins, resident_bytes
-
-    mi.set_variant(variant)
-    register_plugins()
     poster = load()
     goal = picture(mi, bitmap(mi, poster.image))
     inside = 1.0 * (picture(mi, {"type": "rgb", "value": SKY / 2})[..., 0] < 0.75 * SKY)

@@ -14,6 +14,7 @@ import numpy as np
 import eigengs_dr as eg
 from eigengs_bench.clock import Image, interleaved
 from eigengs_bench.rows import Job, Row
+from eigengs_dr.cli.scene import load_mitsuba
 from eigengs_dr.image.color import to_coded
 
 ROWS, PIXELS, SPP = 256, 128, 16  # of the bitmap, twice as wide; of the film; samples a pixel
@@ -77,13 +78,10 @@ def compare(variant: str, name: str) -> Row:
         sphere, as a part of it; `variance`, of a pixel at equal samples, and `ratio`, the time of a
         picture, both over those of the bitmap; `bytes` and `bitmap_bytes` that are held.
     """
-    import mitsuba as mi
-
-    from eigengs_dr.plugins import environment_of, register_plugins, resident_bytes
+    mi = load_mitsuba(variant, quiet=False)
+    from eigengs_dr.plugins import environment_of, resident_bytes
     from eigengs_dr.scene.fit_environment import fit_environment
 
-    mi.set_variant(variant)
-    register_plugins()
     light = LIGHTS[name](ROWS)
     bitmap = {"type": "envmap", "bitmap": mi.Bitmap(light)}
     held = resident_bytes(mi.load_dict(bitmap))

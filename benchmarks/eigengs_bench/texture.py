@@ -18,6 +18,7 @@ from eigengs_bench.clock import interleaved
 from eigengs_bench.names import TEXTURE_PARTS
 from eigengs_bench.report import Section, Table, table
 from eigengs_bench.rows import Job, Row, Task
+from eigengs_dr.cli.scene import load_mitsuba
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.resize import resample
 from eigengs_dr.storage.npz import sizes_of
@@ -37,7 +38,6 @@ def run(task: Task, variant: str, parts: Sequence[str] = TEXTURE_PARTS) -> list[
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_filtered_N` with
     the prefilter, `ratio_prefiltered` that of 5,000, and `ratio_step` picture and gradient of all
     parameters by `prb`.
-    `ratio_maps` is what colour, roughness and normal of one file add over what its colour adds.
     `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
     `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
     memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
@@ -63,7 +63,7 @@ def summarize(rows: Sequence[Row]) -> Section:
         *([_losses(balls, posters)] if balls and posters else []),
         *([_lights(lights)] if lights else []),
     ]
-    return Section(tables, figures=_figures(balls, posters))
+    return Section(tables, figures=_figures(balls))
 
 
 def _costs(balls: Sequence[Row]) -> list[Table]:
@@ -136,14 +136,14 @@ def _lights(lights: Sequence[Row]) -> Table:
     return table(caption, columns, lines, name="lights")._replace(rows=lights)
 
 
-def _figures(balls: Sequence[Row], posters: Sequence[Row]) -> dict[str, str]:
-    """Return figures of a ball, and medians over the posters but the text, for sentences."""
-    pictures = [one for one in posters if one["kind"] != "text"]
-    medians = {k: median(one[k] for one in pictures) for k in ("ratio", "ratio_floats") if pictures}
-    timed = {name: row[f"ratio_{name}"] for row in balls[-1:] for name in ("prefiltered", "step")}
-    held = [row[f"held_{count}"] for row in balls[-1:] for count in HELD]
-    range_held = {"held": f"{min(held):.1f} to {max(held):.1f}"} if held else {}
-    return {name: f"{value:.2f}" for name, value in (medians | timed).items()} | range_held
+def _figures(balls: Sequence[Row]) -> dict[str, str]:
+    """Return figures of the last row of a ball, for sentences."""
+    figures = {}
+    for row in balls[-1:]:
+        held = [row[f"held_{count}"] for count in HELD]
+        figures["held"] = f"{min(held):.1f} to {max(held):.1f}"
+        figures |= {name: f"{row[f'ratio_{name}']:.2f}" for name in ("prefiltered", "step")}
+    return figures
 
 
 def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
@@ -208,12 +208,9 @@ def _memory(row: Row) -> Table:
 
 def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Row:
     """Measure the figures of `run`."""
-    import mitsuba as mi
+    mi = load_mitsuba(variant, quiet=False)
+    from eigengs_dr.plugins import pixel_angle, texture_of
 
-    from eigengs_dr.plugins import pixel_angle, register_plugins, texture_of
-
-    mi.set_variant(variant)
-    register_plugins()
     picture, sets = eg.sample("coffee")[:400, 100:500], {}
     counts = sorted({*COUNTS, *CHANGED})
     for count in counts:
@@ -233,15 +230,6 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         "step_bitmap": _step(mi, plain),
         "step_gaussians": _step(mi, settled),
     }
-    # Nearly constant roughness and normals: paths are as long as with constants.
-    normal = [0.5, 0.5, 1.0] + 0.1 * (picture - picture.mean()) * [1, 1, 0]
-    images = {"albedo": picture, "roughness": 0.25 + 0.1 * picture[..., :1], "normal": normal}
-    fitted = eg.fit(images, SETTLED, 0)
-    with TemporaryDirectory() as folder:
-        fitted.save(f"{folder}/maps.npz")
-        for count in (0, 1, 3):
-            scene = ball(mi, *_maps(f"{folder}/maps.npz", count))
-            programs[f"maps_{count}"] = partial(mi.render, scene)
     for count in CHANGED:
         for name, given in (("", 0.0), ("filtered_", angle)):
             texture = mi.load_dict(texture_of(sets[count], prefilter=given))
@@ -255,29 +243,17 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         **{f"ratio_filtered_{n}": timed[f"filtered_{n}"] / timed["bitmap"] for n in CHANGED},
         "ratio_prefiltered": timed[f"filtered_{SETTLED}"] / timed["bitmap"],
         "ratio_step": timed["step_gaussians"] / timed["step_bitmap"],
-        "ratio_maps": (timed["maps_3"] - timed["maps_0"]) / (timed["maps_1"] - timed["maps_0"]),
     }
 
 
-def _maps(path: str, count: int) -> list[Any]:
-    """Return colour, roughness and normal of a coat, the first `count` as maps of a file."""
-    file = {"type": "gaussian_texture", "filename": path}
-    maps = [file | {"map": name} for name in ("albedo", "roughness", "normal")]
-    flat = {"type": "srgb", "color": [0.5, 0.5, 1.0]}
-    constants: list[Any] = [{"type": "rgb", "value": 0.5}, 0.3, flat]
-    return [*maps[:count], *constants[count:]]
-
-
-def ball(mi: Any, texture: dict[str, Any], roughness: Any = 0.3, normal: Any = None) -> Any:
+def ball(mi: Any, texture: dict[str, Any]) -> Any:
     """Load a ball with a textured coat on a grey floor, under a lamp and the sky."""
     at = mi.ScalarTransform4f()
     camera = at.look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE}
     sampler = {"type": "independent", "sample_count": SPP}
     sensor = {"type": "perspective", "fov": 32, "to_world": camera, "film": film}
-    coat = {"type": "principled", "base_color": texture, "roughness": roughness}
-    if normal:
-        coat = {"type": "normalmap", "normalmap": normal, "bsdf": coat}
+    coat = {"type": "principled", "base_color": texture, "roughness": 0.3}
     floor = at.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}
     scene = {
