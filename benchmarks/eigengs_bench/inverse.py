@@ -381,13 +381,13 @@ def gain(methods: Mapping[str, Mapping[int, Row]], key: str = "psnr_rgb") -> lis
 
 def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
     """Lay out the gains of a scene and its cameras: a column per descent."""
-    descents = [*((steps, SPP) for steps in STEPS), *((NOISY_STEPS, spp) for spp in NOISES)]
     cells: dict[tuple[str, int], dict[tuple[int, int], str]] = {}
     for (scene, cameras, spp), methods in curves.items():
         if "fit" in methods:
             gains = zip(sorted(methods["fit"]), gain(methods), strict=True)
             line = cells.setdefault((scene, cameras), {})
             line.update({(steps, spp): f"{decibels:+.1f}" for steps, decibels in gains})
+    descents = sorted({d for line in cells.values() for d in line}, key=lambda d: (d[1] != SPP, d))
     lines = [
         (f"{scene}, {cameras} cameras", *(line.get(descent, "") for descent in descents))
         for (scene, cameras), line in cells.items()
