@@ -409,7 +409,7 @@ def _gains(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Table:
 
 def _chart(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Figure:
     """Draw PSNR over seconds, a panel for each scene and number of cameras."""
-    cases = [case for case in curves if len(next(iter(curves[case].values()))) > 1]
+    cases = [case for case in curves if case[2] == SPP]
     lines = max(1, math.ceil(len(cases) / 2))
     figure = fr.new_figure(8, 1 + 2.1 * lines, "Textures recovered from photos")
     axes = np.ravel(figure.subplots(lines, 2, squeeze=False))
