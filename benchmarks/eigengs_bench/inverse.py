@@ -359,14 +359,14 @@ def summarize(rows: Sequence[Row]) -> Section:
 SLOWER = 1.05  # seconds of a rival, relative to those of a fit
 
 
-def gain(methods: Mapping[str, Mapping[int, Row]], key: str = "psnr_rgb") -> list[float]:
+def gain(methods: Mapping[str, Mapping[int, Row]]) -> list[float]:
     """Return the decibels of each fit above the best texels of about equal seconds.
 
     Between two descents of a method, its PSNR is linear in the logarithm of the seconds; beyond
     them it is that of the nearest.
     """
     rivals = [
-        sorted((row["seconds"], row[key]) for row in methods[m].values())
+        sorted((row["seconds"], row["psnr_rgb"]) for row in methods[m].values())
         for m in TEXEL_WAYS
         if m in methods
     ]
@@ -375,7 +375,7 @@ def gain(methods: Mapping[str, Mapping[int, Row]], key: str = "psnr_rgb") -> lis
     for _, row in sorted(methods["fit"].items()):
         time = math.log(SLOWER * row["seconds"])
         best = max(float(np.interp(time, np.log(seconds), psnr)) for seconds, psnr in curves)
-        gains.append(row[key] - best)
+        gains.append(row["psnr_rgb"] - best)
     return gains
 
 

@@ -10,7 +10,6 @@ import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import drjit as dr
 
@@ -20,7 +19,7 @@ from ..backend.types import Float, Rows, UInt
 from .loss import LossObjective
 from .method import DEFAULT
 from .place import Adaptive
-from .state import Adam, Optimizer, debias
+from .state import Adam, Optimizer
 
 LEAST_SIDE = 4
 """Smallest length of the shorter side of the coarsest level, in texels."""
@@ -34,26 +33,33 @@ NOISY = Adam(0.5, 0.999, 1e-8)
 class Agreeing(Adam):
     """Adam whose rate rises while derivatives agree with the way so far, and falls if they do not.
 
-    With the derivative g of the values p of a variable, and the moments m and v of `Adam`::
+    With a row of values p and its derivative g at step t, and the averages m and v of `Adam`::
 
-        a_t = memory a_{t-1} + (1 - memory) p_t
-        r_t = r_{t-1} exp(-gain g_t (p_t - a_t) / (|g_t| |p_t - a_t|))      from least to 1
-        p_t = p_{t-1} - lr r_t m_t / (sqrt(v_t + floor mean(v_t)) + epsilon)
+        r_t = r_{t-1} exp(-gain g (p - a_{t-1}) / (|g| |p - a_{t-1}|))      from least to 1
+        a_t = memory a_{t-1} + (1 - memory) p
+        p_t = p - lr r_t m_t / (sqrt(v_t + floor mean(v_t)) + epsilon)
 
     While derivatives lead on, an error is left and steps are too short; if they lead back, noise
     has moved the values (Kesten, "Accelerated stochastic approximation", 1958). Values with little
     derivative, which Adam moves as far as others, move less: what moves them is noise.
 
+    Cost: four sums over each row.
+
     Parameters
     ----------
     memory : float, optional
-        Decay factor of the average of values, in [0, 1).
+        Decay factor of the average a of values, in [0, 1).
     gain : float, optional
         Change of the logarithm of the rate for derivatives that agree.
     first, least : float, optional
-        The rate r at the start, and its lower bound, in (0, 1].
+        The rate r at the start, and its lower bound: ``0 < least <= first <= 1``.
     floor : float, optional
-        Share of the mean of v that is added to each.
+        Share of the mean of v that is added to each, at least 0.
+
+    Raises
+    ------
+    ValueError
+        If one is out of range.
     """
 
     beta_1: float = 0.5
@@ -63,9 +69,24 @@ class Agreeing(Adam):
     least: float = 0.02
     floor: float = 0.05
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.memory < 1:
+            raise ValueError(f"Agreeing: memory is {self.memory}; it must be in [0, 1)")
+        if not 0 < self.least <= self.first <= 1:
+            raise ValueError(
+                f"Agreeing: least is {self.least} and first is {self.first}; they must be above 0, "
+                "at most 1 and in this order"
+            )
+        if not (self.gain >= 0 and self.floor >= 0):
+            raise ValueError(
+                f"Agreeing: gain is {self.gain} and floor is {self.floor}; they must be at least 0"
+            )
+
     def start(self, value: Rows) -> tuple[Rows, ...]:
-        """Return the moments, the average of values and the logarithm of the rate."""
-        log_rate = dr.opaque(types_of(value).Float, math.log(self.first))
+        """Return both averages of `Adam`, that of the values, and the logarithms of the rates."""
+        log_rate = dr.full(type(value), math.log(self.first), (*value.shape[:-1], 1))
+        dr.make_opaque(log_rate)
         return *super().start(value), type(value)(value), log_rate
 
     def step(
@@ -73,17 +94,18 @@ class Agreeing(Adam):
     ) -> tuple[Rows, tuple[Rows, ...]]:
         """Return the value and the moments after a step; see `Optimizer`."""
         m, v, average, log_rate = moments
-        m = dr.lerp(gradient, m, self.beta_1)
-        v = dr.lerp(dr.square(gradient), v, self.beta_2)
+        m, v, scale = self.averaged(gradient, m, v, rate, time)
         way = value - average
-        lengths = dr.sum(dr.square(gradient), axis=None) * dr.sum(dr.square(way), axis=None)
-        back = dr.sum(gradient * way, axis=None) * dr.select(lengths > 0, dr.rsqrt(lengths), 0)
-        log_rate = dr.clip(log_rate - self.gain * back, math.log(self.least), 0)
-        scale = rate * dr.exp(log_rate) / debias(self.beta_1, time)
-        scale *= dr.sqrt(debias(self.beta_2, time))
-        floored = dr.sqrt(v + self.floor * dr.mean(v, axis=None)) + self.epsilon
+        products = gradient * way, dr.square(gradient), dr.square(way), v
+        dr.eval(products)  # one kernel before the sums
+        along, slopes, ways, total = (dr.sum(one, axis=-1) for one in products)
+        lengths = slopes * ways
+        cosine = dr.select(lengths > 0, along * dr.rsqrt(lengths), 0)
+        log_rate = dr.clip(log_rate - self.gain * cosine, math.log(self.least), 0)
+        floored = v + total * (self.floor / value.shape[-1])
         average = dr.lerp(value, average, self.memory)
-        return value - scale * (m / floored), (m, v, average, log_rate)
+        moved = value - scale * dr.exp(log_rate) * (m / (dr.sqrt(floored) + self.epsilon))
+        return moved, (m, v, average, log_rate)
 
 
 @dataclass(frozen=True)
@@ -203,18 +225,19 @@ def _children(place: UInt, count: int, fine: int) -> list[tuple[UInt, Float]]:
     return children
 
 
-def _sum_levels(values: Sequence[list[Float]], levels: Sequence[TexelLevel]) -> list[Float]:
+def _sum_levels(values: Sequence[Rows], levels: Sequence[TexelLevel]) -> Float:
+    """Return the sum of all levels as rows of pixels."""
     total = values[-1]
     for value, (fine, coarse) in zip(values[-2::-1], [*pairwise(levels)][::-1], strict=True):
-        total = [enlarge(t, coarse, fine) + v for t, v in zip(total, value, strict=True)]
+        total = type(total)([enlarge(plane, coarse, fine) for plane in total]) + value
         dr.eval(total)
-    return total
+    return dr.ravel(total)
 
 
 def texel_sums(
     objective: LossObjective, coarse: Coarse, steps: int, start: Sequence[float], unit: float = 1.0
 ) -> Generator[Float, None, None]:
-    """Descend on a loss by a pyramid of texels; each channel of a level is a variable.
+    """Descend on a loss by a pyramid of texels; each channel of a level has a rate of its own.
 
     Parameters
     ----------
@@ -242,25 +265,23 @@ def texel_sums(
         slopes: list[Float],
         size: Float,
     ) -> tuple[list, list, Float, Float, list[Float]]:
-        slope: Any = _planes(objective.pull_back(sums, slopes), channels)
+        slope = _planes(objective.pull_back(sums, slopes), channels)
         rests, later = size == 0, time + 1  # without a derivative nothing moves
         falling = 0.5 + 0.5 * dr.cos(time * (math.pi / steps))
         rate = dr.fma(falling, (1 - coarse.decay), coarse.decay) * (coarse.rate * unit)
-        for k, rows in enumerate(values):
+        for k, value in enumerate(values):
             if k:
-                slope = [shrink(plane, levels[k - 1], levels[k]) for plane in slope]
+                slope = type(slope)([shrink(plane, levels[k - 1], levels[k]) for plane in slope])
             dr.eval(slope)
-            for c, value in enumerate(rows):
-                moved = optimizer.step(value, slope[c], moments[k][c], rate, later)
-                rows[c], moments[k][c] = dr.select(rests, (value, moments[k][c]), moved)
-        sums = dr.ravel(types.FloatX(_sum_levels(values, levels)))
+            moved = optimizer.step(value, slope, moments[k], rate, later)
+            values[k], moments[k] = dr.select(rests, (value, moments[k]), moved)
+        sums = _sum_levels(values, levels)
         return values, moments, dr.select(rests, time, later), sums, objective.seen(sums)
 
-    values = [[dr.zeros(types.Float, level.texels) for _ in start] for level in levels[:-1]]
-    values.append([dr.full(types.Float, value, levels[-1].texels) for value in start])
+    values = [dr.zeros(types.FloatX, (channels, level.texels)) for level in levels]
+    values[-1] += types.FloatX([types.Float(value) for value in start])
     dr.make_opaque(values)
-    moments = [[optimizer.start(value) for value in rows] for rows in values]
-    sums = dr.ravel(types.FloatX(_sum_levels(values, levels)))
+    moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)
     pictures, time = objective.seen(sums), dr.opaque(types.Float, 0)
     with freeze_program(advance) as take_step:
         yield sums
@@ -272,8 +293,8 @@ def texel_sums(
             yield sums
 
 
-def _planes(rows: Float, channels: int) -> list[Float]:
-    """Return the channels of rows of pixels, each as an array."""
+def _planes(rows: Float, channels: int) -> Rows:
+    """Return the channels of rows of pixels, each as a row."""
     types = types_of(rows)
-    pixel = dr.arange(types.UInt, dr.width(rows) // channels)
-    return [dr.gather(types.Float, rows, pixel * channels + c) for c in range(channels)]
+    first = dr.arange(types.UInt, dr.width(rows) // channels) * channels
+    return types.FloatX([dr.gather(types.Float, rows, first + c) for c in range(channels)])

@@ -49,8 +49,9 @@ class Loss:
         tensor of Dr.Jit of one value that depends on the picture; where it does not, at some steps,
         nothing moves. The step is the number of steps taken before, over the whole fit: it may
         choose a camera, or seed random numbers. Rows of the trace call the function for step 0,
-        and controls between steps for the next one. Without an image, a judge or a target, rows
-        between the first and the last hold the mean of the steps since the row before instead.
+        and controls between steps for the next one. Without an image, a judge or a target, only
+        the rows of the first and of the last set call it; others hold the mean of the steps since
+        the row before.
     bounds : (float, float), optional
         Smallest and largest value of the picture, such as ``(0, 1)``: the function sees the picture
         clipped, and sums outside are pulled back.
@@ -437,6 +438,12 @@ class LossObjective(Pixels):
     def compares(self) -> bool:
         """Whether losses of two sets say which is better, as those of other cameras do not."""
         return self.loss.judge is not None or bool(self.pictures)
+
+    @property
+    def is_called_by_row(self) -> bool:
+        """Whether a row of the trace before the last calls the loss, see `Calls.recent`."""
+        is_new = self.calls.step == self.calls.since  # no step to take the mean of
+        return self.compares or self.loss.target is not None or is_new
 
     def judge(self, pictures: Sequence[Float]) -> float:
         """Return the value by which pictures, as rows of pixels, are compared."""

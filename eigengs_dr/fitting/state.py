@@ -184,10 +184,16 @@ class Adam:
     ) -> tuple[Rows, tuple[Rows, ...]]:
         """Return the value and the moments after a step; see `Optimizer`."""
         m, v = moments
+        m, v, scale = self.averaged(gradient, m, v, rate, time)
+        return value - scale * (m / (dr.sqrt(v) + self.epsilon)), (m, v)
+
+    def averaged(
+        self, gradient: Rows, m: Rows, v: Rows, rate: Float, time: Float
+    ) -> tuple[Rows, Rows, Float]:
+        """Return both moving averages, and the rate without the bias of their start."""
         m = dr.lerp(gradient, m, self.beta_1)
         v = dr.lerp(dr.square(gradient), v, self.beta_2)
-        scale = rate * dr.sqrt(debias(self.beta_2, time)) / debias(self.beta_1, time)
-        return value - scale * (m / (dr.sqrt(v) + self.epsilon)), (m, v)
+        return m, v, rate * dr.sqrt(debias(self.beta_2, time)) / debias(self.beta_1, time)
 
 
 class Moving(NamedTuple):

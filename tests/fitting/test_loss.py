@@ -600,10 +600,12 @@ def test_rows_between_the_ends_call_no_loss():
     options = {"size": (SIDE, SIDE), "gaussians": 50, "iterations": 60, "space": "rgb"}
     found = eg.fit(loss=counted, **options)
     assert len(calls) == 60 + 2 and calls.count(0) == 1 + 2
-    picture = dr.llvm.ad.TensorXf(eg.render(found.gaussians))
-    assert found.loss == pytest.approx(squares(picture).array[0], rel=1e-5)
+    assert found.loss == pytest.approx(squares(eg.render(found.gaussians)).array[0], rel=1e-5)
     losses = [row["loss"] for row in found.trace]
     assert losses[0] > losses[-1] and len(losses) == 5  # texels; 0, 10, 20 and 30 steps after
+    for number in (0, 1):  # no step of texels: there is no mean
+        texels, first, *_ = eg.fit(loss=squares, **options | {"iterations": number}).trace
+        assert texels["loss"] > 0.01 and first["loss"] > 0.01
 
 
 def test_the_average_of_sets_is_quieter_than_the_last():

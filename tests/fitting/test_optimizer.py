@@ -136,3 +136,21 @@ def test_the_rate_rises_with_an_error_and_falls_with_noise():
             value, moments = optimizer.step(value, slope, moments, types.Float(0.05), time)
         rates.append(float(np.exp(moments[-1].numpy()[0])))
     assert rates[0] > 0.9 and rates[1] < Agreeing().first
+
+
+@pytest.mark.parametrize(
+    "options", [{"memory": 1.0}, {"least": 0.0}, {"first": 2.0}, {"gain": -1.0}, {"floor": -0.1}]
+)
+def test_settings_of_rates_that_are_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Agreeing(**options)
+
+
+def test_each_row_of_a_variable_has_its_own_rate():
+    """As if the rows were two variables."""
+    types = types_in(select("llvm"))
+    rows = np.float32([[3, 1, -2], [0.1, 0.2, 0.3]])
+    whole = minimize(Agreeing(), types.FloatX(rows), lambda x: x * x * x, 0.1, 20)
+    for row, path in zip(rows, whole.transpose(1, 0, 2), strict=True):
+        alone = minimize(Agreeing(), types.Float(row), lambda x: x * x * x, 0.1, 20)
+        np.testing.assert_allclose(path, alone, rtol=1e-6)
