@@ -32,6 +32,10 @@ PHOTOS = ("astronaut", "chelsea", "coffee", "retina", "rocket")
 MAPS = ("brick", "gravel")  # of one channel, from scikit-image
 SCANS = ("bark", "onyx", "rustymetal")  # colours, in the folder "textures" of DATA
 SLOT = "poster.bsdf.reflectance"
+PANGRAMS = (
+    "The quick brown fox jumps over the lazy dog. Sphinx of black quartz, judge my vow. "
+    "Pack my box with five dozen liquor jugs. "
+)
 
 
 class Poster(NamedTuple):
@@ -67,7 +71,7 @@ def letters(side: int) -> Image:
     from PIL import ImageDraw, ImageFont
 
     page, font = pillow.new("L", (side, side), 255), ImageFont.load_default(side // 32)
-    words = " ".join(str(eg.fit.__doc__).split())
+    words = PANGRAMS * 12
     for line in range(20):
         place = side // 16, side // 16 + line * side // 23
         ImageDraw.Draw(page).text(place, words[64 * line : 64 * line + 64], 0, font)
