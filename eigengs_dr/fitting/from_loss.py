@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -22,6 +23,7 @@ from .objective import Pixels
 from .options import max_gaussians_for
 from .place import Adaptive
 from .problem import Problem
+from .search import fewest
 from .state import begin
 
 PIXELS_PER_GAUSSIAN = 4
@@ -81,8 +83,8 @@ def fit_loss(problem: Problem, watch: Watch) -> tuple[Refinement, float]:
     """Descend on a loss from nothing or from a set; also return the seconds before Gaussians move.
 
     A pyramid of texels takes the first steps, see `Coarse`. Gaussians are fitted to its picture: a
-    given number, or numbers that double while the loss gains from it. They take the remaining
-    steps.
+    given number, or numbers that double while a judge gains from it. They take the remaining steps,
+    in which a search finds the fewest for a target.
     """
     options, taken, trace = problem.options, 0, list[Row]()
     loss = options.loss
@@ -108,7 +110,7 @@ def fit_loss(problem: Problem, watch: Watch) -> tuple[Refinement, float]:
     def score(gaussians: Gaussians) -> list[Measured]:
         exact = objective.is_called_by_row or objective.calls.step == options.iterations
         row = objective.judged(gaussians) if exact else {"loss": objective.calls.recent()}
-        return [Measured({"seconds": watch.seconds, **row})]
+        return [Measured({"seconds": watch.seconds, **row}, row.get("margin", math.inf))]
 
     descent = Descent(
         objective,
@@ -118,12 +120,13 @@ def fit_loss(problem: Problem, watch: Watch) -> tuple[Refinement, float]:
         watch.progress and (lambda step, steps, row: watch.show(step + taken, row)),
         watch.ended,
     )
-    [refined] = refine(descent, begin(start, chosen=True), options.iterations - taken)
+    steps = options.iterations - taken
+    if options.searches:
+        refined = fewest(descent, start, problem.max_count, steps)
+    else:
+        [refined] = refine(descent, begin(start, chosen=True), steps)
     if refined.stopped != "interrupted":
         objective.calls.check_use()
-        if loss.target is not None:
-            met = refined.row["loss"] <= loss.target
-            refined = replace(refined, stopped="met" if met else "out of reach")
     trace += [{**row, "iteration": row["iteration"] + taken} for row in refined.trace]
     return replace(refined, trace=trace, iterations=refined.iterations + taken), seconds_init
 
@@ -188,7 +191,7 @@ def _start(
         return last(states, start)
 
     loss, pixels = objective.loss, problem.size[0] * problem.size[1]
-    if options.gaussians is not None or (loss.judge is None and loss.target is None):
+    if options.gaussians is not None or options.searches or loss.judge is None:
         return fitted(options.count or max(1, pixels // PIXELS_PER_GAUSSIAN)), []
     max_count, count = max_gaussians_for(pixels, objective.channels), pixels // FIRST_PIXELS
     best, rows = fitted(max(1, count)), list[Row]()
@@ -199,8 +202,6 @@ def _start(
             if len(rows) > 1 and rows[-1]["loss"] >= rows[-2]["loss"]:
                 break
             best, count = gaussians, 2 * max(1, count)
-            if loss.target is not None and rows[-1]["loss"] <= loss.target:
-                break
             if count > max_count or watch.ended():
                 break
             gaussians = fitted(count)

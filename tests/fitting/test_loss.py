@@ -98,9 +98,10 @@ def test_a_mask_frees_gaussians_for_the_rest():
     assert eg.psnr(found.image[half], IMAGE[half]) > eg.psnr(plain.image[half], IMAGE[half]) + 1
 
 
-def test_a_target_takes_fewer_for_a_higher_loss():
+@pytest.mark.parametrize("given", [{"image": IMAGE}, {"size": (SIDE, SIDE)}], ids=["image", "free"])
+def test_a_target_takes_fewer_for_a_higher_loss(given):
     few, many = (
-        eg.fit(IMAGE, iterations=100, space="rgb", loss=eg.Loss(squares, target=t))
+        eg.fit(**given, iterations=100, space="rgb", loss=eg.Loss(squares, target=t))
         for t in (1e-3, 3e-4)
     )
     assert (few.stopped, many.stopped) == ("met", "met")
@@ -465,7 +466,7 @@ STOPS = {"first": 0, "texels": 3, "later": 25}
 @pytest.mark.parametrize(
     ("kind", "stop"),
     [
-        *product(("image", "free", "target"), (*STOPS, "judge", "from a judge on")),
+        *product(("image", "free", "target", "free target"), (*STOPS, "judge", "from a judge on")),
         ("number", "judge"),
         ("number", "from a judge on"),
     ],
@@ -486,8 +487,8 @@ def test_a_loss_or_a_judge_may_end_the_fit(kind, stop):
         return squares(picture)
 
     given = {"image": IMAGE} if kind in ("image", "target") else {"size": (SIDE, SIDE)}
-    given |= {} if kind in ("target", "number") else {"gaussians": 30}
-    asked = eg.Loss(loss, judge=judge, target=1e-4 if kind == "target" else None)
+    given |= {} if "target" in kind or kind == "number" else {"gaussians": 30}
+    asked = eg.Loss(loss, judge=judge, target=1e-4 if "target" in kind else None)
     for error in (KeyboardInterrupt(), StopIteration("mine"), RuntimeError("mine")):
         ended[:], judged = [error], []
         with pytest.raises(BaseException) as got:
