@@ -1,8 +1,12 @@
 """Clocks: a descent that is measured on its way, and programs that are timed in turn."""
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -112,13 +116,68 @@ def interleaved(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, float]:
     """Time programs in turn, each once per round; return median milliseconds by name."""
-    times: dict[str, list[float]] = {name: [] for name in programs}
+    timers = {name: partial(milliseconds, program) for name, program in programs.items()}
+    return _medians(timers, warm_up, rounds, progress)
+
+
+def interleaved_apart(
+    makers: Mapping[str, Callable[[], Callable[[], Any]]],
+    warm_up: int,
+    rounds: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, float]:
+    """Time programs in turn, each made in a process of its own, as Mitsuba is slower beside others.
+
+    Mitsuba traces the textures of every live scene at every rendering, so a scene beside another
+    one takes the time of both. Makers are pickled.
+    """
+    with ExitStack() as stack:
+        workers = {
+            name: stack.enter_context(ProcessPoolExecutor(1, get_context("spawn")))
+            for name in makers
+        }
+        for name, make in makers.items():
+            workers[name].submit(_keep, make).result()
+        timers = {name: partial(_time_in, worker) for name, worker in workers.items()}
+        return _medians(timers, warm_up, rounds, progress)
+
+
+def milliseconds(program: Callable[[], Any]) -> float:
+    """Return the time of one call, with all that it leaves to be computed."""
+    started = time.perf_counter()
+    dr.eval(program())
+    dr.sync_thread()
+    return (time.perf_counter() - started) * 1e3
+
+
+KEPT: list[Callable[[], Any]] = []
+"""The program of a process of `interleaved_apart`."""
+
+
+def _keep(make: Callable[[], Callable[[], Any]]) -> None:
+    KEPT.append(make())
+
+
+def _time_kept() -> float:
+    return milliseconds(KEPT[0])
+
+
+def _time_in(worker: ProcessPoolExecutor) -> float:
+    return worker.submit(_time_kept).result()
+
+
+def _medians(
+    timers: Mapping[str, Callable[[], float]],
+    warm_up: int,
+    rounds: int,
+    progress: Callable[[int, int], None],
+) -> dict[str, float]:
+    """Call timers in turn, each once per round; return their medians."""
+    times: dict[str, list[float]] = {name: [] for name in timers}
     for done in range(warm_up + rounds):
-        for name, program in programs.items():
-            started = time.perf_counter()
-            dr.eval(program())
-            dr.sync_thread()
+        for name, timer in timers.items():
+            taken = timer()
             if done >= warm_up:  # the first rounds compile and settle
-                times[name].append((time.perf_counter() - started) * 1e3)
+                times[name].append(taken)
         progress(done + 1, warm_up + rounds)
     return {name: float(np.median(ms)) for name, ms in times.items()}

@@ -121,6 +121,7 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
     names = NAMES[scene.kind]
     spaces = {name: SPACES[name] for name in names}
     for _ in range(2):
+        gc.collect()
         textures = {name: bitmap(mi, grey(name)) for name in names}
         loaded = scene_of(mi, scene.kind, textures, scene.cameras)
         cameras = range(scene.cameras)

@@ -6,13 +6,15 @@ light that it gives to surfaces.
 
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 import eigengs_dr as eg
-from eigengs_bench.clock import Image, interleaved
+from eigengs_bench.clock import Image, interleaved_apart
 from eigengs_bench.rows import Job, Row
 from eigengs_dr.cli.scene import load_mitsuba
 from eigengs_dr.image.color import to_coded
@@ -85,16 +87,17 @@ def compare(variant: str, name: str) -> Row:
     light = LIGHTS[name](ROWS)
     bitmap = {"type": "envmap", "bitmap": mi.Bitmap(light)}
     held = resident_bytes(mi.load_dict(bitmap))
-    plain = scene_of(mi, bitmap)
+    plain = scene_of(mi, bitmap, PIXELS)
     gaussians, _ = fit_environment(plain, light, GOAL, STEPS, held)
     sums = environment_of(gaussians)
-    scenes = {"bitmap": plain, "gaussians": scene_of(mi, sums)}
-    programs: dict[str, Callable[[], Any]] = {
-        key: partial(mi.render, scene) for key, scene in scenes.items()
-    }
-    timed = interleaved(programs, WARM_UP, ROUNDS)
     true, seen = (lookups(mi, emitter) for emitter in (bitmap, sums))
-    before, after = (pictures(mi, scene) for scene in scenes.values())
+    before, after = (pictures(mi, scene_of(mi, emitter, PIXELS)) for emitter in (bitmap, sums))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "light.npz"
+        gaussians.save(path)
+        shown = partial(_picture, variant, PIXELS)
+        makers = {"bitmap": partial(shown, light), "gaussians": partial(shown, path)}
+        timed = interleaved_apart(makers, WARM_UP, ROUNDS)
     variances = [np.var(shown, axis=0, ddof=1).mean() for shown in (before, after)]
     return {
         "gaussians": len(gaussians),
@@ -107,6 +110,15 @@ def compare(variant: str, name: str) -> Row:
         "bytes": resident_bytes(mi.load_dict(sums)),
         "bitmap_bytes": held,
     }
+
+
+def _picture(variant: str, side: int, light: Image | Path) -> Callable[[], Any]:
+    """Return what renders the ball under a light: a bitmap, or the file of a set."""
+    mi = load_mitsuba(variant, quiet=False)
+    emitter = {"type": "gaussian_environment", "filename": str(light)}
+    if not isinstance(light, Path):
+        emitter = {"type": "envmap", "bitmap": mi.Bitmap(light)}
+    return partial(mi.render, scene_of(mi, emitter, side))
 
 
 def lookups(mi: Any, emitter: dict[str, Any]) -> Image:
@@ -140,11 +152,11 @@ def psnr_without_noise(found: Image, true: Image) -> float:
     return float(-10 * np.log10(max(error, 1e-10)))
 
 
-def scene_of(mi: Any, emitter: dict[str, Any]) -> Any:
+def scene_of(mi: Any, emitter: dict[str, Any], side: int) -> Any:
     """Load a glossy ball on a grey floor under a light."""
     at, box = mi.ScalarTransform4f(), {"type": "box"}
     camera = at.look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": box}
+    film = {"type": "hdrfilm", "width": side, "height": side, "rfilter": box}
     film["pixel_format"] = "rgb"
     floor = at.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(3)
     sampler = {"type": "independent", "sample_count": SPP}

@@ -14,7 +14,7 @@ import numpy as np
 
 import eigengs_dr as eg
 from eigengs_bench import poster, sky
-from eigengs_bench.clock import interleaved
+from eigengs_bench.clock import interleaved, interleaved_apart
 from eigengs_bench.names import TEXTURE_PARTS
 from eigengs_bench.report import Section, Table, table
 from eigengs_bench.rows import Job, Row, Task
@@ -33,11 +33,12 @@ PIXELS = 32  # of the picture of a file, for each of its Gaussians
 
 
 def run(task: Task, variant: str, parts: Sequence[str] = TEXTURE_PARTS) -> list[Row]:
-    """Time a material ball with each texture in turn, in one run; every figure is a median.
+    """Time a material ball with each texture in turn; every figure is a median.
 
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_filtered_N` with
-    the prefilter, `ratio_prefiltered` that of 5,000, and `ratio_step` picture and gradient of all
-    parameters by `prb`.
+    the prefilter, `ratio_prefiltered` that of 5,000, `ratio_step` picture and gradient of all
+    parameters by `prb`, and `ratio_step_filtered` these with the prefilter. Each scene has a
+    process of its own, as beside others Mitsuba takes longer.
     `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
     `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
     memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
@@ -73,6 +74,7 @@ def _costs(balls: Sequence[Row]) -> list[Table]:
     costs = [(f"{n:,} Gaussians", f"{row[f'ratio_{n}']:.2f}") for n in COUNTS]
     costs += [(f"{n:,} Gaussians, prefilter", f"{row[f'ratio_filtered_{n}']:.2f}") for n in CHANGED]
     costs.append((f"a step of prb, {SETTLED:,} Gaussians", f"{row['ratio_step']:.2f}"))
+    costs.append(("a step of prb, prefilter", f"{row['ratio_step_filtered']:.2f}"))
     changes = [
         (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
         for what, name in LOOKUPS.items()
@@ -170,6 +172,7 @@ def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
             ("time of a picture, prefilter", f"ratio_filtered_{SETTLED}", bake),
             (f"the same, {CHANGED[-1]:,} Gaussians", f"ratio_filtered_{CHANGED[-1]}", bake),
             ("time of a step of `prb`", "ratio_step", texels),
+            ("time of a step of `prb`, prefilter", "ratio_step_filtered", texels),
         )
     ]
     caption = (
@@ -216,26 +219,26 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
     for count in counts:
         sets[count] = eg.fit(picture, count, STEPS).gaussians
         progress("fits", len(sets), len(counts))
-    coded = np.clip(eg.picture_of(sets[SETTLED], TEXELS, TEXELS), 0, 1)
-    data = mi.TensorXf(to_linear(coded).astype(np.float32))
-    plain = ball(mi, {"type": "bitmap", "data": data, "raw": True})
-    scenes = {f"gaussians_{n}": ball(mi, texture_of(sets[n])) for n in counts}
-    angle = pixel_angle(plain.sensors()[0])
-    for n in CHANGED:
-        scenes[f"filtered_{n}"] = ball(mi, texture_of(sets[n], prefilter=angle))
-    settled = scenes[f"gaussians_{SETTLED}"]
-    programs: dict[str, Callable[[], Any]] = {
-        "bitmap": partial(mi.render, plain),
-        **{name: partial(mi.render, scene) for name, scene in scenes.items()},
-        "step_bitmap": _step(mi, plain),
-        "step_gaussians": _step(mi, settled),
-    }
+    angle = pixel_angle(mi.load_dict(camera(mi, SIDE, SPP)))
+    with TemporaryDirectory() as folder:
+        files = {count: Path(folder) / f"{count}.npz" for count in counts}
+        for count, path in files.items():
+            sets[count].save(path)
+        shown = partial(_picture, variant, SIDE, SPP)
+        makers = {"bitmap": partial(shown, files[SETTLED], TEXELS)}
+        makers |= {f"gaussians_{n}": partial(shown, files[n]) for n in counts}
+        makers |= {f"filtered_{n}": partial(shown, files[n], prefilter=angle) for n in CHANGED}
+        ends = {"bitmap": "bitmap", "gaussians": f"gaussians_{SETTLED}"}
+        ends["filtered"] = f"filtered_{SETTLED}"
+        makers |= {f"step_{n}": partial(makers[end], by_step=True) for n, end in ends.items()}
+        timed = interleaved_apart(makers, WARM_UP, ROUNDS, partial(progress, "pictures"))
+    programs: dict[str, Callable[[], Any]] = {}
     for count in CHANGED:
         for name, given in (("", 0.0), ("filtered_", angle)):
             texture = mi.load_dict(texture_of(sets[count], prefilter=given))
             programs[f"change_{name}{count}"] = partial(_change, mi, texture, "factor")
             programs[f"colors_{name}{count}"] = partial(_change, mi, texture, "color")
-    timed = interleaved(programs, WARM_UP, ROUNDS, partial(progress, "texture"))
+    timed |= interleaved(programs, WARM_UP, ROUNDS, partial(progress, "changes"))
     return {
         **hold(mi, angle, progress),
         **{f"{name}_ms": ms for name, ms in timed.items()},
@@ -243,29 +246,57 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         **{f"ratio_filtered_{n}": timed[f"filtered_{n}"] / timed["bitmap"] for n in CHANGED},
         "ratio_prefiltered": timed[f"filtered_{SETTLED}"] / timed["bitmap"],
         "ratio_step": timed["step_gaussians"] / timed["step_bitmap"],
+        "ratio_step_filtered": timed["step_filtered"] / timed["step_bitmap"],
     }
 
 
-def ball(mi: Any, texture: dict[str, Any]) -> Any:
-    """Load a ball with a textured coat on a grey floor, under a lamp and the sky."""
+def _picture(
+    variant: str,
+    side: int,
+    samples: int,
+    path: Path,
+    texels: int = 0,
+    prefilter: float = 0.0,
+    by_step: bool = False,
+) -> Callable[[], Any]:
+    """Return what renders the ball with a set, or with a bitmap of it; or what differentiates it.
+
+    It runs in a process of its own, see `interleaved_apart`.
+    """
+    mi = load_mitsuba(variant, quiet=False)
+    texture = {"type": "gaussian_texture", "filename": str(path), "prefilter": prefilter}
+    if texels:
+        coded = np.clip(eg.picture_of(eg.Gaussians.load(path), texels, texels), 0, 1)
+        data = mi.TensorXf(to_linear(coded).astype(np.float32))
+        texture = {"type": "bitmap", "data": data, "raw": True}
+    scene = mi.load_dict(ball(mi, texture, camera(mi, side, samples)))
+    return _step(mi, scene) if by_step else partial(mi.render, scene)
+
+
+def camera(mi: Any, side: int, samples: int) -> dict[str, Any]:
+    """Describe the camera that sees the ball."""
+    place = mi.ScalarTransform4f().look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": side, "height": side}
+    sampler = {"type": "independent", "sample_count": samples}
+    kind = {"type": "perspective", "fov": 32, "to_world": place}
+    return kind | {"film": film, "sampler": sampler}
+
+
+def ball(mi: Any, texture: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
+    """Describe a ball with a textured coat on a grey floor, under a lamp and the sky."""
     at = mi.ScalarTransform4f()
-    camera = at.look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": SIDE, "height": SIDE}
-    sampler = {"type": "independent", "sample_count": SPP}
-    sensor = {"type": "perspective", "fov": 32, "to_world": camera, "film": film}
     coat = {"type": "principled", "base_color": texture, "roughness": 0.3}
     floor = at.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}
-    scene = {
+    return {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 5},
-        "sensor": {**sensor, "sampler": sampler},
+        "sensor": sensor,
         "ball": {"type": "sphere", "bsdf": coat},
         "floor": {"type": "rectangle", "to_world": floor},
         "lamp": {"type": "sphere", "center": [3, 4, 3], "emitter": light},
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.4}},
     }
-    return mi.load_dict(scene)
 
 
 def _step(mi: Any, scene: Any) -> Callable[[], Any]:

@@ -450,7 +450,7 @@ def test_texture(monkeypatch, tmp_path):
     assert photo["bitmap_bytes"] == pytest.approx(4 * photo["side"] ** 2, rel=0.1)
     assert material["bitmap_bytes"] == pytest.approx(material["side"] ** 2, rel=0.1)
     assert ball["bytes_filtered_20"] > ball["bytes_20"] > 0 and ball["first_20_ms"] > 0
-    assert ball["ratio_20"] > 0 and ball["ratio_step"] > 0
+    assert ball["ratio_20"] > 0 and ball["ratio_step"] > 0 and ball["ratio_step_filtered"] > 0
     assert "memory, sharp text" in text and "coffee" in text
     for light in lights:
         assert light["mean"] < 0.2 and light["variance"] > 0 and light["ratio"] > 0

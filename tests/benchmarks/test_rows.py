@@ -1,5 +1,6 @@
 """Rows of benchmarks, of which code they are, and the report; programs in turns, images, models."""
 
+import os
 import subprocess
 import sys
 from functools import partial
@@ -154,6 +155,13 @@ def test_programs_take_turns():
     ms = clock.interleaved(programs, 1, 2, lambda *step: seen.append(step))
     assert "".join(order) == "ababab" and seen == [(1, 3), (2, 3), (3, 3)]
     assert set(ms) == {"a", "b"} and all(value >= 0 for value in ms.values())
+
+
+def test_programs_apart_have_a_process_each():
+    makers = dict.fromkeys("ab", partial(partial, os.getpid))
+    ms = clock.interleaved_apart(makers, 0, 1)
+    assert set(ms) == {"a", "b"} and all(value >= 0 for value in ms.values())
+    assert clock.KEPT == []  # the programs are in other processes
 
 
 def test_images_are_the_first_ones_at_the_size_of_their_set(tmp_path, monkeypatch):
