@@ -117,7 +117,9 @@ class Coarse(Adaptive):
     Attributes
     ----------
     share : float
-        Share of the iterations that the pyramid takes, in [0, 1].
+        Largest share of the iterations that the pyramid takes, in [0, 1].
+    max_steps : int
+        Largest number of its steps. Once the picture has its shapes, Gaussians average more noise.
     rate : float
         Largest learning rate of its levels, relative to the range of the picture.
     decay : float
@@ -128,10 +130,15 @@ class Coarse(Adaptive):
     """
 
     share: float = 0.5
+    max_steps: int = 60
     rate: float = 0.025
     decay: float = 0.05
     optimizer: Optimizer = Agreeing()
     fit_steps: int = 150
+
+    def steps(self, iterations: int) -> int:
+        """Return the number of steps of the pyramid in a fit of some iterations."""
+        return min(self.max_steps, round(self.share * iterations))
 
 
 COARSE_TO_FINE = replace(

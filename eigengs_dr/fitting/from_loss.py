@@ -158,7 +158,7 @@ def _rows(objective: LossObjective) -> Float:
 
 def _descend_texels(problem: Problem, coarse: Coarse, watch: Watch) -> LossObjective:
     """Return the objective of a loss near the picture of a pyramid of texels."""
-    loss, steps = problem.options.loss, round(coarse.share * problem.options.iterations)
+    loss, steps = problem.options.loss, coarse.steps(problem.options.iterations)
     assert loss is not None
     reach = min(channels.space.reach for channels in problem.channels)
     low, high = loss.bounds or (0.0, reach)
