@@ -80,8 +80,9 @@ def photo_loss(
     held_out : float, optional
         Share of the pixels of four photos that no step sees, in [0, 1). Their error is then the
         ``loss`` of the trace, and the number of Gaussians doubles while it falls; by default there
-        is one for 4 texels. It takes many photos: with few, a held-out pixel leaves a hole in the
-        texture that no other photo sees, and the number that suits holes is far too small.
+        is one for 4 texels, or for 3 pixels of all photos if these are fewer. It takes many photos:
+        with few, a held-out pixel leaves a hole in the texture that no other photo sees, and the
+        number that suits holes is far too small.
     bounds : (float, float), optional
         See `eigengs_dr.Loss`.
     parameters : optimiser, optional
@@ -172,7 +173,8 @@ def photo_loss(
     spaces = {name: _space_for(known, key) for name, key in keys.items()}
     space = spaces if isinstance(pictures, Mapping) else spaces[""]
     judge = taken.judge if held_out else None
-    loss = Loss(taken.loss, bounds, parameters, judge, space=space)
+    pixels = sum(mask.size - int(mask.sum()) for mask in masks)
+    loss = Loss(taken.loss, bounds, parameters, judge, space=space, pixels=pixels)
     for key in parameters.keys() if parameters is not None else ():
         _check_known(known, key)
     return loss

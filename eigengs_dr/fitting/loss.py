@@ -66,11 +66,16 @@ class Loss:
         Value to reach with as few Gaussians as possible, instead of their number.
     space : str or mapping of str to str, optional
         Space of the sums without an image, if `eigengs_dr.fit` is given none.
+    pixels : int, optional
+        Number of pixels that the function looks at, such as those of all photos of a texture. More
+        than one Gaussian for 3 of them would show their noise: without an image or a number, there
+        are no more.
 
     Raises
     ------
     ValueError
-        If the bounds are not two finite numbers that rise, or the target is no number above 0.
+        If the bounds are not two finite numbers that rise, the target is no number above 0, or
+        there are no pixels.
     TypeError
         If the function or the judge takes other arguments, the function is frozen, or the
         parameters are no optimiser.
@@ -93,6 +98,7 @@ class Loss:
     judge: Callable[[Any], Any] | None = None
     target: float | None = None
     space: str | Mapping[str, str] | None = None
+    pixels: int | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.function, Loss):
@@ -121,6 +127,8 @@ class Loss:
             object.__setattr__(self, name, value)
         if self.target is not None and not 0 < self.target < math.inf:
             raise ValueError(f"Loss: target is {self.target}; it must be finite and above 0")
+        if self.pixels is not None and self.pixels < 1:
+            raise ValueError(f"Loss: pixels is {self.pixels}; it must be at least 1")
 
 
 def _check_bounds(bounds: Any) -> tuple[float, float]:

@@ -417,6 +417,7 @@ def test_options_that_do_not_fit_are_refused(options, message):
         ({"bounds": (0, None)}, "give two numbers"),
         ({"bounds": (0, np.inf)}, "give two numbers"),
         ({"target": 0}, "above 0"),
+        ({"pixels": 0}, "pixels is 0; it must be at least 1"),
         ({"target": "x"}, "target is 'x'; it must be a number"),
     ):
         with pytest.raises(ValueError, match=text):

@@ -1,5 +1,7 @@
 """Photos as a loss: a wall under a sky of light, seen by three cameras."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -64,6 +66,20 @@ def test_a_texture_is_recovered():
     error = np.mean((found.image[inner] - eg.image.color.to_coded(true_texture())[inner]) ** 2)
     assert error < 1e-3
     assert found.gaussians.space == "linear" and found.iterations == 120
+
+
+def test_photos_of_few_pixels_get_few_gaussians():
+    """One for 3 pixels that steps see, and one for 4 texels if these are fewer."""
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), photos_of(wall(true_texture()))
+    seen = sum(photo.shape[0] * photo.shape[1] for photo in photos)
+    loss = photo_loss(scene, NAME, photos)
+    side = math.ceil(2 * math.sqrt(seen))
+    few, many = (eg.fit(loss=loss, size=(s, s), iterations=2).gaussians for s in (8, side))
+    assert len(few) == 16 and len(many) == seen // 3 < side**2 // 4
+    held_out = photo_loss(scene, NAME, photos, held_out=0.5)
+    assert seen - 4 * photos[0][..., 0].size < held_out.pixels < seen
 
 
 def test_held_out_pixels_choose_the_number():
