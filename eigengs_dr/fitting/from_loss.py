@@ -185,17 +185,18 @@ def _start(
     objective: LossObjective, problem: Problem, coarse: Coarse, watch: Watch
 ) -> tuple[Gaussians, list[Row]]:
     """Fit Gaussians to the image of an objective; also return rows for the numbers tried."""
-    options, image = problem.options, objective.image()
+    options, image, loss = problem.options, objective.image(), objective.loss
+    pixels = problem.size[0] * problem.size[1]
     method = replace(DEFAULT, place=options.method.place, cutoff=options.method.cutoff)
     if not isinstance(method.place, Adaptive):  # the choice of a placement is not undone
         method = method.without("grows", "places")
 
     def fitted(count: int) -> Gaussians:
         start = method.place_and_solve(image, count, options.seed)
-        states = descend(image, method, begin(start), coarse.fit_steps, options.seed)
+        steps = coarse.picture_steps(pixels / len(start))
+        states = descend(image, method, begin(start), steps, options.seed)
         return last(states, start)
 
-    loss, pixels = objective.loss, problem.size[0] * problem.size[1]
     if options.gaussians is not None or options.searches or loss.judge is None:
         count = pixels // PIXELS_PER_GAUSSIAN
         if loss.pixels is not None:
