@@ -14,7 +14,13 @@ from .outputs import check_outputs, lock_outputs, name_outputs
 
 @click.command()
 @click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
-@options.output("Picture to write, or a folder of PNG files.", "Y.png|FOLDER")
+@options.output("Picture to write, or a folder of PNG files.", "Y.png|FOLDER", False)
+@click.option(
+    "--planes",
+    type=options.path,
+    metavar="FOLDER",
+    help="Of a model of lights: write its planes for relight and OpenLIME, instead of a picture.",
+)
 @click.option("--map", "name", metavar="NAME", help="The map of a material to render.")
 @options.value(
     "--region", "X,Y,W,H", options.region, "Region of the image: left, top, width, height."
@@ -37,7 +43,8 @@ from .outputs import check_outputs, lock_outputs, name_outputs
 def render(
     run: options.Run,
     file: Path,
-    output: Path,
+    output: Path | None,
+    planes: Path | None,
     scale: float | None,
     size: tuple[int, int | None] | None,
     bits: str | None,
@@ -65,7 +72,14 @@ def render(
       eigengs-dr render bark.npz -o roughness.png --map roughness
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2
       eigengs-dr render fits/ -o pictures/ --size 512
+      eigengs-dr render coin.npz --planes coin/
     """
+    if planes is not None:
+        if output or scale or size or bits or any(choices.values()):
+            raise click.UsageError("--planes takes no other options but --backend and --quiet")
+        return _write_planes(run, file, planes)
+    if output is None:
+        raise click.UsageError("Missing option '-o' / '--output'.")
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
     from ..image.io import SUFFIXES, bits_of
@@ -78,6 +92,18 @@ def render(
     select(run.backend)
     work = partial(_render, run=run, depth=depth, scale=scale, size=size, **choices)
     exit_if_failed(for_each(in_folder, work, files, outputs))
+
+
+def _write_planes(run: options.Run, file: Path, folder: Path) -> None:
+    """Write the planes of a model of lights to a folder."""
+    from ..relight.model import Relightable
+    from ..relight.planes import PixelPlanes
+
+    select(run.backend)
+    planes = PixelPlanes.of(Relightable.load(file, run.backend))
+    planes.write(folder)
+    height, width, count = planes.images.shape
+    run.tell(f"{file}: wrote {count} planes of {width}x{height} pixels to {folder}")
 
 
 def _render(

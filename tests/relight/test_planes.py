@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
 from eigengs_dr.relight.planes import PixelPlanes
 from eigengs_dr.relight.planes import directions as grid_directions
@@ -83,3 +84,17 @@ def test_a_folder_that_holds_something_is_not_overwritten(model, tmp_path):
     with pytest.raises(OSError):
         PixelPlanes.of(model).write(tmp_path)
     assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def test_the_command_writes_planes(model, tmp_path):
+    model.save(tmp_path / "model.npz")
+    text = said("render", tmp_path / "model.npz", "--planes", tmp_path / "planes")
+    assert "6 planes of 24x24 pixels" in text
+    assert PixelPlanes.read(tmp_path / "planes").images.shape == (24, 24, 6)
+
+
+def test_planes_are_no_picture(model, tmp_path):
+    model.save(tmp_path / "model.npz")
+    command = ("render", tmp_path / "model.npz", "--planes", tmp_path / "planes")
+    assert_refused(run(*command, "--scale", 2), "no other options")
+    assert_refused(run(*command[:2]), "--output")
