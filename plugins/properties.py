@@ -15,9 +15,7 @@ from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
-from eigengs_dr.relight.model import FORMAT as LIT
-from eigengs_dr.relight.model import Relightable
-from eigengs_dr.storage.npz import format_of
+from eigengs_dr.relight.model import Relightable, holds_lights
 
 from .parameters import (
     TextureParameters,
@@ -64,7 +62,7 @@ def source_of(props: mi.Properties) -> TextureParameters:
             f"{' and '.join(given) or 'none'}"
         )
     backend = backend_of(mi.variant())
-    if given[0] == "model" and format_of(_path(props, "model")) == LIT:
+    if given[0] == "model" and holds_lights(_path(props, "model")):
         model = Relightable.load(_path(props, "model"), backend)
         return light_source(model, np.array(props.get("light", UP), np.float32).ravel())
     if given[0] == "model":

@@ -6,6 +6,8 @@ from typing import Any
 
 import click
 
+import eigengs_dr as eg
+
 from ..backend.selection import select
 from . import options
 from .console import bar, exit_if_failed, for_each
@@ -15,6 +17,7 @@ from .outputs import check_outputs, lock_outputs, name_outputs
 @click.command()
 @click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
 @options.output("Picture to write, or a folder of PNG files.", "Y.png|FOLDER", False)
+@options.value("--light", "X,Y,Z", options.light, "Direction of the light of a model of lights.")
 @click.option(
     "--planes",
     type=options.path,
@@ -58,6 +61,9 @@ def render(
     --bits 32) hold linear light. A fit of data is written unchanged; one channel gives a grey
     picture. Large pictures are rendered in bands; a .tif file takes no more memory than a band.
 
+    A model of lights, which 'eigengs-dr train --lights' writes, takes --light: a vector towards
+    the light, x to the right, y up, z towards the camera.
+
     Of a folder, all sets in it are rendered. If one fails, the others still are, and the exit code
     is 2.
 
@@ -72,6 +78,7 @@ def render(
       eigengs-dr render bark.npz -o roughness.png --map roughness
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2
       eigengs-dr render fits/ -o pictures/ --size 512
+      eigengs-dr render coin.npz -o coin.png --light 0.3,0.2,0.9
       eigengs-dr render coin.npz --planes coin/
     """
     if planes is not None:
@@ -121,9 +128,18 @@ def _render(
     from ..gaussian.region import check_region
     from ..image.formats import TIFF_SUFFIXES
     from ..many.draw import save_region
+    from ..relight.model import holds_lights
 
     name, region, first = (choices[key] for key in ("name", "region", "first"))
-    data = read_map(file, name, "--map")
+    light = choices["light"]
+    if light is None and holds_lights(file):
+        raise ValueError(f"{file}: holds a model of lights; give --light, such as 0.3,0.2,0.9")
+    if light is not None and name is not None:
+        raise ValueError("--light and --map exclude each other; give one of them")
+    if light is not None:
+        data = eg.Relightable.load(file, run.backend).relight(light).data()
+    else:
+        data = read_map(file, name, "--map")
     count = len(data.arrays["mean"])
     if first is not None:
         if first > count:

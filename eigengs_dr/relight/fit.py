@@ -4,6 +4,9 @@ The pixels are samples with 3 n numbers each, those of n photos and 3 colours. T
 components give few planes: photo and colour j is about ``mean_j + sum_k V_jk (X V)_k``. Columns of
 V are orthonormal, so a squared error of a plane is a squared error of the photos, and the planes
 are fitted as the channels of one image.
+
+Photos count in sRGB codes. Of six sets of real photos, planes of codes show left-out lights 0.6 to
+5.6 dB closer in codes than planes of linear light (12 planes, every 8th of the lights left out).
 """
 
 from __future__ import annotations

@@ -7,6 +7,7 @@ As in `eigengs_dr.EigenGS`, a new member of the family is a product: the colours
 from __future__ import annotations
 
 import os
+import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,20 @@ import numpy as np
 from ..backend.arrays import types_of
 from ..backend.doors import class_of_doors, shows_progress
 from ..backend.types import ArrayLike, Doubles
-from ..gaussian.file import ARRAYS, SetData, check, file_errors
-from ..gaussian.gaussians import Gaussians
-from ..image.space import DATA, RGB
+from ..fitting.objective import Pixels
+from ..fitting.solve import solve
+from ..gaussian import packed
+from ..gaussian.file import ARRAYS, SetData, check, file_errors, read_set
+from ..gaussian.gaussians import Gaussians, with_colors
+from ..image.color import to_linear
+from ..image.io import read_floats
+from ..image.resize import resample
+from ..image.space import DATA, LINEAR, RGB
+from ..raster.render import render
 from ..storage import npz
-from ..storage.npz import Field
+from ..storage.npz import BadValue, Field
 from .fit import find_planes, fit_planes, read_photos
-from .lights import MAX_LIGHTS, LightTable, check_lights, check_table
+from .lights import KINDS, MAX_LIGHTS, LightTable, check_lights, check_table
 
 FORMAT, VERSION = "eigengs_dr.relightable", 1
 
@@ -127,17 +135,20 @@ class Relightable:
         return self.table.lights
 
     def relight(self, light: Any) -> Gaussians:
-        """Return the object under a light, as a set in the space "rgb".
+        """Return the object under a light, or under an environment, as a set.
 
         Parameters
         ----------
-        light : sequence of 3 numbers, or Dr.Jit vector of 3 floats
-            The direction of the light, of any length. The set is differentiable by the vector.
+        light : sequence of 3 numbers, Dr.Jit vector of 3 floats, image (h, w, 3) or path-like
+            The direction of the light, of any length. The set is differentiable by the vector. Or
+            an environment of light around the object, see `environment_lights`; then colours are
+            solved for the shapes, without a derivative.
 
         Returns
         -------
         Gaussians
-            On the means and shapes of the planes.
+            On the means and shapes of the planes; in the space "rgb", and for an environment in
+            "linear", or "radiance" if it is brighter than white.
 
         Raises
         ------
@@ -145,6 +156,9 @@ class Relightable:
             If numbers are no direction above the horizon. A vector of Dr.Jit is not checked: an
             optimiser may pass below the horizon for a step.
         """
+        is_path = isinstance(light, (str, os.PathLike))
+        if is_path or (not dr.is_array_v(light) and np.ndim(light) > 1):
+            return self._under(light)
         planes, types = self.planes, types_of(self.planes.mean)
         if dr.is_array_v(light):
             direction = [types.Float(v) for v in light]
@@ -164,6 +178,19 @@ class Relightable:
         color, background = shown(planes.color, False), shown(planes.background, True)
         return replace(planes, color=color, background=background, space=RGB)
 
+    def _under(self, environment: Any) -> Gaussians:
+        """Return the object under an environment: a sum of light over directions."""
+        lights, radiance = environment_lights(environment)
+        shown = render(self.planes).numpy().astype(np.float32)
+        total = np.zeros((*shown.shape[:2], 3), np.float32)
+        for factors, light in zip(self.table.at(lights).astype(np.float32), radiance, strict=True):
+            if light.any():
+                codes = shown @ factors[:, :-1].T + factors[:, -1]
+                total += to_linear(np.clip(codes, 0, 1)) * light.astype(np.float32)
+        space = LINEAR.above_white if total.max() > 1 else LINEAR
+        start = with_colors(self.planes, np.zeros((len(self.planes) + 1, 3)), space)
+        return solve(start, Pixels.plain(total, start, space.weight(total)))
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
         data, table = self.planes.data(), self.table
@@ -181,7 +208,7 @@ class Relightable:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> Relightable:
-        """Read a file that `save` wrote.
+        """Read a file that `save` or `eigengs_dr.pack` wrote.
 
         Raises
         ------
@@ -192,6 +219,8 @@ class Relightable:
             If the file cannot be opened.
         """
         with file_errors(Path(path)):
+            if packed.is_packed(path):
+                return cls(*_read_packed(Path(path), backend))
             members = npz.read(path, FORMAT, VERSION, LAYOUT)
             parts = {name: members[name] for name in ARRAYS}
             size = tuple(members["size"].tolist())
@@ -205,3 +234,83 @@ class Relightable:
             check_table(table, data.arrays["color"].shape[1])
             table = replace(table, lights=check_lights(table.lights))
             return cls(Gaussians.from_data(data, backend), table, float(members["psnr_held_out"]))
+
+
+def holds_lights(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file that this package wrote holds a model of lights."""
+    if packed.is_packed(path):
+        return bool(packed.read_lights(Path(path)))
+    return npz.format_of(path) == FORMAT
+
+
+ENVIRONMENT_SIZE = (32, 16)
+"""Width and height to which environments are averaged: 256 directions above the horizon."""
+
+
+def environment_lights(environment: Any) -> tuple[Doubles, Doubles]:
+    """Return directions (m, 3) above the horizon, and what each adds of its photo, (m, 3).
+
+    The photo under a light of irradiance pi counts as 1, so that a white diffuse surface is white
+    under an environment of 1: the sum is ``1 / pi integral L(l) photo(l) dl``.
+
+    Parameters
+    ----------
+    environment : array_like, shape (h, w, 3), or path-like
+        Latitudes and longitudes, as an ``envmap`` of Mitsuba: the first row is up (y), and the
+        middle column is behind the camera (z). Files of floats and arrays hold linear light.
+    """
+    is_file = isinstance(environment, (str, os.PathLike))
+    pixels, encoding = read_floats(environment, encoding=None if is_file else "linear")
+    light = to_linear(pixels) if encoding == "srgb" else pixels
+    width, height = ENVIRONMENT_SIZE
+    average = np.asarray(resample(light, width, height), np.float64)
+    polar = np.pi * (np.arange(height) + 0.5) / height
+    turn = 2 * np.pi * (np.arange(width) + 0.5) / width
+    ring, up = np.sin(polar)[:, None], np.cos(polar)[:, None]
+    directions = np.stack(np.broadcast_arrays(ring * np.sin(turn), up, -ring * np.cos(turn)), -1)
+    share = 2 * np.pi / (width * height) * ring[..., None]  # solid angles, over pi
+    above = directions[..., 2] > 0
+    return directions[above], (average * share)[above]
+
+
+# --- The table in a packed file ------------------------------------------------------------------
+
+_HEAD = struct.Struct("<BBHfd")
+"""Kind, planes, lights, smoothing, and the PSNR of left-out lights."""
+
+
+def table_bytes(model: Relightable) -> bytes:
+    """Return the table of a model for an ``.egs`` file: 16 bits a direction, 8 bits a factor.
+
+    Each plane has a scale. Rounding is 40 dB below the contrast of the photos.
+    """
+    table, planes = model.table, model.planes.channels
+    head = _HEAD.pack(
+        KINDS.index(table.kind), planes, len(table.lights), table.smoothing, model.psnr_held_out
+    )
+    scale = (np.abs(table.values).max(axis=(0, 1), initial=1e-6) / 127).astype("<f4")
+    lights = np.round(table.lights * 32767).astype("<i2")
+    values = np.round(table.values / scale).astype(np.int8)
+    return head + scale.tobytes() + lights.tobytes() + values.tobytes()
+
+
+def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable, float]:
+    """Read the parts of a model from an ``.egs`` file."""
+    content = packed.read_lights(path)
+    if not content:
+        raise BadValue("holds a set without a table of lights; read it by Gaussians.load")
+    data = read_set(path)
+    if len(content) < _HEAD.size:
+        raise BadValue("the table of lights is truncated; copy the file again")
+    kind, planes, count, smoothing, psnr = _HEAD.unpack_from(content)
+    sizes = [4 * (planes + 1), 6 * count, 3 * (planes + 1) * count]
+    if len(content) != _HEAD.size + sum(sizes) or planes != data.arrays["color"].shape[1]:
+        raise BadValue("the table of lights has another size; copy the file again")
+    ends = (_HEAD.size + np.cumsum(sizes)).tolist()
+    scale = np.frombuffer(content[_HEAD.size : ends[0]], "<f4").astype(np.float64)
+    lights = np.frombuffer(content[ends[0] : ends[1]], "<i2").reshape(count, 3) / 32767
+    rounded = np.frombuffer(content[ends[1] :], np.int8).reshape(count, 3, planes + 1)
+    name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
+    table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
+    table = replace(table, lights=check_lights(lights))
+    return Gaussians.from_data(data, backend), table, psnr

@@ -25,7 +25,7 @@ def test_new_lights_look_like_their_photos(model):
     new = directions(11, 0.45) @ np.diag([-1, 1, 1])
     psnrs = [eg.psnr(p, picture(model, d)) for p, d in zip(photos(new), new, strict=True)]
     assert np.mean(psnrs) > 35
-    assert model.psnr_held_out == pytest.approx(np.mean(psnrs), abs=6)
+    assert 25 < model.psnr_held_out < np.mean(psnrs) + 1  # some left-out lights are the outermost
 
 
 def test_a_model_is_small_and_says_what_it_is(model):
@@ -97,7 +97,7 @@ def test_a_damaged_file_is_refused(model, tmp_path, key, value, message):
 
 def test_a_set_is_not_read_as_a_model(model, tmp_path):
     model.planes.save(tmp_path / "set.npz")
-    with pytest.raises(ValueError, match="format is 'eigengs_dr.gaussians'"):
+    with pytest.raises(ValueError, match=r"format is 'eigengs_dr\.gaussians'"):
         eg.Relightable.load(tmp_path / "set.npz")
     model.save(tmp_path / "model.npz")
     assert npz.format_of(tmp_path / "model.npz") == "eigengs_dr.relightable"
@@ -135,3 +135,58 @@ def test_what_cannot_be_a_model_is_refused(tmp_path):
 def test_a_light_that_is_no_direction_is_refused(model, light):
     with pytest.raises(ValueError, match="light"):
         model.relight(light)
+
+
+def test_a_white_environment_is_the_integral_over_the_hemisphere(model):
+    """The sum over directions of photos in linear light, by the definition; and scales with it."""
+    from eigengs_dr.image.color import to_linear
+
+    lit = model.relight(np.full((8, 16, 3), 0.5, np.float32))
+    assert lit.space == "linear"
+    z = np.linspace(0.005, 0.995, 60)
+    turn = np.arange(60) * 2.399963
+    ring = np.sqrt(1 - z**2)
+    spread = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)  # equal solid angles
+    images = [np.clip(picture(model, light), 0, 1).astype(np.float64) for light in spread]
+    expected = np.mean([to_linear(image) for image in images], axis=0)  # 2 pi / pi * 0.5
+    assert np.abs(eg.render(lit).numpy() - expected).mean() < 0.02
+
+
+def test_an_environment_with_one_bright_side_lights_from_there(model):
+    """The first row of an environment is up, and columns left of the middle are at x > 0."""
+    sky = np.zeros((16, 32, 3), np.float32)
+    sky[8, 11:13] = 20
+    x = np.sin(2 * np.pi * 12 / 32)
+    lit = eg.picture_of(model.relight(sky)).mean(axis=2)
+    side = picture(model, [x, -0.1, 0.75]).mean(axis=2)
+    other = picture(model, [-x, -0.1, 0.75]).mean(axis=2)
+    alike = [np.corrcoef(lit.ravel(), image.ravel())[0, 1] for image in (side, other)]
+    assert alike[0] > 0.9 > alike[1]
+
+
+def test_a_packed_model_is_smaller_and_shows_nearly_the_same(model, tmp_path):
+    model.save(tmp_path / "model.npz")
+    result = eg.pack(model, tmp_path / "model.egs", max_psnr_drop=0.3)
+    assert result.bytes < 0.4 * (tmp_path / "model.npz").stat().st_size
+    assert 0 < result.psnr_drop <= 0.3
+    loaded = eg.Relightable.load(tmp_path / "model.egs")
+    assert loaded.psnr_held_out == model.psnr_held_out
+    light = [0.2, 0.3, 0.9]
+    allowed = model.psnr_held_out - 10 * np.log10(10**0.03 - 1)  # the error that 0.3 dB adds
+    assert eg.psnr(picture(loaded, light), picture(model, light)) > allowed - 4
+    planes = eg.Gaussians.load(tmp_path / "model.egs")
+    assert planes.channels == model.planes.channels
+
+
+def test_packed_files_that_are_no_models_are_refused(model, tmp_path):
+    path = tmp_path / "set.egs"
+    eg.pack(model.relight([0, 0, 1]), path)
+    with pytest.raises(ValueError, match="without a table of lights"):
+        eg.Relightable.load(path)
+    eg.pack(model, path)
+    content = path.read_bytes()
+    path.write_bytes(content[:200] + bytes([content[200] ^ 1]) + content[201:])
+    with pytest.raises(ValueError, match="damaged"):
+        eg.Relightable.load(path)
+    with pytest.raises(ValueError, match="takes no image"):
+        eg.pack(model, path, np.zeros((24, 24, 3)))
