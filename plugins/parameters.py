@@ -336,8 +336,9 @@ def _direction(light: Any) -> Any:
 
 def light_source(model: Relightable, light: NDArray[np.float32]) -> TextureParameters:
     """Return the direction of the light of a model as the source of a texture."""
-    tensors = {"light": dr.opaque(mi.Vector3f, mi.ScalarVector3f(*light.tolist()))}
-    return TextureParameters(model.relight(light), tensors, lit=model)
+    start, towards = model.relight(light), mi.Vector3f(*light.tolist())
+    dr.make_opaque(towards)  # another light compiles no other programs
+    return TextureParameters(start, {"light": towards}, lit=model)
 
 
 def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> TextureParameters:

@@ -62,7 +62,8 @@ def source_of(props: mi.Properties) -> TextureParameters:
             f"{' and '.join(given) or 'none'}"
         )
     backend = backend_of(mi.variant())
-    if given[0] == "model" and holds_lights(_path(props, "model")):
+    lit = given[0] == "model" and props.plugin_name() == "gaussian_texture"
+    if lit and holds_lights(_path(props, "model")):
         model = Relightable.load(_path(props, "model"), backend)
         return light_source(model, np.array(props.get("light", UP), np.float32).ravel())
     if given[0] == "model":
