@@ -5,7 +5,7 @@ the mean over the photos that were left out; and "exact", the PSNR without any r
 Gaussians before packing, with the bytes per pixel that are "held" in memory.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
@@ -25,9 +25,9 @@ from eigengs_bench import report as fr
 from eigengs_bench.rate import AVIF
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.relight.fit import find_planes, read_photos
-from eigengs_dr.relight.lights import read_lights
+from eigengs_dr.relight.lights import functions_at, read_lights
 
-Array = NDArray[np.floating]
+Array = NDArray[Any]
 
 OURS, RELIGHT = "Gaussians", "relight's defaults"
 PIXELS = (16, 8)  # pixels per Gaussian; the first is the default
@@ -81,11 +81,15 @@ def run(task: Task, names: Sequence[str] = ()) -> list[Row]:
 
 def _jobs(task: Task, folder: Path, name: str) -> Iterator[Job]:
     load = cache(partial(photos_of, folder))
+
+    def work(method: Callable[[Lit, Lit], Row]) -> Row:
+        return method(*load())
+
     for pixels in PIXELS:
         job = {"set": name, "method": OURS, "pixels": pixels, "iterations": task.iterations}
-        yield job, lambda pixels=pixels: gaussians(task, *load(), pixels)
-    for method in METHODS:
-        yield {"set": name, "method": method}, lambda method=method: METHODS[method](*load())
+        yield job, partial(work, partial(gaussians, task, pixels))
+    for title, method in METHODS.items():
+        yield {"set": name, "method": title}, partial(work, method)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -100,7 +104,7 @@ def seen_psnr(planes: Array, factors: Array, unseen: Lit) -> float:
     return float(np.mean([eg.psnr(np.clip(a, 0, 1), b, "rgb") for a, b in pairs]))
 
 
-def gaussians(task: Task, seen: Lit, unseen: Lit, pixels: int) -> Row:
+def gaussians(task: Task, pixels: int, seen: Lit, unseen: Lit) -> Row:
     """Fit a model, and pack it with several budgets."""
     height, width = unseen.photos.shape[1:3]
     options: Any = {"gaussians": height * width // pixels, "iterations": task.iterations}
@@ -124,31 +128,27 @@ def gaussians(task: Task, seen: Lit, unseen: Lit, pixels: int) -> Row:
     return {"points": points, "exact": psnr_of(model), **figures}
 
 
-def fixed(harmonics: bool, seen: Lit, unseen: Lit) -> Row:
-    """Regress each pixel on functions of the light: a polynomial (PTM) or harmonics (HSH)."""
+def polynomial(lights: Array) -> Array:
+    """Return the functions of a polynomial texture map (Malzbender et al. 2001), (n, 6)."""
+    x, y, _ = lights.T
+    return np.stack([x * x, y * y, x * y, x, y, np.ones_like(x)], 1)
 
-    def functions(lights: Array) -> Array:
-        x, y, z = lights.T
-        one, up = np.ones_like(x), np.clip(z, 0, 1)
-        if not harmonics:
-            return np.stack([x * x, y * y, x * y, x, y, one], 1)
-        turn, side, tilt = np.arctan2(y, x), np.sqrt(np.maximum(up - up * up, 0)), 2 * up - 1
-        first = [one, side * np.cos(turn), tilt, side * np.sin(turn)]
-        second = [f(2 * turn) * (up - up**2) for f in (np.cos, np.sin)]
-        third = [f(turn) * side * tilt for f in (np.cos, np.sin)]
-        return np.stack([*first, *second, *third, 6 * up**2 - 6 * up + 1], 1)
 
-    basis = functions(seen.lights)
+def harmonics(lights: Array) -> Array:
+    """Return nine hemispherical harmonics, (n, 9)."""
+    return functions_at("hsh", lights, lights)
+
+
+def fixed(functions: Callable[[Array], Array], seen: Lit, unseen: Lit) -> Row:
+    """Regress each pixel on functions of the light."""
+    basis, shape = functions(seen.lights), unseen.photos.shape[1:3]
     normal = basis.T @ basis + RIDGE * np.eye(basis.shape[1])
-    found = np.linalg.solve(
-        normal, np.tensordot(basis, seen.photos, (0, 0)).reshape(len(normal), -1)
-    )
-    height, width = unseen.photos.shape[1:3]
-    planes = found.reshape(-1, height, width, 3).transpose(1, 2, 0, 3).reshape(height, width, -1)
+    right = np.tensordot(basis, seen.photos, (0, 0)).reshape(len(normal), -1)
+    found = np.linalg.solve(normal, right).reshape(-1, *shape, 3)
+    planes = np.moveaxis(found, 0, 2).reshape(*shape, -1).astype(np.float32)
     values = functions(unseen.lights)  # a plane belongs to one colour
     factors = np.einsum("mb,cd->mcbd", values, np.eye(3)).reshape(len(values), 3, -1)
-    factors = np.concatenate([factors, np.zeros((len(values), 3, 1))], axis=2)
-    return _measured(planes.astype(np.float32), factors, unseen, 0)
+    return _measured(planes, np.pad(factors, ((0, 0), (0, 0), (0, 1))), unseen, 0)
 
 
 def defaults(seen: Lit, unseen: Lit) -> Row:
@@ -172,10 +172,10 @@ def components(kind: str, tuned: bool, seen: Lit, unseen: Lit) -> Row:
     return {"points": [point for row in rows for point in row["points"]]}
 
 
-METHODS = {
+METHODS: dict[str, Callable[[Lit, Lit], Row]] = {
     RELIGHT: defaults,
-    "PTM": partial(fixed, False),
-    "HSH": partial(fixed, True),
+    "PTM": partial(fixed, polynomial),
+    "HSH": partial(fixed, harmonics),
     "JPEG planes": partial(components, "JPEG", False),
     "JPEG planes, tuned": partial(components, "JPEG", True),
     "AVIF planes": partial(components, "AVIF", False),
@@ -219,22 +219,22 @@ def coded(planes: Array, kind: str, tuned: bool, quality: int) -> tuple[int, Arr
     low = (low + high - wide) / 2
     codes = np.round((planes - low) / wide * 255).clip(0, 255).astype(np.uint8)
     if tuned and kind == "AVIF":  # in one file, below each other
-        parts = [np.concatenate(list(np.moveaxis(codes, 2, 0)))]
+        size, found = _file(np.concatenate(list(np.moveaxis(codes, 2, 0))), kind, quality, CODEC)
+        found = np.moveaxis(found.reshape(-1, *codes.shape[:2]), 0, 2)
     else:
-        parts = [codes[..., k : k + 3] for k in range(0, codes.shape[2], 3)]
-    options: Any = {"quality": quality, **(CODEC if kind == "AVIF" else {"optimize": True})}
-    if kind == "JPEG":
-        options |= {"keep_rgb": True} if tuned else {"subsampling": 0}
-    size, decoded = 0, []
-    for part in parts:
-        file = BytesIO()
-        pillow.fromarray(np.ascontiguousarray(part)).save(file, kind, **options)
-        size += file.tell()
-        decoded.append(np.asarray(pillow.open(file).convert("L" if part.ndim == 2 else "RGB")))
-    found = np.concatenate(decoded, axis=2) if decoded[0].ndim == 3 else decoded[0]
-    if found.ndim == 2:
-        found = np.moveaxis(found.reshape(codes.shape[2], *codes.shape[:2]), 0, 2)
+        jpeg = {"optimize": True, **({"keep_rgb": True} if tuned else {"subsampling": 0})}
+        options = CODEC if kind == "AVIF" else jpeg
+        parts = (codes[..., k : k + 3] for k in range(0, codes.shape[2], 3))
+        sizes, pictures = zip(*(_file(p, kind, quality, options) for p in parts), strict=True)
+        size, found = sum(sizes), np.concatenate(pictures, axis=2)
     return size, (found.astype(np.float32) / 255 * wide + low).astype(np.float32)
+
+
+def _file(pixels: NDArray[np.uint8], kind: str, quality: int, options: Any) -> tuple[int, Any]:
+    """Encode a picture; return the bytes, and the pixels that they decode to."""
+    file, picture = BytesIO(), pillow.fromarray(np.ascontiguousarray(pixels))
+    picture.save(file, kind, quality=quality, **options)
+    return file.tell(), np.asarray(pillow.open(file).convert(picture.mode))
 
 
 # ---------------------------------------------------------------------------------------------
@@ -277,16 +277,16 @@ def comparison(points: pd.DataFrame, exact: pd.DataFrame) -> dict[str, float]:
     """Compare the methods on one set, see `summarize`."""
     by_method = dict(iter(points.groupby("method")))
     ours = by_method[OURS]
-    [[_, usual]] = ours[(ours.pixels == USUAL[0]) & (ours.setting == USUAL[1])].iterrows()
+    usual = ours[(ours.pixels == USUAL[0]) & (ours.setting == USUAL[1])].iloc[0]
     found = {"ours": usual.psnr_rgb, "bytes": usual.bytes_per_pixel}
-    [[_, theirs]] = by_method[RELIGHT].iterrows()
+    theirs = by_method[RELIGHT].iloc[0]
     size, gap = at_level(ours, theirs.psnr_rgb)
     found |= {RELIGHT: size / theirs.bytes_per_pixel, "gap": gap}
     for method in CODED:  # a curve that ends below ours is compared at its end
         found[method] = usual.bytes_per_pixel / at_level(by_method[method], usual.psnr_rgb)[0]
     named = exact.set_index("method").exact
     found["better"] = max(named[RELIGHT], named["HSH"])
-    [[_, fit]] = exact[exact.pixels == USUAL[0]].iterrows()
+    fit = exact[exact.pixels == USUAL[0]].iloc[0]
     return found | {"exact": fit.exact - found["better"], "held": fit.held}
 
 

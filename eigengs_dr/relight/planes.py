@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from ..backend.types import ArrayLike, Doubles, Singles
+from ..backend.types import ArrayLike, Doubles, Record, Singles
 from ..raster.render import picture_of
 from ..storage.atomic import atomic_folder
 from .lights import check_lights
@@ -140,7 +140,7 @@ class PixelPlanes(NamedTuple):
             raise ValueError(f"{path}: is no bilinear basis of planes; {what}") from None
 
 
-def _checked(info: dict[str, object], folder: Path) -> tuple[Singles, Doubles]:
+def _checked(info: Record, folder: Path) -> tuple[Singles, Doubles]:
     """Return the planes and the grid of a folder."""
 
     def integer(name: str, largest: int) -> int:
@@ -162,7 +162,7 @@ def _checked(info: dict[str, object], folder: Path) -> tuple[Singles, Doubles]:
     count, side = integer("nplanes", MAX_PLANES), integer("resolution", MAX_RESOLUTION)
     if count % 3 or width * height > MAX_PIXELS:
         raise ValueError(f"it has {count} planes of {width}x{height}; expected a multiple of 3")
-    [material] = info["materials"]  # type: ignore[misc, attr-defined]
+    [material] = info["materials"]
     ranges, scale, bias = (numbers(material[k], k, count) for k in ("range", "scale", "bias"))
     if not (ranges > 0).all():
         raise ValueError("range must be above 0")

@@ -527,6 +527,8 @@ LATER = directions(5, 0.5) @ np.diag([-1, 1, 1])
 def test_relight(lit, tmp_path, backend, monkeypatch):
     monkeypatch.setattr(relight, "PLANES", (6,))
     monkeypatch.setattr(relight, "QUALITIES", (30, 90))
+    monkeypatch.setattr(relight, "PIXELS", (16,))
+    monkeypatch.setattr(relight, "BUDGETS", (0.5,))
     rows, text = answered(tmp_path / "out", "relight", lit, "--iterations", 5, "--backend", backend)
     assert {row["job"]["set"] for row in rows} == {"a", "b"}
     assert {row["job"]["method"] for row in rows} == {relight.OURS, *relight.METHODS}
