@@ -133,7 +133,8 @@ def pack(
     model = gaussians if isinstance(gaussians, Relightable) else None
     if model is not None and image is not None:
         raise ValueError("pack: a model of lights takes no image; leave it out")
-    source: Gaussians = dr.detach(set_of(gaussians) if model is None else model.planes)
+    planes = gaussians.planes if isinstance(gaussians, Relightable) else set_of(gaussians)
+    source: Gaussians = dr.detach(planes)
     rows = _section_rows(len(source), sections)
     if source.maps and len(rows) > 1:
         raise ValueError("pack: a set with maps has one section; leave out the sections")
