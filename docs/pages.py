@@ -5,12 +5,18 @@
 
 import inspect
 import re
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+
+import numpy as np
 
 import eigengs_dr as eg
 from eigengs_bench.pages import filled
 from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
+from eigengs_dr.image.space import DATA
+from eigengs_dr.relight.lights import LightTable
 
 FOLDER = Path(__file__).parent.parent / "build" / "docs" / "extra"
 """Sphinx copies what is in it beside the manual."""
@@ -65,6 +71,12 @@ def plugin_parameters(plugin: str) -> str:
     gaussians = eg.Gaussians.from_arrays([[4, 4]], [[1, 0, 1]], [[1]], size=(8, 8), space="linear")
     model = {"type": plugin, "model": str(SHIPPED["natural"])}
     flags = _flags(mi, plugin_of(plugin, gaussians)) | _flags(mi, model)
+    if plugin == "gaussian_texture":
+        with TemporaryDirectory() as folder:
+            lit = {"type": plugin, "model": f"{folder}/model.npz"}
+            table = LightTable(np.eye(3), np.ones((3, 3, 2)), "hsh", 0.1)
+            eg.Relightable(replace(gaussians, space=DATA), table).save(lit["model"])
+            flags |= _flags(mi, lit)
     lines = ["| parameter | type | description | default | flags |", "|---|---|---|---|---|"]
     for names, kind, text in ENTRY.findall(str(inspect.getdoc(PLUGINS[plugin][1]())) + "\n"):
         kind, _, default = kind.partition(", default: ")

@@ -49,7 +49,14 @@ def _packed_maps(path: Path) -> tuple[TextureMap, ...]:
     return read_egs_maps(path)
 
 
+def _packed_lights(path: Path) -> bytes:
+    from .codec.egs import read_egs_lights
+
+    return read_egs_lights(path)
+
+
 messages.make_html = _make_html
 packed.read_set, packed.read_maps = _read_packed, _packed_maps
+packed.read_lights = _packed_lights
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -38,6 +38,7 @@ from .plugins import register_plugins as register_plugins
 from .raster.render import picture_of as picture_of
 from .raster.render import render as render
 from .raster.render import tile_lists as tile_lists
+from .relight.model import Relightable as Relightable
 from .scene.convert import convert_scene as convert_scene
 from .scene.fit_scene import fit_for_scene as fit_for_scene
 from .version import __version__ as __version__
@@ -61,6 +62,7 @@ __all__ = [
     "Loss",
     "Map",
     "Method",
+    "Relightable",
     "concatenate",
     "convert_scene",
     "exclusive",

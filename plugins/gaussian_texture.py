@@ -40,9 +40,12 @@ def gaussian_texture() -> type:
         first : integer, default: all
             With `filename`: use this many Gaussians, from the first; for sets fitted in levels.
         model : string
-            Instead of `filename`: a model, as ``eigengs-dr train`` writes it.
+            Instead of `filename`: an `EigenGS` or a `Relightable`, as ``eigengs-dr train`` writes.
         coefficients : tensor (C, k), default: 0
-            With `model`: one row per channel; 0 is the mean image.
+            With the `model` of a family: one row per channel; 0 is the mean image.
+        light : vector, default: (0, 0, 1)
+            With a relightable `model`: the direction towards the light, of any length, with x along
+            u, y against v and z towards the camera. Differentiable.
         mean : tensor (N, 2)
             Instead of `filename`: x, y in pixels.
         factor : tensor (N, 3)

@@ -30,6 +30,7 @@ from eigengs_dr.gaussian.gaussians import (
 )
 from eigengs_dr.raster.parameters import KernelParameters
 from eigengs_dr.raster.render import decode_parameters
+from eigengs_dr.relight.model import Relightable
 
 Arrays = Record
 
@@ -246,18 +247,21 @@ class TextureParameters:
 
     They are mean (N, 2), factor (N, 3), color (N, C) and background (C,) of a set, in native pixels
     and the space of the set; or coefficients (C, k) of an `eigengs_dr.EigenGS` model, with
-    ``colors = mean colors + coefficients x weights`` for every channel.
+    ``colors = mean colors + coefficients x weights`` for every channel; or the direction "light" of
+    an `eigengs_dr.Relightable` model.
 
     Attributes
     ----------
     start : Gaussians
         The set of a model at its mean, or a set like that of the texture, from `without_arrays`.
     read : dict of str to TensorXf
-        The parameters at the start.
+        The parameters at the start; a light is a Vector3f.
     tensors : dict of str to TensorXf
         The parameters, which `mitsuba.traverse` shows.
     weights : list of TensorXf, shape (N + 1, k)
         Those of a model, one for each channel.
+    lit : Relightable or None
+        The model of a light.
     file : SharedFile or None
     part : slice
         The channels of the texture among those of the file.
@@ -266,6 +270,7 @@ class TextureParameters:
     start: Gaussians
     read: Arrays
     weights: Sequence[Tensor] = ()
+    lit: Relightable | None = None
     file: SharedFile | None = None
     part: slice = field(default_factory=lambda: slice(None))
 
@@ -298,6 +303,8 @@ class TextureParameters:
         try:
             if self.weights:
                 return self._reconstruct(inputs["coefficients"])
+            if self.lit:
+                return self.lit.relight(_direction(inputs["light"]))
             return from_tensors(inputs, self.start)
         except ValueError as error:
             raise ValueError(f"parameters of Gaussians: {error}") from error
@@ -319,6 +326,19 @@ class TextureParameters:
             last = dr.gather(types.Float, change, types.UInt(count))
             background.append(start.background[channel] + last)
         return replace(start, color=types.FloatX(colors), background=types.FloatX(background))
+
+
+def _direction(light: Any) -> Any:
+    """Return a light that an optimiser may have spoilt, or the light of the camera."""
+    length = dr.squared_norm(light)
+    return dr.select(dr.isfinite(length) & (length > 0), light, type(light)(0, 0, 1))
+
+
+def light_source(model: Relightable, light: NDArray[np.float32]) -> TextureParameters:
+    """Return the direction of the light of a model as the source of a texture."""
+    start, towards = model.relight(light), mi.Vector3f(*light.tolist())
+    dr.make_opaque(towards)  # another light compiles no other programs
+    return TextureParameters(start, {"light": towards}, lit=model)
 
 
 def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> TextureParameters:

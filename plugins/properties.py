@@ -15,8 +15,18 @@ from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
+from eigengs_dr.relight.model import Relightable, holds_lights
 
-from .parameters import TextureParameters, model_source, shared_file, without_arrays
+from .parameters import (
+    TextureParameters,
+    light_source,
+    model_source,
+    shared_file,
+    without_arrays,
+)
+
+UP = (0.0, 0.0, 1.0)
+"""Default light of a relightable model: from the camera."""
 
 WRAPS = ("repeat", "mirror", "clamp")
 """Names of the ways to continue an image outside of its borders."""
@@ -47,10 +57,15 @@ def source_of(props: mi.Properties) -> TextureParameters:
     given = [key for key in ("filename", "model", "mean") if key in props]
     if len(given) != 1:
         raise ValueError(
-            f"{props.plugin_name()}: give one of filename (a saved set), model (a saved EigenGS) "
-            f"or mean, factor, color, ... (see texture_of); got {' and '.join(given) or 'none'}"
+            f"{props.plugin_name()}: give one of filename (a saved set), model (a saved EigenGS or "
+            "Relightable) or mean, factor, color, ... (see texture_of); got "
+            f"{' and '.join(given) or 'none'}"
         )
     backend = backend_of(mi.variant())
+    lit = given[0] == "model" and props.plugin_name() == "gaussian_texture"
+    if lit and holds_lights(_path(props, "model")):
+        model = Relightable.load(_path(props, "model"), backend)
+        return light_source(model, np.array(props.get("light", UP), np.float32).ravel())
     if given[0] == "model":
         coefficients = props.get("coefficients", None)
         if coefficients is not None:

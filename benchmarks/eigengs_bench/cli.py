@@ -241,6 +241,18 @@ def peers() -> None:
     """
 
 
+@question("relight")
+@click.argument("data", type=options.folder, metavar="DATA")
+@click.option("--set", "names", multiple=True, help="Folder in DATA, by default all.")
+@number("--iterations", "Steps of every fit.", 300, 1)
+def relight() -> None:
+    """Compare planes of shared Gaussians with planes of pixels, under lights that were left out.
+
+    DATA holds folders of photos with their lights, an .lp file. A folder Dome has others in Test.
+    Without it every fifth photo is left out. A set of 50 photos takes a minute.
+    """
+
+
 @question("scaling")
 @several("--part", "parts", PARTS, "What to vary", PARTS)
 @number("--max-side", "Largest side of an image in pixels, up to 8192.", 4096, 1)

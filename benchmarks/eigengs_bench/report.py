@@ -38,6 +38,7 @@ QUESTIONS = {
     "scaling": "What size costs",
     "kernels": "How fast the renderer is",
     "texture": "How fast a texture is in Mitsuba",
+    "relight": "Photos under many lights",
     "inverse": "What recovers a texture from photos",
 }
 

@@ -51,6 +51,8 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     With --texture, texture_bytes is the memory of a gaussian_texture of the file for lookups at
     points, and prefilter_bytes its memory with a prefilter.
 
+    For a model of lights, the command shows the number of planes, and the PSNR of left-out lights.
+
     The preview shows the rendered image or, for a model, the mean image, some components and the
     outlines of the Gaussians.
 
@@ -84,17 +86,23 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
 def _facts_of(file: Path, picture: Path | None, texture: bool) -> Record:
     """Return what a file holds, and draw it."""
     from ..eigenbasis.files import MODEL_FORMAT
+    from ..relight.model import FORMAT, holds_lights
 
     packed = is_packed(file)
     file_format = set_file.FORMAT if packed else npz.format_of(file)
     kinds = {set_file.FORMAT: "image", set_file.MATERIAL: "material", MODEL_FORMAT: "model"}
+    kinds[FORMAT] = "lights"
     if file_format not in kinds:
         expected = ", ".join(kinds)
         raise ValueError(f"{file}: format is {file_format[:40]!r}, expected one of {expected}")
     kind = "material" if packed and set_file.maps_of(file) else kinds[file_format]
+    if packed and holds_lights(file):
+        kind = "lights"
     facts: Record = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
     if kind == "model":
         facts |= _describe_model(eg.EigenGS.load(file))
+    elif kind == "lights":
+        facts |= _describe_lights(eg.Relightable.load(file))
     elif packed:
         facts |= _describe_packed(file)
     else:
@@ -157,6 +165,13 @@ def _describe_model(model: eg.EigenGS) -> Record:
     return facts
 
 
+def _describe_lights(model: eg.Relightable) -> Record:
+    facts = _describe_set(model.planes.data()) | {"planes": model.planes.channels}
+    facts |= {"lights": len(model.lights), "table": model.table.kind}
+    known = isfinite(model.psnr_held_out)
+    return facts | ({"psnr_held_out": round(model.psnr_held_out, 2)} if known else {})
+
+
 def _truncation(model: eg.EigenGS) -> list[Record]:
     """Return the truncation curve at 0, 1, 2, 5, 10, ... and all components."""
     curve = model.truncation_curve()
@@ -215,6 +230,8 @@ def _draw(file: Path, kind: str, picture: Path) -> None:
     pixels: Any
     if kind == "model":
         pixels = component_sheet(eg.EigenGS.load(file))
+    elif kind == "lights":
+        pixels = eg.picture_of(eg.Relightable.load(file).relight((0, 0, 1)))
     else:
         pixels = eg.picture_of(eg.Gaussians.load(file))
     if kind == "material":

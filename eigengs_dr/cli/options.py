@@ -104,6 +104,15 @@ def region(text: str) -> tuple[int, ...]:
     return _numbers(text, r"\d+,\d+,0*[1-9]\d*,0*[1-9]\d*", expected)
 
 
+def light(text: str) -> tuple[float, ...]:
+    """Parse the direction of a light, such as "0.3,0.2,0.9"."""
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{text}: expected x,y,z, such as 0.3,0.2,0.9") from None
+    return x, y, z
+
+
 def counts(text: str) -> int | tuple[int, ...]:
     """Parse one number for all channels, or one for each of three."""
     expected = "a number above 0, or three such as 230,60,60"

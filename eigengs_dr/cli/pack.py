@@ -46,6 +46,8 @@ def pack(
     entropy-codes them. Every command that reads the .npz file of an image reads .egs files too.
     Without --image, the command assumes that the fit has 40 dB. A material takes --map instead.
 
+    A model of lights takes none: its loss refers to the PSNR of left-out lights.
+
     Of a folder, all .npz files in it are packed. If one fails, the others still are, and the exit
     code is 2.
 
@@ -86,6 +88,10 @@ def _pack(
     levels: int | tuple[int, ...] | None,
 ) -> Record:
     """Pack one set into a file, and return its figures."""
+    from ..relight.model import holds_lights
+
+    if holds_lights(file):
+        return _pack_lights(file, target, run, bool(image or maps or levels), drop)
     gaussians = eg.Gaussians.load(file, run.backend)
     if maps and not gaussians.maps:
         raise ValueError(f"{file}: holds one image and no maps; give --image instead of --map")
@@ -108,5 +114,21 @@ def _pack(
         f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes",
         f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel",
         f"  lost {packed.psnr_drop:.2f} dB; {name} against {against}: {values}",
+    )
+    return figures
+
+
+def _pack_lights(file: Path, target: Path, run: options.Run, given: bool, drop: float) -> Record:
+    """Pack a model of lights into a file, and return its figures."""
+    if given:
+        raise ValueError(f"{file}: a model of lights takes no --image, --map and --levels")
+    model = eg.Relightable.load(file, run.backend)
+    packed, before = eg.pack(model, target, max_psnr_drop=drop), file.stat().st_size
+    figures: Record = {"input": file, "output": target, "bytes_before": before, **packed._asdict()}
+    figures |= {"gaussians": len(packed.gaussians), "steps": packed.steps._asdict()}
+    run.tell(
+        f"{file}: {len(model.planes):,} Gaussians, {before:,} bytes",
+        f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel",
+        f"  lost {packed.psnr_drop:.2f} dB of left-out lights",
     )
     return figures

@@ -6,6 +6,8 @@ from typing import Any
 
 import click
 
+import eigengs_dr as eg
+
 from ..backend.selection import select
 from . import options
 from .console import bar, exit_if_failed, for_each
@@ -14,7 +16,14 @@ from .outputs import check_outputs, lock_outputs, name_outputs
 
 @click.command()
 @click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
-@options.output("Picture to write, or a folder of PNG files.", "Y.png|FOLDER")
+@options.output("Picture to write, or a folder of PNG files.", "Y.png|FOLDER", False)
+@options.value("--light", "X,Y,Z", options.light, "Direction of the light of a model of lights.")
+@click.option(
+    "--planes",
+    type=options.path,
+    metavar="FOLDER",
+    help="Of a model of lights: write its planes for relight and OpenLIME, instead of a picture.",
+)
 @click.option("--map", "name", metavar="NAME", help="The map of a material to render.")
 @options.value(
     "--region", "X,Y,W,H", options.region, "Region of the image: left, top, width, height."
@@ -37,7 +46,8 @@ from .outputs import check_outputs, lock_outputs, name_outputs
 def render(
     run: options.Run,
     file: Path,
-    output: Path,
+    output: Path | None,
+    planes: Path | None,
     scale: float | None,
     size: tuple[int, int | None] | None,
     bits: str | None,
@@ -50,6 +60,9 @@ def render(
     Files of 8 and 16 bits hold clamped sRGB; files of floats (.exr, .hdr, .pfm, and .tif with
     --bits 32) hold linear light. A fit of data is written unchanged; one channel gives a grey
     picture. Large pictures are rendered in bands; a .tif file takes no more memory than a band.
+
+    A model of lights, which 'eigengs-dr train --lights' writes, takes --light: a vector towards
+    the light, x to the right, y up, z towards the camera.
 
     Of a folder, all sets in it are rendered. If one fails, the others still are, and the exit code
     is 2.
@@ -65,7 +78,15 @@ def render(
       eigengs-dr render bark.npz -o roughness.png --map roughness
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2
       eigengs-dr render fits/ -o pictures/ --size 512
+      eigengs-dr render coin.npz -o coin.png --light 0.3,0.2,0.9
+      eigengs-dr render coin.npz --planes coin/
     """
+    if planes is not None:
+        if output or scale or size or bits or any(choices.values()):
+            raise click.UsageError("--planes takes no other options but --backend and --quiet")
+        return _write_planes(run, file, planes)
+    if output is None:
+        raise click.UsageError("Missing option '-o' / '--output'.")
     if scale is not None and size is not None:
         raise click.UsageError("--scale and --size exclude each other; give one of them")
     from ..image.io import SUFFIXES, bits_of
@@ -78,6 +99,18 @@ def render(
     select(run.backend)
     work = partial(_render, run=run, depth=depth, scale=scale, size=size, **choices)
     exit_if_failed(for_each(in_folder, work, files, outputs))
+
+
+def _write_planes(run: options.Run, file: Path, folder: Path) -> None:
+    """Write the planes of a model of lights to a folder."""
+    from ..relight.model import Relightable
+    from ..relight.planes import PixelPlanes
+
+    select(run.backend)
+    planes = PixelPlanes.of(Relightable.load(file, run.backend))
+    planes.write(folder)
+    height, width, count = planes.images.shape
+    run.tell(f"{file}: wrote {count} planes of {width}x{height} pixels to {folder}")
 
 
 def _render(
@@ -95,9 +128,18 @@ def _render(
     from ..gaussian.region import check_region
     from ..image.formats import TIFF_SUFFIXES
     from ..many.draw import save_region
+    from ..relight.model import holds_lights
 
     name, region, first = (choices[key] for key in ("name", "region", "first"))
-    data = read_map(file, name, "--map")
+    light = choices["light"]
+    if light is None and holds_lights(file):
+        raise ValueError(f"{file}: holds a model of lights; give --light, such as 0.3,0.2,0.9")
+    if light is not None and name is not None:
+        raise ValueError("--light and --map exclude each other; give one of them")
+    if light is not None:
+        data = eg.Relightable.load(file, run.backend).relight(light).data()
+    else:
+        data = read_map(file, name, "--map")
     count = len(data.arrays["mean"])
     if first is not None:
         if first > count:

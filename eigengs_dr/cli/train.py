@@ -1,5 +1,6 @@
 """The command ``eigengs-dr train``: train an EigenGS model on a folder of images."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +43,17 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
 @options.choice("--space", ["ycbcr", "rgb"], "Colour space of the components.")
 @options.number("--seed", "Seed of the random numbers.", 0, minimum=0)
 @options.value("--preview", "FILE", options.path, "Picture of the components.")
+@options.value(
+    "--lights", "DIRS.lp", options.EXISTING, "The photos show one object under these lights."
+)
 @options.shared("cluster", "backend", "report", "quiet")
 def train(
-    run: options.Run, folder: Path | str, output: Path, preview: Path | None, **choices: Any
+    run: options.Run,
+    folder: Path | str,
+    output: Path,
+    preview: Path | None,
+    lights: Path | None,
+    **choices: Any,
 ) -> None:
     """Train a model on the images in a folder, or at its URL.
 
@@ -55,6 +64,11 @@ def train(
     --cluster, the processes of a Dask cluster compute components and weights; they all need access
     to FOLDER and MODEL.npz.
 
+    With --lights, the folder holds photos of one object from one camera. The list names each photo,
+    and the direction of its light. The model renders the object under any light; --components is
+    then the number of planes, by default as many as left-out lights need. 'eigengs-dr render' takes
+    the model with --light.
+
     \b
     Examples:
       eigengs-dr train photos/ -o photos.npz --preview photos.png
@@ -62,7 +76,10 @@ def train(
       eigengs-dr train photos/ -o photos.npz --target-psnr 24
       eigengs-dr train /shared/faces/ -o /shared/faces.npz --cluster tcp://node1:8786
       eigengs-dr fit photo.jpg --basis photos.npz
+      eigengs-dr train coin/ -o coin.npz --lights coin/dirs.lp
     """
+    if lights is not None:
+        return _train_on_lights(run, folder, output, lights, preview, choices)
     from ..backend.interrupts import Interrupted
     from ..eigenbasis.components import TrainOptions
     from ..eigenbasis.training import train_model
@@ -110,5 +127,65 @@ def train(
         f"{figures['gaussians']} Gaussians in {figures['seconds']:.1f} s; "
         f"{split}",
         f"  {measured}",
+        f"  wrote {output}" + (f" and {picture}" if picture else ""),
+    )
+
+
+FOR_FAMILIES = ("size", "energy", "target_psnr", "frequency_aware", "preset", "space", "cluster")
+"""Options that photos under known lights do not take."""
+
+
+def _train_on_lights(
+    run: options.Run,
+    folder: Path | str,
+    output: Path,
+    lights: Path,
+    preview: Path | None,
+    choices: Record,
+) -> None:
+    """Fit a model to photos of one object under known lights, and write it."""
+    import eigengs_dr as eg
+
+    from ..relight.lights import read_lights
+
+    for name in FOR_FAMILIES:
+        if run.context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE:
+            option = name.replace("_", "-")
+            raise click.UsageError(f"--{option} and --lights exclude each other; give one of them")
+    planes = None
+    if run.context.get_parameter_source("components") == click.core.ParameterSource.COMMANDLINE:
+        planes = choices["components"]
+        if not isinstance(planes, int):
+            raise click.UsageError("--components is one number with --lights: that of planes")
+    [output] = name_outputs([folder], output, [".npz"])
+    [picture] = name_pictures([folder], preview)
+    photos = [Path(folder) / name for name in read_lights(lights)[0]]
+    check_outputs([output, picture, run.report], [lights, *photos])
+    select(run.backend)
+    steps = choices["iterations"]
+    started = time.perf_counter()
+    with bar(run.quiet) as show:
+        model = eg.Relightable.fit(
+            folder,
+            lights,
+            gaussians=choices["gaussians"],
+            planes=planes,
+            seed=choices["seed"],
+            backend=run.backend,
+            progress=lambda done, total, row: show("planes", done, total),
+            **({} if steps is None else {"iterations": steps}),
+        )
+    model.save(output)
+    if picture:
+        eg.save_image(picture, eg.picture_of(model.relight((0, 0, 1))))
+    seconds, planes = time.perf_counter() - started, model.planes.channels
+    figures: Record = {"gaussians": len(model.planes), "planes": planes}
+    figures |= {"lights": len(model.lights), "table": model.table.kind, "seconds": seconds}
+    figures["psnr_held_out"] = model.psnr_held_out
+    run.write_report(figures | {"input": folder, "output": output})
+    run.tell(
+        f"{folder}: {len(model.lights)} photos, {planes} planes, {len(model.planes):,} Gaussians "
+        f"in {seconds:.1f} s",
+        f"  left-out lights: psnr_rgb {model.psnr_held_out:.2f} dB, before planes are Gaussians",
         f"  wrote {output}" + (f" and {picture}" if picture else ""),
     )

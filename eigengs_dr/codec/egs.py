@@ -36,11 +36,14 @@ from .range_coder import EVENNESS, MAX_LEVELS, Decoder, Encoder, code_cells, hil
 
 SUFFIX = ".egs"
 
-VERSION, MAPS_VERSION = 5, 6
-"""Versions of the format, for a set without maps and with a table of maps. Earlier versions were
-never released, and are not read."""
+VERSION, MAPS_VERSION, LIGHTS_VERSION = 5, 6, 7
+"""Versions of the format: for a set without maps, with a table of maps, and with a table of lights.
+Earlier versions were never released, and are not read."""
 
 MAX_SECTIONS = 1 << 12
+
+MAX_LIGHTS_BYTES = 1 << 22
+"""Largest size of a table of lights."""
 
 _HEADER = struct.Struct("<4sBBBBHIIiiffdf")
 """Magic, version, space, channels, levels of the square of cells, sections, width, height, column
@@ -79,6 +82,8 @@ class EgsContent(NamedTuple):
         an image.
     psnr : float
         PSNR against the image in dB, see `eigengs_dr.codec.packing.PackResult`; NaN if unknown.
+    lights : bytes
+        The table of lights of planes, see `eigengs_dr.relight.model.table_bytes`; else empty.
     """
 
     sections: list[Symbols]
@@ -89,6 +94,7 @@ class EgsContent(NamedTuple):
     cutoff: float = CUTOFF
     maps: tuple[TextureMap, ...] = ()
     psnr: float = float("nan")
+    lights: bytes = b""
 
     def set_data(self) -> SetData:
         """Return the set, in single precision."""
@@ -111,7 +117,7 @@ def egs_bytes(packed: EgsContent) -> bytes:
     levels = int((cells - corner).max()).bit_length()
     head = _HEADER.pack(
         MAGIC,
-        MAPS_VERSION if packed.maps else VERSION,
+        MAPS_VERSION if packed.maps else LIGHTS_VERSION if packed.lights else VERSION,
         SPACES.index(packed.space),
         len(packed.background),
         levels,
@@ -123,6 +129,8 @@ def egs_bytes(packed: EgsContent) -> bytes:
         packed.psnr,
     )
     head += packed.background.astype("<f4").tobytes() + _map_table(packed.maps)
+    if packed.lights:
+        head += len(packed.lights).to_bytes(4, "little") + packed.lights
     parts = [head, zlib.crc32(head).to_bytes(4, "little")]
     parts += [section_to_bytes(part, packed.steps, corner, levels) for part in packed.sections]
     return b"".join(parts)
@@ -251,6 +259,12 @@ def read_egs_maps(path: str | os.PathLike[str]) -> tuple[TextureMap, ...]:
         return _read_header(file)[3].maps
 
 
+def read_egs_lights(path: str | os.PathLike[str]) -> bytes:
+    """Return the table of lights of packed planes, empty for other sets; errors as `read_egs`."""
+    with _opened(path) as file:
+        return _read_header(file)[3].lights
+
+
 def section_counts(path: str | os.PathLike[str]) -> list[int]:
     """Return the number of Gaussians per section, undecoded; errors as for `read_egs`."""
     with _opened(path) as file:
@@ -277,14 +291,16 @@ def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
     magic, version, space, channels, levels, count, *rest = _HEADER.unpack(head)
     if magic != MAGIC:
         raise BadValue("not a packed set of Gaussians; it may be damaged or of another kind")
-    if version not in (VERSION, MAPS_VERSION):
+    if version not in (VERSION, MAPS_VERSION, LIGHTS_VERSION):
         raise BadValue(
-            f"version is {version}, but this package reads versions {VERSION} and {MAPS_VERSION}; "
+            f"version is {version}, but this package reads versions {VERSION} to {LIGHTS_VERSION}; "
             + ("upgrade eigengs-dr" if version > VERSION else "pack the set again")
         )
     width, height, x, y, color, cell, cutoff, psnr = rest
     background = exactly(file, 4 * channels)
     table, maps = _read_maps(file) if version == MAPS_VERSION else (b"", ())
+    if version == LIGHTS_VERSION:
+        table = _read_lights(file)
     if exactly(file, 4) != zlib.crc32(head + background + table).to_bytes(4, "little"):
         raise BadValue("the header is damaged; copy the file again")
     if version == MAPS_VERSION:
@@ -300,7 +316,18 @@ def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
         raise BadValue(f"the steps are {tuple(steps)}, expected numbers above 0")
     values = np.frombuffer(background, "<f4")
     content = EgsContent([], steps, values, (width, height), SPACES[space], cutoff, maps, psnr)
+    if version == LIGHTS_VERSION:
+        content = content._replace(lights=table[4:])
     return levels, count, np.array([x, y]), content
+
+
+def _read_lights(file: BinaryIO) -> bytes:
+    """Read a table of lights, with its length before it."""
+    head = exactly(file, 4)
+    length = int.from_bytes(head, "little")
+    if not 1 <= length <= MAX_LIGHTS_BYTES:
+        raise BadValue(f"the header claims {length} bytes of lights; copy the file again")
+    return head + exactly(file, length)
 
 
 def _read_maps(file: BinaryIO) -> tuple[bytes, tuple[TextureMap, ...]]:

@@ -24,6 +24,7 @@ from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
 from ..image.pixels import check_encoding
 from ..raster.render import picture_of
+from ..relight.model import Relightable, table_bytes
 from ..storage.atomic import require_writable
 from .egs import MAX_SECTIONS, SUFFIX, write_egs
 from .quantization import Steps
@@ -70,7 +71,7 @@ class PackResult(NamedTuple):
 @door
 @np.errstate(under="ignore")  # small weights become 0, whatever the caller does about that
 def pack(
-    gaussians: Gaussians | Fit,
+    gaussians: Gaussians | Fit | Relightable,
     output: str | os.PathLike[str],
     image: ArrayLike | Mapping[str, ArrayLike] | None = None,
     max_psnr_drop: float = BUDGET,
@@ -81,9 +82,11 @@ def pack(
 
     Parameters
     ----------
-    gaussians : Gaussians or Fit
+    gaussians : Gaussians, Fit or Relightable
+        Of a model of lights, its planes and its table are written; it takes no image.
     output : path-like
-        File to write; an existing file is replaced atomically. `Gaussians.load` reads it.
+        File to write; an existing file is replaced atomically. `Gaussians.load` reads it, and
+        `Relightable.load` that of a model.
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
         The image of the fit, as `fit` takes it; for a set with maps, the images by name. By default
         the rendering of the set.
@@ -94,6 +97,7 @@ def pack(
         maps, the loss refers to the mean over the maps of the ratio of the squared errors (of
         colours as sRGB) after and before, so that all maps lose about the same number of decibels.
         Without images, the errors of the maps are in the ratio of their weights in the fit.
+        For a model of lights, the loss refers to its `psnr_held_out`.
     sections : sequence of int, optional
         Number of Gaussians in each section of the file, in the order of the set. A reader may stop
         after any section; the budget applies to each of these prefixes. By default one section.
@@ -126,17 +130,26 @@ def pack(
             f"pack: max_psnr_drop is {max_psnr_drop}; it must be above 0 and at most "
             f"{MAX_PSNR:g} dB, such as 0.5"
         )
-    source: Gaussians = dr.detach(set_of(gaussians))
+    model = gaussians if isinstance(gaussians, Relightable) else None
+    if model is not None and image is not None:
+        raise ValueError("pack: a model of lights takes no image; leave it out")
+    planes = gaussians.planes if isinstance(gaussians, Relightable) else set_of(gaussians)
+    source: Gaussians = dr.detach(planes)
     rows = _section_rows(len(source), sections)
     if source.maps and len(rows) > 1:
         raise ValueError("pack: a set with maps has one section; leave out the sections")
-    compare = _compare_maps if source.maps else _compare
-    maps, display, compared = compare(source, image, encoding)
+    if model is None:
+        compare = _compare_maps if source.maps else _compare
+        maps, display, compared = compare(source, image, encoding)
+    else:
+        maps, display, compared = _compare_planes(model)
     weighted = scale_channels(source, channel_weights(maps)) if maps else source
     attempt, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
     seen = psnr_from_mse(attempt.error)
     stored = seen if image is not None and not maps else math.nan
-    size = write_egs(output, attempt.packed._replace(maps=maps, psnr=stored))
+    lights = b"" if model is None else table_bytes(model)
+    content = attempt.packed._replace(maps=maps, psnr=stored, lights=lights)
+    size = write_egs(output, content)
     rounded = Gaussians.load(output, types_of(source.mean).backend)
     after = psnr_from_mse(max(attempt.error + compared.extra_error, MIN_MSE))
     figure: float | dict[str, float] = seen
@@ -209,6 +222,21 @@ def _image_of(g: Gaussians, image: ArrayLike, encoding: str | None) -> Array:
 def _display(g: Gaussians) -> Array:
     """Render a set in the space of the comparison, see `_image_of`."""
     return g.space.comparable(planes_of(g))
+
+
+# --- The planes of a model of lights --------------------------------------------------------------
+
+
+def _compare_planes(model: Relightable) -> Compared:
+    """Compare planes with themselves: the sum of their errors is that of the photos."""
+    target = planes_of(model.planes)
+
+    def error(rounded: Gaussians) -> float:
+        difference = np.square(planes_of(rounded) - target, dtype=np.float64)
+        return float(difference.sum(axis=2).mean())
+
+    unseen = 10 ** (-model.psnr_held_out / 10)
+    return (), [], Comparison(error, target, unseen if np.isfinite(unseen) else MSE_WITHOUT_IMAGE)
 
 
 # --- A set with maps -----------------------------------------------------------------------------

@@ -25,6 +25,10 @@ read_maps: Callable[[Path], tuple[TextureMap, ...]]
 """``read_maps(path)`` reads the maps of a set, without its Gaussians."""
 
 
+read_lights: Callable[[Path], bytes]
+"""``read_lights(path)`` reads the table of lights of planes, empty for other sets."""
+
+
 def is_packed(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is a packed set; raise `OSError` if it cannot be opened."""
     with open(path, "rb") as file:

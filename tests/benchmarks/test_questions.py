@@ -20,6 +20,7 @@ from _helpers.benchmarks import (  # noqa: F401  data is a fixture
     task_in,
 )
 from _helpers.command import said
+from _helpers.lit_spheres import directions, photos
 from eigengs_bench import (
     cases,
     kernels,
@@ -28,6 +29,7 @@ from eigengs_bench import (
     pareto,
     peers,
     rate,
+    relight,
     scaling,
     stability,
     tables,
@@ -501,3 +503,59 @@ def test_gain_at_equal_seconds():
     assert inverse.gain({"pyramid": pyramid, "texels": texels, "fit": fits}) == pytest.approx(
         [1, -4, 1]
     )
+
+
+# --- Photos under many lights ---
+
+
+@pytest.fixture
+def lit(tmp_path):
+    """A set of photos with an ``.lp`` file, and one with photos of its own to measure on."""
+    for name, lights in (("a", directions(20)), ("b/Dome", directions(12)), ("b/Test", LATER)):
+        folder = tmp_path / "lit" / name
+        folder.mkdir(parents=True)
+        lines = [f"{k}.png {x} {y} {z}" for k, (x, y, z) in enumerate(lights)]
+        (folder / "dirs.lp").write_text("\n".join([str(len(lines)), *lines]))
+        for k, photo in enumerate(photos(lights)):
+            save_image(folder / f"{k}.png", photo)
+    return tmp_path / "lit"
+
+
+LATER = directions(5, 0.5) @ np.diag([-1, 1, 1])
+
+
+def test_relight(lit, tmp_path, backend, monkeypatch):
+    monkeypatch.setattr(relight, "PLANES", (6,))
+    monkeypatch.setattr(relight, "QUALITIES", (30, 90))
+    monkeypatch.setattr(relight, "PIXELS", (16,))
+    monkeypatch.setattr(relight, "BUDGETS", (0.5,))
+    rows, text = answered(tmp_path / "out", "relight", lit, "--iterations", 5, "--backend", backend)
+    assert {row["job"]["set"] for row in rows} == {"a", "b"}
+    assert {row["job"]["method"] for row in rows} == {relight.OURS, *relight.METHODS}
+    points = [point for row in rows for point in row["points"]]
+    assert all(p["bytes_per_pixel"] == p["bytes"] / 24**2 for p in points)
+    assert "median" in text and (tmp_path / "out" / "relight.svg").exists()
+
+
+def test_every_fifth_light_is_left_out(lit):
+    seen, unseen = relight.photos_of(lit / "a")
+    np.testing.assert_allclose(unseen.lights, directions(20)[2::5], atol=1e-9)
+    assert len(seen.photos) == 16
+    np.testing.assert_allclose(relight.photos_of(lit / "b")[1].lights, LATER, atol=1e-9)
+
+
+@pytest.mark.parametrize("tuned", [False, True])
+@pytest.mark.parametrize("kind", ["JPEG", "AVIF"])
+def test_coded_planes_are_near_the_planes(kind, tuned):
+    y, x = np.mgrid[:32, :32] / 32
+    planes = np.stack([np.sin(3 * x + k) / (k + 1) for k in range(6)], 2).astype(np.float32)
+    size, found = relight.coded(planes + y[..., None], kind, tuned, 95)
+    assert size > 200
+    assert np.abs(found - planes - y[..., None]).max() < 0.05
+
+
+def test_bytes_at_a_psnr():
+    points = pd.DataFrame({"bytes_per_pixel": [1.0, 4.0, 2.0], "psnr_rgb": [30.0, 34.0, 29.0]})
+    assert relight.at_level(points, 32.0) == (pytest.approx(2.0), 0.0)
+    assert relight.at_level(points, 40.0) == (4.0, -6.0)
+    assert relight.at_level(points, 28.0) == (1.0, 2.0)

@@ -1,0 +1,231 @@
+"""From photos under known lights to planes on one set of Gaussians, and a table of lights.
+
+The pixels are samples with 3 n numbers each, those of n photos and 3 colours. Their principal
+components give few planes: photo and colour j is about ``mean_j + sum_k V_jk (X V)_k``. Columns of
+V are orthonormal, so a squared error of a plane is a squared error of the photos, and the planes
+are fitted as the channels of one image.
+
+Photos count in sRGB codes. Of six sets of real photos, planes of codes show left-out lights 0.6 to
+5.6 dB closer in codes than planes of linear light (12 planes, every 8th of the lights left out).
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..backend.types import Doubles, Singles
+from ..eigenbasis.incremental import largest_eigenpairs, orient, product
+from ..fitting.fit import Fit, ended, fit_problem
+from ..fitting.objective import Channels, Target
+from ..fitting.options import FitOptions
+from ..fitting.problem import Problem
+from ..image.io import check_image
+from ..image.metrics import psnr_from_mse
+from ..image.pixels import ImageError
+from ..image.space import DATA
+from .lights import LightTable, check_lights, functions_at, read_lights, solve_table
+
+MAX_PLANES = 32
+"""Largest number of planes that is tried. On six sets of real photos, the PSNR of left-out lights
+stays the same from 24 on."""
+
+MIN_LIGHTS = 4
+"""Smallest number of photos: a linear function of the direction has four factors."""
+
+FOLDS = 8
+"""Number of parts of the lights, each left out once."""
+
+TABLES = (("thin_plate", 1e-3), ("thin_plate", 1e-2), ("thin_plate", 0.1), ("hsh", 0.1))
+"""Tables that are tried, with their smoothing."""
+
+SPARED = 0.2
+"""Decibels of left-out lights that a smaller number of planes may cost."""
+
+PIXELS_PER_GAUSSIAN = 16
+"""Pixels of a photo for each Gaussian."""
+
+
+class Photos(NamedTuple):
+    """Photos under known lights.
+
+    Attributes
+    ----------
+    rows : ndarray of float32, shape (3 n, H W)
+        A row for each photo and colour, in sRGB codes.
+    size : (int, int)
+        Width and height in pixels.
+    lights : ndarray of float64, shape (n, 3)
+    """
+
+    rows: Singles
+    size: tuple[int, int]
+    lights: Doubles
+
+
+def read_photos(photos: Any, lights: Any = None) -> Photos:
+    """Read photos and their lights; for parameters and errors see `Relightable.fit`."""
+    is_folder = isinstance(photos, (str, os.PathLike))
+    if lights is None:
+        if not is_folder:
+            raise ValueError("photos need lights: give their directions (n, 3), or an .lp file")
+        found = sorted(Path(photos).glob("*.[lL][pP]"))
+        if len(found) != 1:
+            raise ValueError(
+                f"{photos}: holds {len(found)} files of lights (.lp), expected one; give its name "
+                "as lights"
+            )
+        lights = found[0]
+    if isinstance(lights, (str, os.PathLike)):
+        names, directions = read_lights(lights)
+        if is_folder:
+            photos = [Path(photos) / name for name in names]
+    elif is_folder:
+        raise ValueError(f"{photos}: a folder needs an .lp file, which names its photos")
+    else:
+        directions = check_lights(lights)
+    if len(photos) != len(directions):
+        raise ValueError(f"there are {len(photos)} photos, but {len(directions)} lights")
+    if len(photos) < MIN_LIGHTS:
+        raise ValueError(f"there are {len(photos)} photos; a model needs at least {MIN_LIGHTS}")
+    return _stacked(photos, directions)
+
+
+def _stacked(photos: Sequence[Any], lights: Doubles) -> Photos:
+    """Read photos into one array."""
+    rows, shape = np.empty((0, 0), np.float32), (0, 0, 0)
+    for k, photo in enumerate(photos):
+        pixels = check_image(photo, copy=False)
+        if k == 0:
+            shape = pixels.shape
+            rows = np.empty((3 * len(photos), shape[0] * shape[1]), np.float32)
+        if pixels.shape != shape:
+            name = photo if isinstance(photo, (str, os.PathLike)) else f"photo {k + 1}"
+            raise ImageError(
+                f"{name}: is {pixels.shape[1]}x{pixels.shape[0]}, but the first photo is "
+                f"{shape[1]}x{shape[0]}; scale them to one size"
+            )
+        rows[3 * k : 3 * k + 3] = pixels.reshape(-1, 3).T
+    return Photos(rows, (shape[1], shape[0]), lights)
+
+
+class Planes(NamedTuple):
+    """The planes of photos.
+
+    Attributes
+    ----------
+    images : ndarray of float32, shape (H, W, K)
+        Scaled so that the sum of their mean squared errors is that of the photos.
+    table : LightTable
+    psnr_held_out : float
+        Mean PSNR in dB of photos that were left out, from planes of the others.
+    """
+
+    images: Singles
+    table: LightTable
+    psnr_held_out: float
+
+
+def find_planes(photos: Photos, planes: int | None = None) -> Planes:
+    """Compute planes and their table; by default as many planes as left-out lights need.
+
+    Parameters
+    ----------
+    photos : Photos
+        Its rows are centred in place.
+    planes : int, optional
+        Number of planes.
+    """
+    rows, lights = photos.rows, photos.lights
+    mean = rows.mean(axis=1, dtype=np.float64)
+    rows -= mean.astype(np.float32)[:, None]
+    gram = product(rows, rows) / rows.shape[1]
+    limit = min(planes or MAX_PLANES, len(rows))
+    psnrs = {choice: left_out(gram, mean, lights, *choice, limit) for choice in TABLES}
+    count = planes or fewest_planes(max(psnrs.values(), key=lambda values: values.max()))
+    kind, smoothing = max(psnrs, key=lambda choice: psnrs[choice][min(count, limit) - 1])
+    _, weights = largest_eigenpairs(gram.copy(), count, 0.0)
+    unit = orient((weights / np.linalg.norm(weights, axis=0)).T.astype(np.float32))
+    scale = np.sqrt(len(rows))
+    images = (unit @ rows / np.float32(scale)).T.reshape(*photos.size[::-1], len(unit))
+    columns = np.vstack([unit * scale, mean[None]]).astype(np.float64)
+    values = np.moveaxis(columns.reshape(-1, len(lights), 3), 0, 2)
+    table = LightTable(lights, values, kind, smoothing)
+    held_out = float(psnrs[kind, smoothing][len(unit) - 1])
+    return Planes(np.ascontiguousarray(images), table, held_out)
+
+
+def left_out(
+    gram: Doubles, mean: Doubles, lights: Doubles, kind: str, smoothing: float, limit: int
+) -> Doubles:
+    """Return the mean PSNR of left-out photos with 1, 2, ..., `limit` planes of the others.
+
+    With the covariance C of the rows, the eigenpairs (V, L) of the rest R, and interpolated factors
+    W of left-out rows T, the mean squared error is ``C_TT - 2 W V^T C_RT + W L W^T`` and the
+    squared error of the mean. So no pixel is needed.
+
+    Parameters
+    ----------
+    gram : ndarray of float64, shape (3 n, 3 n)
+        Covariance of the rows over the pixels.
+    mean : ndarray of float64, shape (3 n,)
+    lights : ndarray of float64, shape (n, 3)
+    kind, smoothing
+        See `LightTable`.
+    limit : int
+    """
+    part = np.arange(len(lights)) % min(FOLDS, len(lights))
+    found = []
+    for fold in range(part.max() + 1):
+        out = part == fold
+        left, rest = np.repeat(out, 3), np.repeat(~out, 3)
+        values, vectors = np.linalg.eigh(gram[np.ix_(rest, rest)])
+        values, vectors = values[::-1][:limit], vectors[:, ::-1][:, :limit]
+        columns = np.concatenate([vectors, mean[rest, None]], axis=1)
+        known = lights[~out]
+        solved = solve_table(kind, smoothing, known, columns.reshape(len(known), -1))
+        factors = (functions_at(kind, known, lights[out]) @ solved).reshape(left.sum(), -1)
+        weights = factors[:, :-1]
+        change = values * weights**2 - 2 * weights * (gram[np.ix_(left, rest)] @ vectors)
+        errors = np.diag(gram)[left] + (mean[left] - factors[:, -1]) ** 2
+        errors = errors[:, None] + np.cumsum(change, axis=1)
+        found.append(errors.reshape(-1, 3, weights.shape[1]).mean(axis=1))
+    shortest = min(errors.shape[1] for errors in found)
+    joined = np.concatenate([errors[:, :shortest] for errors in found])
+    psnrs = [[psnr_from_mse(e) for e in row] for row in joined.tolist()]
+    return np.asarray(np.mean(psnrs, axis=0))
+
+
+def fewest_planes(psnrs: Doubles) -> int:
+    """Return the smallest number of planes within `SPARED` of the best."""
+    return int(np.argmax(psnrs >= psnrs.max() - SPARED)) + 1
+
+
+def fit_planes(
+    images: Singles,
+    gaussians: int | None,
+    iterations: int,
+    seed: int,
+    backend: str | None,
+    progress: Callable[..., None] | None = None,
+) -> Fit:
+    """Fit planes (H, W, K) as the channels of one set, by their squared error."""
+    started = time.perf_counter()
+    height, width, count = images.shape
+    options = FitOptions(
+        gaussians=gaussians or max(1, height * width // PIXELS_PER_GAUSSIAN),
+        iterations=iterations,
+        space=DATA,
+        seed=seed,
+        backend=backend,
+    )
+    options.check_image(width, height, count)
+    channels = Channels("", DATA, slice(0, count), (Target.of(images, DATA),))
+    problem = Problem((channels,), (width, height), options)
+    [result] = fit_problem(problem, started, progress)
+    return ended(result)

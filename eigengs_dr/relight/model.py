@@ -1,0 +1,316 @@
+"""`Relightable`: photos under many lights as planes on one set of Gaussians, and a table of lights.
+
+As in `eigengs_dr.EigenGS`, a new member of the family is a product: the colours under a light are
+``sum_k t_k(l) psi_nk`` with the colours psi of the planes and the factors t of the light.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..backend.arrays import types_of
+from ..backend.doors import class_of_doors, shows_progress
+from ..backend.types import ArrayLike, Doubles
+from ..fitting.objective import Pixels
+from ..fitting.solve import solve
+from ..gaussian import packed
+from ..gaussian.file import ARRAYS, SetData, check, file_errors, read_set
+from ..gaussian.gaussians import Gaussians, with_colors
+from ..image.color import to_linear
+from ..image.io import read_floats
+from ..image.resize import resample
+from ..image.space import DATA, LINEAR, RGB
+from ..raster.render import render
+from ..storage import npz
+from ..storage.npz import BadValue, Field
+from .fit import find_planes, fit_planes, read_photos
+from .lights import KINDS, MAX_LIGHTS, LightTable, check_lights, check_table
+
+FORMAT, VERSION = "eigengs_dr.relightable", 1
+
+LAYOUT: dict[str, Field] = ARRAYS | {
+    "size": Field("i8", 1),
+    "cutoff": Field("f8", 0),
+    "lights": Field("f4", 2, 3 * MAX_LIGHTS),
+    "values": Field("f4", 3),
+    "kind": Field("U", 0),
+    "smoothing": Field("f8", 0),
+    "psnr_held_out": Field("f8", 0),
+}
+"""Arrays of a file."""
+
+
+@class_of_doors
+@dataclass(frozen=True, eq=False, repr=False)
+class Relightable:
+    """An object under any light, from photos of one camera under some lights.
+
+    Attributes
+    ----------
+    planes : Gaussians
+        The planes, in the space "data": a channel for each. A light is a sum of them.
+    table : LightTable
+        The factors of the planes for every light.
+    psnr_held_out : float
+        Mean PSNR in dB, in sRGB, of photos that were left out: from planes of the others, before
+        they become Gaussians.
+
+    Notes
+    -----
+    A direction is a vector towards the light: x to the right of the photo, y up, z towards the
+    camera. Lights are far, as the table knows no distance. Between lights, cast shadows fade
+    instead of moving. Lights below the horizon are refused.
+    """
+
+    planes: Gaussians
+    table: LightTable
+    psnr_held_out: float = float("nan")
+
+    @classmethod
+    @shows_progress
+    def fit(
+        cls,
+        photos: Any,
+        lights: ArrayLike | str | os.PathLike[str] | None = None,
+        *,
+        gaussians: int | None = None,
+        planes: int | None = None,
+        iterations: int = 300,
+        seed: int = 0,
+        backend: str | None = None,
+        progress: Any = None,
+    ) -> Relightable:
+        """Fit a model to photos of an object under known lights.
+
+        Parameters
+        ----------
+        photos : path-like, or sequence of images or paths, or array_like of shape (n, H, W, 3)
+            At least 4 photos of one size from one camera. A folder holds the photos that the list
+            of lights names.
+        lights : array_like of shape (n, 3), or path-like, optional
+            The direction of the light of each photo, of any length; or a list ``.lp`` of names and
+            directions. By default the only such file in the folder.
+        gaussians : int, optional
+            Number of Gaussians, by default one for 16 pixels.
+        planes : int, optional
+            Number of planes. By default as many as left-out lights need.
+        iterations : int, optional
+            Number of steps of the fit of the planes.
+        seed, backend, progress : optional
+            See `eigengs_dr.fit`.
+
+        Raises
+        ------
+        ValueError
+            If photos and lights do not match, a light is below the horizon, or an option is out of
+            range; an `ImageError` if a photo cannot be used.
+        OSError
+            If a file cannot be opened.
+        """
+        read = read_photos(photos, lights)
+        if planes is not None and not 1 <= planes <= min(64, len(read.rows)):
+            raise ValueError(f"planes is {planes}; {len(read.lights)} photos have 1 to 64")
+        found = find_planes(read, planes)
+        del read  # the photos take more memory than the fit
+        result = fit_planes(found.images, gaussians, iterations, seed, backend, progress)
+        return cls(result.gaussians, found.table, found.psnr_held_out)
+
+    def __repr__(self) -> str:
+        size = f"{self.planes.width}x{self.planes.height} pixels"
+        return (
+            f"Relightable({len(self.planes)} Gaussians, {size}, {self.planes.channels} planes, "
+            f"{len(self.lights)} lights, {self.table.kind})"
+        )
+
+    @property
+    def lights(self) -> Doubles:
+        """Directions of the lights of the photos, shape (n, 3)."""
+        return self.table.lights
+
+    def relight(self, light: Any) -> Gaussians:
+        """Return the object under a light, or under an environment, as a set.
+
+        Parameters
+        ----------
+        light : sequence of 3 numbers, Dr.Jit vector of 3 floats, image (h, w, 3) or path-like
+            The direction of the light, of any length. The set is differentiable by the vector. Or
+            an environment of light around the object, see `environment_lights`; then colours are
+            solved for the shapes, without a derivative.
+
+        Returns
+        -------
+        Gaussians
+            On the means and shapes of the planes; in the space "rgb", and for an environment in
+            "linear", or "radiance" if it is brighter than white.
+
+        Raises
+        ------
+        ValueError
+            If numbers are no direction above the horizon. A vector of Dr.Jit is not checked: an
+            optimiser may pass below the horizon for a step.
+        """
+        is_path = isinstance(light, (str, os.PathLike))
+        if is_path or (not dr.is_array_v(light) and np.ndim(light) > 1):
+            return self._under(light)
+        planes, types = self.planes, types_of(self.planes.mean)
+        if dr.is_array_v(light):
+            direction = [types.Float(v) for v in light]
+        else:
+            [numbers] = check_lights(np.asarray(light, np.float64)[None], "light").tolist()
+            direction = [dr.opaque(types.Float, v) for v in numbers]
+        factors = self.table.factors(types, direction)
+
+        def shown(rows: Any, added: bool) -> Any:
+            return type(rows)(
+                [
+                    sum((f * row for f, row in zip(fs, rows, strict=False)), fs[-1] * added)
+                    for fs in factors
+                ]
+            )
+
+        color, background = shown(planes.color, False), shown(planes.background, True)
+        return replace(planes, color=color, background=background, space=RGB)
+
+    def _under(self, environment: Any) -> Gaussians:
+        """Return the object under an environment: a sum of light over directions."""
+        lights, radiance = environment_lights(environment)
+        shown = render(self.planes).numpy().astype(np.float32)
+        total = np.zeros((*shown.shape[:2], 3), np.float32)
+        for factors, light in zip(self.table.at(lights).astype(np.float32), radiance, strict=True):
+            if light.any():
+                codes = shown @ factors[:, :-1].T + factors[:, -1]
+                total += to_linear(np.clip(codes, 0, 1)) * light.astype(np.float32)
+        space = LINEAR.above_white if total.max() > 1 else LINEAR
+        start = with_colors(self.planes, np.zeros((len(self.planes) + 1, 3)), space)
+        return solve(start, Pixels.plain(total, start, space.weight(total)))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
+        data, table = self.planes.data(), self.table
+        arrays = {name: values.astype(np.float32) for name, values in data.arrays.items()}
+        arrays |= {
+            "size": np.array(data.size, np.int64),
+            "cutoff": np.array(data.cutoff, np.float64),
+            "lights": table.lights.astype(np.float32),
+            "values": table.values.astype(np.float32),
+            "kind": np.array(table.kind),
+            "smoothing": np.array(table.smoothing, np.float64),
+            "psnr_held_out": np.array(self.psnr_held_out, np.float64),
+        }
+        npz.write(path, FORMAT, VERSION, arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> Relightable:
+        """Read a file that `save` or `eigengs_dr.pack` wrote.
+
+        Raises
+        ------
+        ValueError
+            If the file has another format or version, is damaged, or holds invalid values; one line
+            names the file and the key.
+        OSError
+            If the file cannot be opened.
+        """
+        with file_errors(Path(path)):
+            if packed.is_packed(path):
+                return cls(*_read_packed(Path(path), backend))
+            members = npz.read(path, FORMAT, VERSION, LAYOUT)
+            parts = {name: members[name] for name in ARRAYS}
+            size = tuple(members["size"].tolist())
+            data = check(SetData(parts, size, DATA, float(members["cutoff"])))
+            table = LightTable(
+                members["lights"].astype(np.float64),
+                members["values"].astype(np.float64),
+                str(members["kind"]),
+                float(members["smoothing"]),
+            )
+            check_table(table, data.arrays["color"].shape[1])
+            table = replace(table, lights=check_lights(table.lights))
+            return cls(Gaussians.from_data(data, backend), table, float(members["psnr_held_out"]))
+
+
+def holds_lights(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file that this package wrote holds a model of lights."""
+    if packed.is_packed(path):
+        return bool(packed.read_lights(Path(path)))
+    return npz.format_of(path) == FORMAT
+
+
+ENVIRONMENT_SIZE = (32, 16)
+"""Width and height to which environments are averaged: 256 directions above the horizon."""
+
+
+def environment_lights(environment: Any) -> tuple[Doubles, Doubles]:
+    """Return directions (m, 3) above the horizon, and what each adds of its photo, (m, 3).
+
+    The photo under a light of irradiance pi counts as 1, so that a white diffuse surface is white
+    under an environment of 1: the sum is ``1 / pi integral L(l) photo(l) dl``.
+
+    Parameters
+    ----------
+    environment : array_like, shape (h, w, 3), or path-like
+        Latitudes and longitudes, as an ``envmap`` of Mitsuba: the first row is up (y), and the
+        middle column is behind the camera (z). Files of floats and arrays hold linear light.
+    """
+    is_file = isinstance(environment, (str, os.PathLike))
+    pixels, encoding = read_floats(environment, encoding=None if is_file else "linear")
+    light = to_linear(pixels) if encoding == "srgb" else pixels
+    width, height = ENVIRONMENT_SIZE
+    average = np.asarray(resample(light, width, height), np.float64)
+    polar = np.pi * (np.arange(height) + 0.5) / height
+    turn = 2 * np.pi * (np.arange(width) + 0.5) / width
+    ring, up = np.sin(polar)[:, None], np.cos(polar)[:, None]
+    directions = np.stack(np.broadcast_arrays(ring * np.sin(turn), up, -ring * np.cos(turn)), -1)
+    share = 2 * np.pi / (width * height) * ring[..., None]  # solid angles, over pi
+    above = directions[..., 2] > 0
+    return directions[above], (average * share)[above]
+
+
+# --- The table in a packed file ------------------------------------------------------------------
+
+_HEAD = struct.Struct("<BBHfd")
+"""Kind, planes, lights, smoothing, and the PSNR of left-out lights."""
+
+
+def table_bytes(model: Relightable) -> bytes:
+    """Return the table of a model for an ``.egs`` file: 16 bits a direction, 8 bits a factor.
+
+    Each plane has a scale. Rounding is 40 dB below the contrast of the photos.
+    """
+    table, planes = model.table, model.planes.channels
+    head = _HEAD.pack(
+        KINDS.index(table.kind), planes, len(table.lights), table.smoothing, model.psnr_held_out
+    )
+    scale = (np.abs(table.values).max(axis=(0, 1), initial=1e-6) / 127).astype("<f4")
+    lights = np.round(table.lights * 32767).astype("<i2")
+    values = np.round(table.values / scale).astype(np.int8)
+    return head + scale.tobytes() + lights.tobytes() + values.tobytes()
+
+
+def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable, float]:
+    """Read the parts of a model from an ``.egs`` file."""
+    content = packed.read_lights(path)
+    if not content:
+        raise BadValue("holds a set without a table of lights; read it by Gaussians.load")
+    data = read_set(path)
+    if len(content) < _HEAD.size:
+        raise BadValue("the table of lights is truncated; copy the file again")
+    kind, planes, count, smoothing, psnr = _HEAD.unpack_from(content)
+    sizes = [4 * (planes + 1), 6 * count, 3 * (planes + 1) * count]
+    if len(content) != _HEAD.size + sum(sizes) or planes != data.arrays["color"].shape[1]:
+        raise BadValue("the table of lights has another size; copy the file again")
+    ends = (_HEAD.size + np.cumsum(sizes)).tolist()
+    scale = np.frombuffer(content[_HEAD.size : ends[0]], "<f4").astype(np.float64)
+    lights = np.frombuffer(content[ends[0] : ends[1]], "<i2").reshape(count, 3) / 32767
+    rounded = np.frombuffer(content[ends[1] :], np.int8).reshape(count, 3, planes + 1)
+    name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
+    table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
+    table = replace(table, lights=check_lights(lights))
+    return Gaussians.from_data(data, backend), table, psnr
