@@ -26,7 +26,7 @@ OTHER_WORDS = {
 
 CALLS = {
     f"{owner.__name__}.{name}": call
-    for owner in (eg, eg.EigenGS, eg.Eigenbasis)
+    for owner in (eg, eg.EigenGS, eg.Eigenbasis, eg.Relightable)
     for name in (eg.__all__ if owner is eg else dir(owner))
     if not name.startswith("_") and name not in ("save", "load")
     if inspect.isfunction(call := getattr(owner, name)) or inspect.ismethod(call)
