@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.resize import resample
@@ -156,6 +157,31 @@ def many() -> list[Row]:
     rows = eg.fit_many(photos, gaussians=2000, iterations=300)
     fits = [row.result.image for row in rows]
     return [dict(zip(names[k : k + 4], fits[k : k + 4], strict=True)) for k in (0, 4)]
+
+
+def relight() -> list[Row]:
+    """Relight a relief of bricks, a made-up object, beside its formula."""
+    height = gaussian_filter(resample(square(eg.sample("brick")), 240, 240)[..., 0], 2) * 40
+    dy, dx = np.gradient(height)
+    normal = np.stack([-dx, dy, np.ones_like(dx)], -1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    albedo = np.array([0.75, 0.5, 0.4])
+
+    def photo(light: np.ndarray) -> np.ndarray:
+        half = light + [0, 0, 1]
+        shine = np.maximum(normal @ (half / np.linalg.norm(half)), 0) ** 30
+        shaded = np.maximum(normal @ light, 0)[..., None] * albedo + 0.2 * shine[..., None]
+        return to_coded(np.clip(shaded, 0, 1).astype(np.float32))
+
+    z, turn = np.linspace(0.98, 0.3, 40), np.arange(40) * 2.4
+    ring = np.sqrt(1 - z**2)
+    lights = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)
+    model = eg.Relightable.fit(np.stack([photo(light) for light in lights]), lights)
+    unseen = {"left": (-0.8, 0, 0.6), "above": (0, 0.6, 0.8), "right": (0.8, 0, 0.6)}
+    return [
+        {f"light {name}": photo(np.array(light)) for name, light in unseen.items()},
+        {f"{name}, model": eg.picture_of(model.relight(d)) for name, d in unseen.items()},
+    ]
 
 
 def square(photo: np.ndarray) -> np.ndarray:
@@ -420,6 +446,7 @@ PICTURES: dict[str, Callable[[], list[Row]]] = {
     "many": many,
     "components": components,
     "split": split,
+    "relight": relight,
     "prefilter": aliasing,
     "convert": conversion,
     "differentiate": descent,

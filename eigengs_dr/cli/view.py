@@ -51,7 +51,7 @@ def view(
     draws the same picture as "render", at any zoom. It can show outlines, only the first Gaussians,
     and the parameters of the Gaussian under the pointer. With --image, a divider wipes between the
     Gaussians and the photo. For a model, it has sliders for the first components, and draws random
-    images.
+    images. For a model of lights, the light follows the pointer, and on a phone the finger.
 
     \b
     Examples:
@@ -60,6 +60,7 @@ def view(
       eigengs-dr view levels.npz --levels 4
       eigengs-dr view bark.npz --map roughness
       eigengs-dr view natural --image photo.jpg -o natural.html
+      eigengs-dr view coin.npz --open
     """
     [page] = name_outputs([file], output, SUFFIXES)
     check_outputs([page], [file, *([image] if image else [])])
@@ -77,7 +78,7 @@ def view(
 
 def _load(
     file: Path, name: str | None, levels: int | tuple[int, ...] | None, backend: str | None
-) -> tuple[eg.Gaussians | eg.EigenGS, list[int]]:
+) -> tuple[eg.Gaussians | eg.EigenGS | eg.Relightable, list[int]]:
     """Return the set or the model of a file or a name, and the Gaussians up to each level.
 
     The file need not be trusted: the number of Gaussians is checked before they are read.
@@ -85,9 +86,14 @@ def _load(
     from ..codec import egs
     from ..eigenbasis.eigengs import SHIPPED
     from ..eigenbasis.files import MODEL_FORMAT
+    from ..relight.model import holds_lights
     from ..viewer.view import check_count
 
     file = SHIPPED.get(str(file), file)
+    if holds_lights(file):
+        if levels is not None or name is not None:
+            raise ValueError(f"{file}: is a model of lights; leave out --levels and --map")
+        return eg.Relightable.load(file, backend), []
     sections = egs.section_counts(file) if is_packed(file) else []
     if not sections and npz.format_of(file) == MODEL_FORMAT:
         if levels is not None or name is not None:

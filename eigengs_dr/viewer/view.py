@@ -26,6 +26,7 @@ from ..gaussian.gaussians import Gaussians, one_image, set_of
 from ..image.pixels import check_encoding
 from ..image.resize import resample
 from ..raster.render import picture_of
+from ..relight.model import Relightable
 from ..storage.atomic import atomic_write
 from .pictures import check_aspect, displayed, first_components, photo_uri, within
 
@@ -82,7 +83,7 @@ def _template() -> jinja2.Template:
 
 
 def view(
-    source: Gaussians | Fit | EigenGS,
+    source: Gaussians | Fit | EigenGS | Relightable,
     image: ArrayLike | None = None,
     *,
     levels: Sequence[int] = (),
@@ -93,11 +94,12 @@ def view(
 
     The page pans and zooms without limits, and can show outlines, only the first Gaussians, and the
     parameters of the Gaussian under the pointer. For a model it has sliders for the first
-    components of each channel, and draws random images.
+    components of each channel, and draws random images. Of a model of lights, the light follows the
+    pointer, and on a phone the finger.
 
     Parameters
     ----------
-    source : Gaussians, Fit or EigenGS
+    source : Gaussians, Fit, EigenGS or Relightable
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
         A photo to compare with. A model encodes it, so that the sliders start from it.
     levels : sequence of int, optional
@@ -128,13 +130,18 @@ def view(
     >>> "One Gaussian" in page.html
     True
     """
-    if not isinstance(source, Gaussians | Fit | EigenGS):
+    if not isinstance(source, Gaussians | Fit | EigenGS | Relightable):
         raise TypeError(
-            f"{type(source).__name__} cannot be shown; expected Gaussians, Fit or EigenGS"
+            f"{type(source).__name__} cannot be shown; expected Gaussians, Fit, EigenGS or "
+            "Relightable"
         )
     check_encoding(encoding)
     model = source if isinstance(source, EigenGS) else None
-    gaussians = one_image(set_of(source)) if model is None else model.gaussians
+    lights = describe_lights(source) if isinstance(source, Relightable) else None
+    if isinstance(source, Relightable):
+        gaussians = source.relight(OVERHEAD)
+    else:
+        gaussians = one_image(set_of(source)) if model is None else model.gaussians
     pixels = None if image is None else displayed(image, gaussians.space, encoding)
     model_facts, note = None, ""
     if model is not None:
@@ -151,6 +158,7 @@ def view(
         "channels": views[0][1],
         "photo": None if pixels is None else photo_uri(pixels),
         "model": model_facts,
+        "lights": lights,
     }
     html = _template().render(
         title=title,
@@ -237,6 +245,26 @@ def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:
         return [("Colour", (0, 1, 2))]
     single = [(str(c + 1), (c, c, c)) for c in range(channels)]
     return [*([("1, 2, 3 as red, green, blue", (0, 1, 2))] if channels > 3 else []), *single]
+
+
+OVERHEAD = (0.0, 0.0, 1.0)
+"""The light of a page before the pointer moves it."""
+
+
+def describe_lights(model: Relightable) -> Record:
+    """Return the planes of a model of lights and the functions of its table for a page."""
+    check_count(len(model.planes))
+    arrays, table = model.planes.to_arrays(), model.table
+    scales = np.abs(arrays["color"]).max(axis=0, initial=0)
+    scales = np.where(scales > 0, scales, 1)
+    return {
+        "kind": table.kind,
+        "lights": to_text(table.lights, "<f8"),
+        "coefficients": to_text(table.coefficients, "<f8"),
+        "planes": to_text(arrays["color"] / scales, "<f2"),
+        "scales": scales.tolist(),
+        "background": arrays["background"].tolist(),
+    }
 
 
 MAX_WEIGHT_BYTES = 1 << 20
@@ -340,6 +368,12 @@ def _shown_size(gaussians: Gaussians) -> tuple[int, int]:
 @html_of.register(EigenGS)
 def _show_components(source: EigenGS | Eigenbasis) -> str:
     return _block(repr(source), *_images(dict(first_components(source)), THUMBNAIL_WIDTH))
+
+
+@html_of.register
+def _show_lights(model: Relightable) -> str:
+    gaussians = model.relight(OVERHEAD)
+    return _block(repr(model), *_images(picture_of(gaussians, *_shown_size(gaussians))))
 
 
 def _images(

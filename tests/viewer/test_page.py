@@ -1,10 +1,13 @@
 """The page in a browser: it draws as the renderer does, and answers mouse, touch and keyboard."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SIDE, family, small_model
+from _helpers.lit_spheres import directions, photos
 from _helpers.sets import random_scene
 from eigengs_dr.viewer.view import Page
 
@@ -315,3 +318,45 @@ def test_a_photo_moves_along_the_components(actual):
     assert differ(tab.image(), codes(model.encode(photo)) + after - before) < 1.0
     tab.page.click("#photo-image")
     assert differ(tab.image(), codes(model.encode(photo))) < 0.05
+
+
+@pytest.fixture(scope="module")
+def lit():
+    """A model of a bump under lights."""
+    lights = directions(20)
+    return eg.Relightable.fit(photos(lights), lights, gaussians=80, planes=5, iterations=20)
+
+
+@pytest.mark.parametrize("kind", ["thin_plate", "hsh"])
+def test_the_light_follows_the_pointer(actual, lit, kind):
+    model = replace(lit, table=replace(lit.table, kind=kind))
+    tab = actual(eg.view(model))
+    assert differ(tab.image(), codes(model.relight((0, 0, 1)))) < 0.1
+    left, top, width, height = tab.run("viewer.camera.frame")
+    tab.page.mouse.move(left + 0.75 * width, top + 0.25 * height)
+    light = tab.run("lights.direction")
+    np.testing.assert_allclose(light, [0.5, 0.5, 0.5**0.5], atol=0.1)
+    assert differ(tab.image(), codes(model.relight(light))) < 0.1
+
+    tab.page.uncheck("#follows")
+    tab.page.mouse.move(left + 0.25 * width, top + 0.25 * height)
+    assert tab.run("lights.direction") == light
+    tab.page.mouse.move(0, 0)
+    tab.page.fill("#height", "30")
+    tab.page.fill("#turn", "180")
+    light = tab.run("lights.direction")
+    np.testing.assert_allclose(light, [-(0.75**0.5), 0, 0.5], atol=1e-6)
+    assert differ(tab.image(), codes(model.relight(light))) < 0.1
+
+
+def test_the_light_follows_a_finger(show, lit):
+    tab = show(eg.view(lit), "phone")
+    touch = tab.page.context.new_cdp_session(tab.page)
+    left, top, width, height = (v / 2 for v in tab.run("viewer.camera.frame"))
+    place = tab.run("[viewer.camera.x, viewer.camera.y]")
+    for kind, share in (("touchStart", 0.5), ("touchMove", 0.7), ("touchMove", 0.9)):
+        at = {"x": left + share * width, "y": top + 0.5 * height}
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [at]})
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    np.testing.assert_allclose(tab.run("lights.direction"), [0.8, 0, 0.6], atol=0.05)
+    assert tab.run("[viewer.camera.x, viewer.camera.y]") == place

@@ -5,8 +5,9 @@ const ZOOM_STEP = 1.25;
 /**
  * Pan and zoom by mouse, touch, pen and keyboard.
  * `moved()` runs after every change, `pointed(x, y)` with the pixel under the pointer or null.
+ * `steered(x, y)` gets the pixel under a single finger first: if it returns true, the picture stays.
  */
-function listen(canvas, camera, { moved, pointed }) {
+function listen(canvas, camera, { moved, steered, pointed }) {
   const pointers = new Map();
   let travelled = 0;
   let lastTap = 0;
@@ -35,6 +36,7 @@ function listen(canvas, camera, { moved, pointed }) {
     pointers.set(event.pointerId, at);
     const after = middle();
     travelled += Math.hypot(after[0] - before[0], after[1] - before[1]) + Math.abs(spread() - width);
+    if (pointers.size === 1 && event.pointerType === "touch" && steered(...at)) return;
     camera.pan(after[0] - before[0], after[1] - before[1]);
     camera.zoom(spread() / width, ...after);
     moved();

@@ -1,6 +1,6 @@
 "use strict";
 
-/** Start the page: window.viewer and window.model are for tests and for the curious. */
+/** Start the page: window.viewer, .model and .lights are for tests and for the curious. */
 function start() {
   const facts = JSON.parse(byId("facts").textContent);
   const set = new GaussianSet(facts.set);
@@ -13,9 +13,18 @@ function start() {
     window.model = new Model(facts.model, set);
     connectModel(viewer, window.model);
   }
+  let steer = () => false;
+  if (facts.lights) {
+    window.lights = new Lights(facts.lights, set);
+    steer = connectLights(viewer, window.lights);
+  }
   listen(viewer.canvas, viewer.camera, {
     moved: () => viewer.redraw(true),
-    pointed: (x, y) => showChosen(viewer, viewer.choose(x, y)),
+    steered: steer,
+    pointed: (x, y) => {
+      const isLight = x !== null && steer(x, y); // which no outline disturbs
+      showChosen(viewer, viewer.choose(isLight ? null : x, y));
+    },
   });
   viewer.draw();
   viewer.renderer.finish();

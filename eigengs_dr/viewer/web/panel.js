@@ -131,6 +131,34 @@ function connectModel(viewer, model) {
   update(false);
 }
 
+/** Connect the light: sliders for where it stands; return what turns it to a pixel of the canvas. */
+function connectLights(viewer, lights) {
+  const [turn, height, follows] = ["turn", "height", "follows"].map(byId);
+  const degrees = Math.PI / 180;
+  const show = (moving) => {
+    const [x, y, z] = lights.direction;
+    if (Math.hypot(x, y) > 1e-6) turn.value = (Math.round(Math.atan2(y, x) / degrees) + 360) % 360;
+    height.value = Math.round(Math.asin(z) / degrees);
+    byId("direction").textContent = lights.direction.map((v) => v.toFixed(2)).join(", ");
+    viewer.recolor();
+    if (moving) viewer.redraw(true);
+  };
+  for (const slider of [turn, height]) {
+    slider.addEventListener("input", () => {
+      const [a, b] = [turn.value * degrees, height.value * degrees];
+      lights.aim(Math.cos(a) * Math.cos(b), Math.sin(a) * Math.cos(b), Math.sin(b));
+      show(true);
+    });
+  }
+  show(false);
+  return (px, py) => {
+    if (!follows.checked) return false;
+    lights.aimAt(...viewer.camera.toImage(px, py));
+    show(true);
+    return true;
+  };
+}
+
 /** Connect the other controls. */
 function connectView(viewer) {
   const { camera } = viewer;
