@@ -168,7 +168,7 @@ def relight() -> list[Row]:
     albedo = np.array([0.75, 0.5, 0.4])
 
     def photo(light: np.ndarray) -> np.ndarray:
-        half = light + [0, 0, 1]
+        half = light + np.array([0, 0, 1])
         shine = np.maximum(normal @ (half / np.linalg.norm(half)), 0) ** 30
         shaded = np.maximum(normal @ light, 0)[..., None] * albedo + 0.2 * shine[..., None]
         return to_coded(np.clip(shaded, 0, 1).astype(np.float32))
