@@ -277,10 +277,14 @@ def space(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     image = eg.sample("coffee")[100:124, 200:224]
     images = [np.roll(image, 5 * k, axis=1) for k in range(5)]
-    for folder in ("photos", "states"):
+    for folder in ("photos", "states", "coin"):
         (tmp_path / folder).mkdir()
     for k, other in enumerate(images):
         eg.save_image(f"photos/{k}.png", other)
+    for k, other in enumerate(images):
+        eg.save_image(f"coin/image{k:02}.png", other)
+    lights = [f"image{k:02}.png {k / 5} 0.2 1" for k in range(5)]
+    (tmp_path / "coin" / "dirs.lp").write_text("\n".join(["5", *lights]))
     for name in ("photo.jpg", "wood.jpg", "huge.tif"):
         eg.save_image(name, np.tile(image, (3, 3, 1)) if name == "huge.tif" else image)
     eg.save_image("roughness.png", image[..., :1])
