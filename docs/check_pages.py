@@ -35,7 +35,8 @@ BLOCKS = re.compile(r"^ *```.*?^ *```", re.M | re.S)
 CODE = re.compile(rf"{BLOCKS.pattern}|<!-- manual:.*?-->|`[^`\n]+`", re.M | re.S)
 
 FORMATS = {
-    f"eigengs_dr.{kind}" for kind in ("gaussians", "material", "eigenbasis", "model", "checkpoint")
+    f"eigengs_dr.{kind}"
+    for kind in ("gaussians", "material", "eigenbasis", "model", "relightable", "checkpoint")
 }
 """Names of file formats, not of Python."""
 

@@ -138,13 +138,16 @@ def _lights(lights: Sequence[Row]) -> Table:
     return table(caption, columns, lines, name="lights")._replace(rows=lights)
 
 
+FIGURES = ("prefiltered", "step", "step_filtered")
+
+
 def _figures(balls: Sequence[Row]) -> dict[str, str]:
     """Return figures of the last row of a ball, for sentences."""
     figures = {}
     for row in balls[-1:]:
         held = [row[f"held_{count}"] for count in HELD]
         figures["held"] = f"{min(held):.1f} to {max(held):.1f}"
-        figures |= {name: f"{row[f'ratio_{name}']:.2f}" for name in ("prefiltered", "step")}
+        figures |= {name: f"{row[f'ratio_{name}']:.2f}" for name in FIGURES}
     return figures
 
 

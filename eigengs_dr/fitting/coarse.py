@@ -126,9 +126,8 @@ class Coarse(Adaptive):
         Fraction of the rate at the end, after half a cosine.
     optimizer : Optimizer
     fit_steps : int
-        Largest number of steps of a fit of its picture, which do not call the loss. There are 8 for
-        each texel of a Gaussian: those of 4 texels show the picture after 30 steps, those of 64
-        need all.
+        Largest number of steps of a fit of its picture, which do not call the loss; there are
+        `eigengs_dr.fitting.from_loss.STEPS_PER_TEXEL` for each texel of a Gaussian.
     """
 
     share: float = 0.5
@@ -137,14 +136,6 @@ class Coarse(Adaptive):
     decay: float = 0.05
     optimizer: Optimizer = Agreeing()
     fit_steps: int = 150
-
-    def steps(self, iterations: int) -> int:
-        """Return the number of steps of the pyramid in a fit of some iterations."""
-        return min(self.max_steps, round(self.share * iterations))
-
-    def picture_steps(self, texels_per_gaussian: float) -> int:
-        """Return the number of steps of the fit of its picture."""
-        return min(self.fit_steps, round(8 * texels_per_gaussian))
 
 
 COARSE_TO_FINE = replace(

@@ -168,9 +168,9 @@ PLAIN = b"\0\0\0\0" * 5
 HOSTILE = {
     "nothing": (b"", "not a file of eigengs_dr"),
     "another magic": (header(magic=b"\x89EGT") + body(), "not a file of eigengs_dr"),
-    "newer": (header(version=7) + body(), "7, but this package reads versions 5 and 6; upgrade"),
-    "older": (header(version=3) + body(), "reads versions 5 and 6; pack the set"),
-    "older, with maps": (header(version=4) + body(), "reads versions 5 and 6; pack the set"),
+    "newer": (header(version=8) + body(), "8, but this package reads versions 5 to 7; upgrade"),
+    "older": (header(version=3) + body(), "reads versions 5 to 7; pack the set"),
+    "older, with maps": (header(version=4) + body(), "reads versions 5 to 7; pack the set"),
     "version 0": (header(version=0) + body(), "version is 0"),
     "another space": (header(space=9) + body(), "unknown values"),
     "no channels": (header(channels=0) + body(), "claims 0 channels"),

@@ -7,7 +7,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.families import small_model
+from _helpers.lit_spheres import directions, photos
 from _helpers.materials import material
 from _helpers.texture import backend, gaussians, mi, texel_centres
 from eigengs_dr.plugins import texture_of
@@ -37,8 +39,15 @@ def sources(tmp_path):
         mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "model.npz")})
     )["coefficients"]
     model = {"model": str(tmp_path / "model.npz"), "coefficients": coefficients}
+    known = directions(10)
+    lit = eg.Relightable.fit(
+        photos(known), known, gaussians=40, planes=3, iterations=2, backend=backend()
+    )
+    lit.save(tmp_path / "lights.npz")
+    lights = {"model": str(tmp_path / "lights.npz"), "light": [0.3, 0.2, 0.9]}
     kind = {"type": "gaussian_texture"}
-    return [texture_of(gaussians()) | common, kind | file | common, kind | model | common]
+    sources = [kind | source | common for source in (file, model, lights)]
+    return [texture_of(gaussians()) | common, *sources]
 
 
 def test_it_has_what_the_class_takes_and_nothing_else(described, sources):
