@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..backend.types import Doubles, Singles
+from ..backend.types import ArrayLike, Doubles, Singles
 from ..eigenbasis.incremental import largest_eigenpairs, orient, product
 from ..fitting.fit import Fit, ended, fit_problem
 from ..fitting.objective import Channels, Target
@@ -68,7 +68,7 @@ class Photos(NamedTuple):
     lights: Doubles
 
 
-def read_photos(photos: Any, lights: Any = None) -> Photos:
+def read_photos(photos: Any, lights: ArrayLike | str | os.PathLike[str] | None = None) -> Photos:
     """Read photos and their lights; for parameters and errors see `Relightable.fit`."""
     is_folder = isinstance(photos, (str, os.PathLike))
     if lights is None:
@@ -96,7 +96,7 @@ def read_photos(photos: Any, lights: Any = None) -> Photos:
     return _stacked(photos, directions)
 
 
-def _stacked(photos: Sequence[Any], lights: Doubles) -> Photos:
+def _stacked(photos: Sequence[object], lights: Doubles) -> Photos:
     """Read photos into one array."""
     rows, shape = np.empty((0, 0), np.float32), (0, 0, 0)
     for k, photo in enumerate(photos):

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..backend.arrays import types_of
 from ..backend.doors import class_of_doors, shows_progress
-from ..backend.types import ArrayLike, Doubles
+from ..backend.types import ArrayLike, Doubles, Rows
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
 from ..gaussian import packed
@@ -66,7 +66,8 @@ class Relightable:
     -----
     A direction is a vector towards the light: x to the right of the photo, y up, z towards the
     camera. Lights are far, as the table knows no distance. Between lights, cast shadows fade
-    instead of moving. Lights below the horizon are refused.
+    instead of moving. Lights below the horizon are refused. A fit holds all photos in memory, 12
+    bytes for each of their pixels.
     """
 
     planes: Gaussians
@@ -167,7 +168,7 @@ class Relightable:
             direction = [dr.opaque(types.Float, v) for v in numbers]
         factors = self.table.factors(types, direction)
 
-        def shown(rows: Any, added: bool) -> Any:
+        def shown(rows: Rows, added: bool) -> Rows:
             return type(rows)(
                 [
                     sum((f * row for f, row in zip(fs, rows, strict=False)), fs[-1] * added)
@@ -178,7 +179,7 @@ class Relightable:
         color, background = shown(planes.color, False), shown(planes.background, True)
         return replace(planes, color=color, background=background, space=RGB)
 
-    def _under(self, environment: Any) -> Gaussians:
+    def _under(self, environment: object) -> Gaussians:
         """Return the object under an environment: a sum of light over directions."""
         lights, radiance = environment_lights(environment)
         shown = render(self.planes).numpy().astype(np.float32)
@@ -247,7 +248,7 @@ ENVIRONMENT_SIZE = (32, 16)
 """Width and height to which environments are averaged: 256 directions above the horizon."""
 
 
-def environment_lights(environment: Any) -> tuple[Doubles, Doubles]:
+def environment_lights(environment: object) -> tuple[Doubles, Doubles]:
     """Return directions (m, 3) above the horizon, and what each adds of its photo, (m, 3).
 
     The photo under a light of irradiance pi counts as 1, so that a white diffuse surface is white
