@@ -110,7 +110,8 @@ def _facts_of(file: Path, picture: Path | None, texture: bool) -> Record:
     if kind != "model":
         facts["bpp"] = round(8 * facts["bytes"] / (facts["width"] * facts["height"]), 4)
     if texture:
-        facts |= _load_textures("model" if kind == "model" else "filename", **facts)
+        key = "model" if kind in ("model", "lights") else "filename"
+        facts |= _load_textures(key, **facts)
     if not packed:
         facts["ledger"] = npz.sizes_of(file)
     if picture:

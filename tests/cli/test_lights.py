@@ -54,6 +54,12 @@ def test_info_describes_a_model_of_lights(folder):
     assert facts["kind"] == "lights" and facts["planes"] == 5 and facts["lights"] == 16
 
 
+@pytest.mark.mitsuba
+def test_info_knows_the_memory_of_its_texture(folder):
+    facts = json.loads(said("info", folder / "model.npz", "--json", "--texture"))
+    assert facts["prefilter_bytes"] > facts["texture_bytes"] > 0
+
+
 @pytest.mark.parametrize(
     ("command", "source", "options", "message"),
     [
