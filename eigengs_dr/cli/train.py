@@ -163,18 +163,21 @@ def _train_on_lights(
     check_outputs([output, picture, run.report], [lights, *photos])
     select(run.backend)
     steps = choices["iterations"]
-    started = time.perf_counter()
-    with bar(run.quiet) as show:
-        model = eg.Relightable.fit(
-            folder,
-            lights,
-            gaussians=choices["gaussians"],
-            planes=planes,
-            seed=choices["seed"],
-            backend=run.backend,
-            progress=lambda done, total, row: show("planes", done, total),
-            **({} if steps is None else {"iterations": steps}),
-        )
+    started, stopped = time.perf_counter(), False
+    try:
+        with bar(run.quiet) as show:
+            model = eg.Relightable.fit(
+                folder,
+                lights,
+                gaussians=choices["gaussians"],
+                planes=planes,
+                seed=choices["seed"],
+                backend=run.backend,
+                progress=lambda done, total, row: show("planes", done, total),
+                **({} if steps is None else {"iterations": steps}),
+            )
+    except eg.Interrupted as interrupt:
+        model, stopped = interrupt.result, True
     model.save(output)
     if picture:
         eg.save_image(picture, eg.picture_of(model.relight((0, 0, 1))))
@@ -182,10 +185,14 @@ def _train_on_lights(
     figures: Record = {"gaussians": len(model.planes), "planes": planes}
     figures |= {"lights": len(model.lights), "table": model.table.kind, "seconds": seconds}
     figures["psnr_held_out"] = model.psnr_held_out
-    run.write_report(figures | {"input": folder, "output": output})
+    ending = {"stopped": "interrupted"} if stopped else {}
+    run.write_report(figures | {"input": folder, "output": output} | ending)
     run.tell(
         f"{folder}: {len(model.lights)} photos, {planes} planes, {len(model.planes):,} Gaussians "
         f"in {seconds:.1f} s",
         f"  left-out lights: psnr_rgb {model.psnr_held_out:.2f} dB, before planes are Gaussians",
         f"  wrote {output}" + (f" and {picture}" if picture else ""),
     )
+    if stopped:
+        print_message(f"interrupted; the model so far is in {output}")
+        run.context.exit(INTERRUPTED)

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..backend.arrays import types_of
 from ..backend.doors import class_of_doors, shows_progress
+from ..backend.interrupts import Interrupted
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
@@ -114,6 +115,9 @@ class Relightable:
             range; an `ImageError` if a photo cannot be used.
         OSError
             If a file cannot be opened.
+        Interrupted
+            At Ctrl-C or SIGTERM during the fit of the planes; its ``result`` is the model of the
+            best set so far.
         """
         read = read_photos(photos, lights)
         if planes is not None and not 1 <= planes <= min(64, len(read.rows)):
@@ -121,7 +125,10 @@ class Relightable:
         found = find_planes(read, planes)
         del read  # the photos take more memory than the fit
         result = fit_planes(found.images, gaussians, iterations, seed, backend, progress)
-        return cls(result.gaussians, found.table, found.psnr_held_out)
+        model = cls(result.gaussians, found.table, found.psnr_held_out)
+        if result.stopped == "interrupted":
+            raise Interrupted(model, "the fit was interrupted; .result holds the model so far")
+        return model
 
     def __repr__(self) -> str:
         size = f"{self.planes.width}x{self.planes.height} pixels"

@@ -190,3 +190,17 @@ def test_packed_files_that_are_no_models_are_refused(model, tmp_path):
         eg.Relightable.load(path)
     with pytest.raises(ValueError, match="takes no image"):
         eg.pack(model, path, np.zeros((24, 24, 3)))
+
+
+def test_an_interrupted_fit_gives_the_model_so_far():
+    lights = directions(12)
+
+    def stop(done, total, row):
+        if done >= 10:
+            raise KeyboardInterrupt
+
+    with pytest.raises(eg.Interrupted) as error:
+        eg.Relightable.fit(photos(lights), lights, iterations=500, progress=stop)
+    model = error.value.result
+    assert isinstance(model, eg.Relightable) and len(model.lights) == 12
+    assert eg.picture_of(model.relight((0, 0, 1))).shape == (24, 24, 3)
