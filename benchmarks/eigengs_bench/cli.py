@@ -18,6 +18,8 @@ from eigengs_bench.names import (
     SAMPLES,
     SETS,
     SOLVE_STEPS,
+    SUBJECTS_OF_DATA,
+    SUBJECTS_OF_SAMPLES,
     TABLES,
     TEXTURE_PARTS,
 )
@@ -291,15 +293,20 @@ def texture() -> None:
 
 
 @question("inverse")
+@data_argument
+@several("--scene", "subjects", SUBJECTS_OF_SAMPLES + SUBJECTS_OF_DATA, "Scene, by default all")
+@number("--seeds", "Number of seeds whose figures are averaged.", 2, 1)
 def inverse() -> None:
-    """Recover textures from photos by texels, a pyramid of texels, Gaussians or coefficients.
+    """Recover textures from photos by texels, a pyramid of texels, or Gaussians.
 
     \b
     poster    a flat picture, with 3 and with 16 cameras around it
     ball      the colour of a glossy coat, seen from all sides
     material  its colour and its roughness, with 6 and with 8 cameras
+    painting  a large picture from two cameras; DATA is the folder of its scene
+    wall      colour, normals and roughness of the wall behind the painting
 
-    Steps render 4 samples per pixel, others 1 and 16. Everything takes about half an hour.
+    Steps render 4 samples per pixel, others 1 and 16. Everything takes more than an hour.
     """
 
 
