@@ -17,6 +17,7 @@ from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.recording import freeze_rendering
 from eigengs_dr.backend.types import ArrayLike
 from eigengs_dr.fitting.loss import Loss
+from eigengs_dr.gaussian.channels import usual_space
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
 from eigengs_dr.image.pixels import ImageError, check_encoding, reason_of
@@ -65,8 +66,9 @@ def photo_loss(
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
         are those of the set. Bitmaps need ``raw: true``, and those of files of 8 bits also
         ``format: "variant"``, to hold floats. Their texels are then light or data, so the ``space``
-        of a fit is by default "linear" for three channels, and "data" for one. An ``envmap`` counts
-        as a bitmap, of the space "log"; its light has no `bounds`.
+        of a fit is by default "linear" for three channels, "normal" for a map with the name
+        "normal", and "data" for one channel. An ``envmap`` counts as a bitmap, of the space "log";
+        its light has no `bounds`.
     photos : sequence of array_like or tensor, shape (H, W, 3), path-like, PIL or mitsuba.Bitmap
         Of the size of the film of its sensor each; grey is replicated. Numbers of a list, an array
         or a tensor of Dr.Jit or PyTorch are linear light if they are floats, as those of
@@ -170,7 +172,7 @@ def photo_loss(
     hidden = [mi.TensorXf(np.float32(mask)) for mask in masks]
     drawn = scene, known, keys, chosen, integrator, spp
     taken = _Photos(*drawn, targets, hidden, judged, parameters, _first_of(seed))
-    spaces = {name: _space_for(known, key) for name, key in keys.items()}
+    spaces = {name: _space_for(known, name, key) for name, key in keys.items()}
     space = spaces if isinstance(pictures, Mapping) else spaces[""]
     judge = taken.judge if held_out else None
     pixels = sum(mask.size - int(mask.sum()) for mask in masks)
@@ -409,11 +411,13 @@ def _data_of(known: mi.SceneParameters, key: str) -> str:
     )
 
 
-def _space_for(known: mi.SceneParameters, key: str) -> str:
-    """Return the space of the sums of texels: logarithms for an ``envmap``, else light or data."""
+def _space_for(known: mi.SceneParameters, name: str, key: str) -> str:
+    """Return the space of a map: logarithms for an ``envmap``, normals by name, light or data."""
     if isinstance(known.properties[key][2], mi.Emitter):
         return "log"
-    return "linear" if known[key].shape[2] == 3 else "data"
+    if known[key].shape[2] != 3:
+        return "data"
+    return "normal" if usual_space(name) == "normal" else "linear"
 
 
 def _check_photo(number: int, photo: Any, size: Sequence[int], encoding: str | None) -> mi.TensorXf:

@@ -26,7 +26,7 @@ from eigengs_bench.clock import Image
 from eigengs_bench.names import SUBJECTS_OF_DATA, SUBJECTS_OF_SAMPLES
 from eigengs_bench.report import Section, Table, number, table
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_bench.subjects import LINEAR, SUBJECTS, Maps, Scene, grey, photos_of, scene_of
+from eigengs_bench.subjects import SPACES, SUBJECTS, Maps, Scene, grey, photos_of, scene_of
 from eigengs_dr.cli.scene import load_mitsuba
 from eigengs_dr.image.color import to_coded
 
@@ -81,9 +81,7 @@ def pyramid(mi: Any, scene: Scene) -> Unknown:
 def fit(mi: Any, scene: Scene, steps: int) -> Row:
     """Recover maps by `eg.fit` of a `photo_loss`; a short fit before it compiles the kernels."""
     names = list(scene.maps)
-    spaces = {
-        name: "data" if name == "roughness" else "linear" for name in names
-    }  # 1 or 3 channels
+    spaces = {name: SPACES[name] for name in names}
     size = (scene.subject.texels, scene.subject.texels)
     for iterations in (WARM_UP, steps):
         gc.collect()
@@ -169,7 +167,7 @@ def judge(mi: Any, scene: Scene, maps: Maps) -> Row:
 
 def _psnr(name: str, picture: Image, true: Image, weights: Image) -> float:
     pair = [np.clip(values, 0, 1) for values in (picture, true)]
-    if name in LINEAR:
+    if SPACES[name] == "linear":
         pair = [to_coded(values) for values in pair]
     error = np.mean(np.square(pair[0] - pair[1]), axis=2)
     return float(-10 * np.log10(np.average(error, weights=weights)))
@@ -190,12 +188,10 @@ def _jobs(task: Task, subjects: Sequence[str], seeds: int) -> Iterator[Job]:
     for spp in NOISES:
         settings += [(NOISY_STEPS, spp, method) for method in ("pyramid", "fit")]
         settings.append((LONGER, spp, "pyramid"))
-    cases = [(kind, count) for kind in subjects for count in SUBJECTS[kind].cameras]
-    for kind, count in cases:
-        if kind in SUBJECTS_OF_DATA:
-            settings = [(*PAINTING, method) for method in METHODS]
+    hung = [(*PAINTING, method) for method in METHODS]
+    for kind, count in ((kind, count) for kind in subjects for count in SUBJECTS[kind].cameras):
         for seed in range(seeds):
-            for steps, spp, method in settings:
+            for steps, spp, method in hung if kind in SUBJECTS_OF_DATA else settings:
                 job = {"scene": kind, "cameras": count, "method": method, "steps": steps}
                 job |= {"spp": spp, "seed": seed}
                 yield job, partial(recover, mi, task.data, job)

@@ -22,7 +22,7 @@ JUDGES, MANY, SEED = 4, 64, 1 << 20  # cameras without photos; samples and seed 
 SEEN_SPP = 16  # samples of the derivative that says what the photos show
 GREY = {"roughness": (0.5,), "normal": (0.5, 0.5, 1.0)}  # texels before the first step; colours:
 COLOR = (0.2, 0.2, 0.2)
-LINEAR = ("color", "albedo")  # maps of linear light; others are data
+SPACES = {"color": "linear", "albedo": "linear", "roughness": "data", "normal": "normal"}
 Maps = Mapping[str, Image]
 
 
@@ -124,7 +124,7 @@ def _maps(kind: str, data: Path | None) -> Maps:
         codes = np.clip(codes, 0, 1)
         if name == "roughness":
             codes = 0.1 + 0.8 * codes.mean(axis=2, keepdims=True)
-        maps[name] = np.float32(to_linear(codes) if name in LINEAR else codes)
+        maps[name] = np.float32(to_linear(codes) if SPACES[name] == "linear" else codes)
     return maps
 
 

@@ -19,7 +19,7 @@ from _helpers.benchmarks import (  # noqa: F401  data is a fixture
     row,
     task_in,
 )
-from _helpers.command import said
+from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
 from eigengs_bench import (
     cases,
@@ -475,20 +475,28 @@ def test_a_psnr_without_noise():
 def test_inverse(monkeypatch, tmp_path):
     pytest.importorskip("mitsuba")
     from eigengs_bench import inverse
+    from eigengs_bench.subjects import SUBJECTS
 
-    small = {"SIDE": 16, "TEXELS": 64, "MANY": 4, "STEPS": (4, 16), "CAMERAS": (2,), "NOISES": ()}
-    small["MATERIAL_CAMERAS"] = (2,)
-    photos = {"ball": {"color": "coffee"}, "material": {"albedo": "coffee", "roughness": "coffee"}}
-    for name, value in (small | {"PHOTOS": photos}).items():
+    small = {"STEPS": (4, 16), "NOISES": (), "WARM_UP": 4, "NOISY_STEPS": 16}
+    for name, value in small.items():
         monkeypatch.setattr(inverse, name, value)
-    rows, text = answered(tmp_path / "out", "inverse", "--backend", "llvm")
-    ball, material = rows[:10], rows[10:]
-    for first, then in zip(ball[:5], ball[5:], strict=True):
+    for name, subject in SUBJECTS.items():
+        one = subject._replace(texels=64, side=16, cameras=(2,))
+        monkeypatch.setitem(SUBJECTS, name, one)
+    scenes = ("--scene", "ball", "--scene", "material", "--seeds", "1")
+    rows, text = answered(tmp_path / "out", "inverse", *scenes, "--backend", "llvm")
+    ball, material = rows[:6], rows[6:]
+    for first, then in zip(ball[:3], ball[3:], strict=True):
         assert first["job"]["method"] == then["job"]["method"] in inverse.METHODS
         assert first["seconds"] > 0 and 5 < first["psnr_rgb"] < then["psnr_rgb"]
-    assert [row["job"]["method"] for row in material] == ["texels", "pyramid", "frozen", "fit"] * 2
+    assert [row["job"]["method"] for row in material] == [*inverse.METHODS] * 2
     assert all(row["albedo"] > 5 and row["roughness_constant"] > 5 for row in material)
     assert "ball, 2 cameras" in text and "at equal seconds" in text
+
+
+def test_scenes_of_data_need_their_folder(tmp_path):
+    command = "bench", "inverse", "--scene", "wall", "-o", tmp_path / "out"
+    assert_refused(run(*command), "--scene wall needs DATA")
 
 
 def test_gain_at_equal_seconds():

@@ -18,7 +18,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def wall(texture, light=1.0):
+def wall(texture, light=1.0, normals=None):
     """A diffuse wall under the same light from all sides: it looks like its texture."""
     at, cameras = mi.ScalarTransform4f(), {}
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "pixel_format": "rgb"}
@@ -30,12 +30,16 @@ def wall(texture, light=1.0):
     if not isinstance(texture, dict):
         data = mi.TensorXf(np.ascontiguousarray(texture, np.float32))
         paint = {"type": "bitmap", "data": data, "raw": True}
+    coat = {"type": "diffuse", "reflectance": paint}
+    if normals is not None:
+        relief = {"type": "bitmap", "data": mi.TensorXf(normals), "raw": True}
+        coat = {"type": "normalmap", "normalmap": relief, "paint": coat}
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "prb", "max_depth": 2},
             "sky": {"type": "constant", "radiance": light},
-            "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": paint}},
+            "wall": {"type": "rectangle", "bsdf": coat},
             **cameras,
         }
     )
@@ -66,6 +70,17 @@ def test_a_texture_is_recovered():
     error = np.mean((found.image[inner] - eg.image.color.to_coded(true_texture())[inner]) ** 2)
     assert error < 1e-3
     assert found.gaussians.space == "linear" and found.iterations == 120
+
+
+def test_a_map_of_normals_starts_flat():
+    """Its name says what it is, as that of `eigengs-dr fit --map`."""
+    from eigengs_dr.plugins import photo_loss
+
+    scene = wall(GREY, normals=GREY)
+    loss = photo_loss(scene, {"normal": "wall.bsdf.normalmap"}, photos_of(wall(GREY)))
+    result = eg.fit(loss=loss, size=(32, 32), gaussians=20, iterations=4)
+    assert result.gaussians.maps[0].space == "normal"
+    np.testing.assert_allclose(result.image["normal"].mean((0, 1)), [0.5, 0.5, 1], atol=0.05)
 
 
 def test_photos_of_few_pixels_get_few_gaussians():
