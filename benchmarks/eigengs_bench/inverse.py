@@ -189,7 +189,8 @@ def _jobs(task: Task, subjects: Sequence[str], seeds: int) -> Iterator[Job]:
         settings += [(NOISY_STEPS, spp, method) for method in ("pyramid", "fit")]
         settings.append((LONGER, spp, "pyramid"))
     hung = [(*PAINTING, method) for method in METHODS]
-    for kind, count in ((kind, count) for kind in subjects for count in SUBJECTS[kind].cameras):
+    cases = [(kind, count) for kind in subjects for count in SUBJECTS[kind].cameras]
+    for kind, count in cases:
         for seed in range(seeds):
             for steps, spp, method in hung if kind in SUBJECTS_OF_DATA else settings:
                 job = {"scene": kind, "cameras": count, "method": method, "steps": steps}

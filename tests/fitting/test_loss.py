@@ -12,7 +12,7 @@ from drjit.opt import Adam
 import eigengs_dr as eg
 from eigengs_dr.backend.arrays import _types, types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.coarse import Coarse, enlarge, shrink, texel_levels, texel_sums
+from eigengs_dr.fitting.coarse import Coarse, enlarge, fill, shrink, texel_levels, texel_sums
 from eigengs_dr.fitting.loss import LossObjective
 from eigengs_dr.fitting.objective import Channels, Pixels, Target
 from eigengs_dr.image.space import RGB, Affine, space_of
@@ -589,6 +589,32 @@ def test_levels_of_a_pyramid(backend, size):
     row = shown.reshape(fine.height, fine.width)[0, 1:-1]
     inner = row[: 2 * (coarse.width - 1)][: len(row)]
     np.testing.assert_allclose(np.diff(inner[: 2 * coarse.width - 3]), 0.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(16, 16), (21, 13)])
+def test_texels_without_a_derivative_show_what_lies_around(backend, size):
+    """Those with one stay; a channel without any keeps its mean."""
+    levels, types = texel_levels(*size), types_in(select(backend))
+    y, x = np.mgrid[: size[1], : size[0]].astype(np.float32)
+    hole = (abs(x - 6) < 3) & (abs(y - 6) < 3)
+    true = 0.2 + 0.02 * x
+    picture = types.FloatX([np.where(hole, 0.9, true).ravel(), np.full(true.size, 0.7)])
+    squares = types.FloatX([np.where(hole, 0, 1).ravel(), np.zeros(true.size)])
+    filled, rest = (row.numpy().reshape(true.shape) for row in fill(picture, squares, levels))
+    np.testing.assert_allclose(filled[~hole], true[~hole], atol=2e-3)
+    np.testing.assert_allclose(filled[hole], true[hole], atol=0.06)
+    np.testing.assert_allclose(rest, 0.7, rtol=1e-5)
+
+
+def test_a_half_that_a_loss_ignores_looks_like_the_other():
+    """Instead of the grey that a fit starts from."""
+    red, half = np.float32([0.8, 0.2, 0.1]), np.s_[:, : SIDE // 2]
+
+    def left(picture, step=0):
+        return dr.mean(dr.square(picture[half] - type(picture)(red)), axis=None)
+
+    result = eg.fit(loss=left, size=(SIDE, SIDE), gaussians=60, iterations=120, space="rgb")
+    np.testing.assert_allclose(result.image[:, SIDE // 2 + 4 :].mean((0, 1)), red, atol=0.05)
 
 
 def test_rows_between_the_ends_call_no_loss():
