@@ -365,7 +365,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         "Bytes of packed Gaussians over those of planes of pixels at equal PSNR of photos that "
         "were left out (in brackets where no size of ours meets it); what Gaussians before packing "
         "reach above the better of 9 principal components with RBF and 27 planes of HSH, both "
-        "without rounding; bytes per pixel in memory; and the error of the light that Mitsuba finds "
+        "without rounding; bytes per pixel in memory; the error of the light that Mitsuba finds "
         f"from one left-out photo, median of {FOUND}"
     )
     columns = ("set", "dB; bytes a pixel", *ratios, "PSNR, dB", "in memory", "light")

@@ -148,7 +148,7 @@ def values_of(bsdf, light, size=SIZE, mirrored=False):
     si.sh_frame, si.wi = mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Vector3f(0, 0.6, 0.8)
     si.sh_frame.s, si.sh_frame.t = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, -1 if mirrored else 1, 0)
-    x, y, z = np.array(light) / np.linalg.norm(light)
+    x, y, z = (np.array(light) / np.linalg.norm(light)).tolist()
     wo = mi.Vector3f(x, y if mirrored else -y, z)
     return picture(bsdf.eval(mi.BSDFContext(), si, wo), size)
 
