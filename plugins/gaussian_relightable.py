@@ -33,7 +33,7 @@ def gaussian_relightable() -> type:
     """Return the class of the material, a `mitsuba.BSDF` of the current variant."""
     texture = gaussian_texture()
 
-    class GaussianRelightable(mi.BSDF):  # type: ignore[misc]
+    class GaussianRelightable(mi.BSDF):
         """A `Relightable` under the lights of a scene: what its camera saw, from everywhere.
 
         With the photo P under a light from l, the value towards any direction above the surface is
