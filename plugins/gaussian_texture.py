@@ -131,9 +131,10 @@ def gaussian_texture() -> type:
 
         @collector_off()
         def eval_1_grad(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> mi.Vector2f:
-            if self.channels == 2:
+            if self.channels not in (1, 3):
                 raise ValueError(
-                    f"{self.label()}: a bump map needs heights; this set has x and y of normals"
+                    f"{self.label()}: a bump map needs heights; this set has {self.channels} "
+                    "channels"
                 )
             (x, sx), (y, sy), inside = self.point(si.uv)
             packed = self.table.packed
@@ -152,7 +153,15 @@ def gaussian_texture() -> type:
             return mi.Vector2f(m[0, 0] * du + m[1, 0] * dv, m[0, 1] * du + m[1, 1] * dv)
 
         def _color(self, si: mi.SurfaceInteraction3f, active: Mask) -> list:
-            """Look up the channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
+            """Look up the channels of a colour, a number or a normal."""
+            if self.channels > 3:
+                raise ValueError(
+                    f"{self.label()}: the set has {self.channels} channels; use a set of 1 to 3"
+                )
+            return self.values(si, active)
+
+        def values(self, si: mi.SurfaceInteraction3f, active: Mask) -> list:
+            """Look up all channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
             where = (self.wrap, self.angle, id(self.sensor), *np.array(self.to_uv.matrix).flat)
             inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
             sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))

@@ -63,8 +63,8 @@ def source_of(props: mi.Properties) -> TextureParameters:
         )
     backend = backend_of(mi.variant())
     lit = given[0] == "model" and props.plugin_name() == "gaussian_texture"
-    if lit and holds_lights(_path(props, "model")):
-        model = Relightable.load(_path(props, "model"), backend)
+    if lit and holds_lights(path(props, "model")):
+        model = Relightable.load(path(props, "model"), backend)
         return light_source(model, np.array(props.get("light", UP), np.float32).ravel())
     if given[0] == "model":
         coefficients = props.get("coefficients", None)
@@ -72,13 +72,13 @@ def source_of(props: mi.Properties) -> TextureParameters:
             coefficients = np.array(coefficients)
             if coefficients.dtype.kind not in "fiu" or not np.isfinite(coefficients).all():
                 raise ValueError(f"{props.plugin_name()}: coefficients must be finite numbers")
-        return model_source(EigenGS.load(_path(props, "model"), backend), coefficients)
+        return model_source(EigenGS.load(path(props, "model"), backend), coefficients)
     if given[0] == "filename":
         first = _read(props, "first", 0, int, "a number of Gaussians")
         if first < 0:
             raise _mistake(props, "first", first, "a number of Gaussians")
         name = _read(props, "map", "", str, "the name of a map")
-        file = _path(props, "filename")
+        file = path(props, "filename")
         if Path(file).suffix.lower() in SUFFIXES:
             bitmap = "envmap" if props.plugin_name() == "gaussian_environment" else "bitmap"
             raise ValueError(
@@ -89,7 +89,7 @@ def source_of(props: mi.Properties) -> TextureParameters:
     else:
         gaussians = _from_arrays(props, backend)
         source = TextureParameters(without_arrays(gaussians), to_tensors(gaussians))
-    if source.start.channels > 3:
+    if source.start.channels > 3 and not raw(props):
         raise ValueError(
             f"{props.plugin_name()}: the set has {source.start.channels} channels; "
             "use a set of 1 to 3"
@@ -110,7 +110,7 @@ def _from_arrays(props: mi.Properties, backend: str | None) -> Gaussians:
     return Gaussians.from_arrays(mean, factor, color, flat, size=size, space=space, backend=backend)
 
 
-def _path(props: mi.Properties, key: str) -> str:
+def path(props: mi.Properties, key: str) -> str:
     """Return the path of a file by Mitsuba's resolver, which also looks beside the scene."""
     return str(mi.file_resolver().resolve(props[key]))
 

@@ -12,12 +12,14 @@ import mitsuba as mi
 from eigengs_dr.backend import recording
 
 from .gaussian_environment import gaussian_environment
+from .gaussian_relightable import gaussian_relightable
 from .gaussian_texture import gaussian_texture
-from .versions import register_emitter, register_texture
+from .versions import register_bsdf, register_emitter, register_texture
 
 PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
     "gaussian_texture": (register_texture, gaussian_texture),
     "gaussian_environment": (register_emitter, gaussian_environment),
+    "gaussian_relightable": (register_bsdf, gaussian_relightable),
 }
 """How each plugin is registered, and what makes its class for the current variant."""
 
@@ -25,8 +27,8 @@ PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
 def register_plugins() -> None:
     """Register the plugins with the current variant of Mitsuba and with later ones.
 
-    They are ``gaussian_texture`` and ``gaussian_environment``. Further calls change nothing. In
-    scalar variants, a scene that uses them raises an error.
+    They are ``gaussian_texture``, ``gaussian_environment`` and ``gaussian_relightable``. Further
+    calls change nothing. In scalar variants, a scene that uses them raises an error.
 
     Where Dr.Jit has one thread, as on one core, it gets two: with one, Mitsuba 3.9 waits forever as
     it reads or writes an EXR file.

@@ -57,6 +57,11 @@ def register_emitter(name: str, create: Callable[[mi.Properties], Any]) -> None:
     mi.register_emitter(name, reason_first(create))
 
 
+def register_bsdf(name: str, create: Callable[[mi.Properties], Any]) -> None:
+    """Register a material with the current variant, by the type of the plugin in scenes."""
+    mi.register_bsdf(name, reason_first(create))
+
+
 @cache
 def columns_beyond() -> tuple[int, int]:
     """Return how many columns an ``envmap`` repeats beyond its left and its right border.
