@@ -113,7 +113,7 @@ def plugins_of(scene: mi.Scene) -> list[Texture]:
     found: dict[mi.Object, None] = {}
 
     class Objects(mi.TraversalCallback):
-        """What walks through the objects of a scene."""
+        """What walks through the objects of a scene: another one for each, as it calls itself."""
 
         only_objects = True
 
@@ -127,7 +127,7 @@ def plugins_of(scene: mi.Scene) -> list[Texture]:
         def put_object(self, name: str, value: mi.Object, flags: object) -> None:
             if value is not None and value not in found:
                 found[value] = None
-                value.traverse(self)
+                value.traverse(Objects())
 
     scene.traverse(Objects())
     return [node for node in found if hasattr(node, "follow")]

@@ -5,9 +5,11 @@ A Gaussian of three channels takes four words, and one of more channels half a w
     x 18 bits, a 14 | y 18, c 14 | b 16, channel 16 | channel 16, channel 16
 
 a and c, which are positive, are floats of 5 bits of exponent and 9 of mantissa; b and the channels
-are halves, with a sign and 10 bits of mantissa. Means get what a and c lack of a half: an equal
-change of all costs a picture most where it is one of means. Exponents end at `TOP`: a power of two
-brings the largest number there, so light of 100,000 keeps as many bits as that of 1.
+are halves, with a sign and 10 bits of mantissa. Means take the sign and a bit from a and c, since
+their rounding grows with the size of the picture: of 8,000 Gaussians of a photo of 512 pixels it
+alone leaves 83 dB, and that of a and c 75; with 16 bits and whole halves, 74 and 79. Exponents end
+at `TOP`: a power of two brings the largest number there, so light of 100,000 keeps as many bits as
+light of 1.
 
 To decode a number, a shift puts its bits where a float has them. That float is too small by
 2^112, since 5 bits of exponent count from 15 and 8 from 127; one product makes up for that and for
@@ -187,4 +189,5 @@ def _float_bits(values: Doubles, power: int, dropped: int) -> NDArray[np.uint32]
     """
     size = np.abs(values)
     scaled = np.where(size < _smallest(power), 0, size / (FLOAT * 2.0**power))
-    return (scaled.astype(np.float32).view(np.uint32) + (1 << (dropped - 1))) >> dropped
+    bits = scaled.astype(np.float32).view(np.uint32)
+    return (bits + np.uint32(1 << (dropped - 1))) >> np.uint32(dropped)

@@ -86,7 +86,7 @@ def lookups(gaussians, filtered, encode, parameters=None):
 
 @pytest.mark.parametrize("filtered", [False, True])
 @pytest.mark.parametrize("channels", [1, 3, 7])
-@pytest.mark.parametrize("most", [1000, 45])
+@pytest.mark.parametrize("most", [1000, 58])
 def test_sums_are_those_of_the_decoded_numbers(backend, filtered, channels, most, monkeypatch):
     """In several bands too."""
     monkeypatch.setattr(numbered, "MOST", most)
