@@ -83,7 +83,7 @@ def gaussian_environment() -> type:
             call `follow` before a rendering, as ``eigengs-dr scene`` does.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
-        memory : string, default: ``normal``, of arrays ``exact``
+        memory : string, default: normal, of arrays exact
             ``normal``: lookups read 16 bytes for a Gaussian, until a parameter changes; ``small``:
             lists of larger cells too; ``exact``: floats.
         """

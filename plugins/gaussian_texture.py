@@ -73,7 +73,7 @@ def gaussian_texture() -> type:
             carry (Mitsuba 3.10) take precedence over both. Slopes of bump maps ignore footprints.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
-        memory : string, default: ``normal``, of arrays ``exact``
+        memory : string, default: normal, of arrays exact
             ``normal``: lookups read 16 bytes for a Gaussian, until a parameter changes; ``small``:
             lists of larger cells too; ``exact``: floats.
         """
