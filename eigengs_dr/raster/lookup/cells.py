@@ -1,7 +1,7 @@
 """Lists of the Gaussians near each cell of an image, with 16 bits per entry.
 
-Lists hold numbers, not copies of parameters: a Gaussian stands in some 20 lists, and its parameters
-take 32 bytes. A set of more Gaussians than 16 bits can number is cut into bands, each with rows of
+Lists hold numbers, not copies of parameters: a Gaussian stands in some 20 lists, and its row takes
+16 or 32 bytes. A set of more Gaussians than 16 bits can number is cut into bands, each with rows of
 parameters of its own; few Gaussians reach into two bands, and their rows are stored twice.
 """
 
