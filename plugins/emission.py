@@ -90,7 +90,7 @@ def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
     """
     with dr.suspend_grad():
         table, size = dr.detach(texture.table), (texture.width, texture.height)
-        parameters = texture.source.decode(texture.source.tensors)
+        parameters = texture.parameters()
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
         dr.eval(shape, color)
         smallest = _smallest_deviation(shape, color)

@@ -28,8 +28,8 @@ def environment_of(gaussians: Gaussians | Fitted, **properties: object) -> Recor
     gaussians : Gaussians or Fit
         A set of light in equirectangular projection: twice as wide as high.
     **properties
-        Other properties of the emitter: ``scale``, ``to_world``, ``prefilter``, ``cutoff``. None
-        stands for the default.
+        Other properties of the emitter: ``scale``, ``to_world``, ``prefilter``, ``cutoff``,
+        ``memory``. None stands for the default.
 
     Returns
     -------

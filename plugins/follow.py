@@ -106,5 +106,28 @@ def check_scene(function: str, scene: object) -> None:
 
 
 def plugins_of(scene: mi.Scene) -> list[Texture]:
-    """Return the textures and environments of Gaussians in a scene."""
-    return [node for node in mi.traverse(scene).hierarchy if hasattr(node, "follow")]
+    """Return the textures and environments of Gaussians in a scene.
+
+    They are not asked for their parameters, as `mitsuba.traverse` does, which they make for it.
+    """
+    found: dict[mi.Object, None] = {}
+
+    class Objects(mi.TraversalCallback):
+        """What walks through the objects of a scene: another one for each, as it calls itself."""
+
+        only_objects = True
+
+        def put(self, name: str, value: object, flags: object, kind: object = None) -> None:
+            if isinstance(value, mi.Object):
+                self.put_object(name, value, flags)
+
+        def put_value(self, name: str, value: object, flags: object, kind: object) -> None:
+            pass
+
+        def put_object(self, name: str, value: mi.Object, flags: object) -> None:
+            if value is not None and value not in found:
+                found[value] = None
+                value.traverse(Objects())
+
+    scene.traverse(Objects())
+    return [node for node in found if hasattr(node, "follow")]

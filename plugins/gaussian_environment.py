@@ -83,6 +83,9 @@ def gaussian_environment() -> type:
             call `follow` before a rendering, as ``eigengs-dr scene`` does.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
+        memory : string, default: normal, of arrays exact
+            ``normal``: lookups read 16 bytes for a Gaussian, until a parameter changes; ``small``:
+            lists of larger cells too; ``exact``: floats.
         """
 
         transform_name = "to_world"
@@ -287,6 +290,7 @@ def gaussian_environment() -> type:
                 f"  resolution = [{self.width}, {self.height}],\n"
                 f"  space = {self.space},\n  scale = {float(self.scale[0]):g},\n"
                 f"  prefilter = {self.prefilter_name()},\n  cutoff = {self.cutoff:g},\n"
+                f"  memory = {self.memory.name},\n"
                 f"  leaves = {dr.width(self.importance.places)},\n"
                 f"  resident_bytes = {resident_bytes(self)},\n"
                 f"  to_world = {transform}\n]"

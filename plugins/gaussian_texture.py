@@ -73,6 +73,9 @@ def gaussian_texture() -> type:
             carry (Mitsuba 3.10) take precedence over both. Slopes of bump maps ignore footprints.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
+        memory : string, default: normal, of arrays exact
+            ``normal``: lookups read 16 bytes for a Gaussian, until a parameter changes; ``small``:
+            lists of larger cells too; ``exact``: floats.
         """
 
         transform_name, others = "to_uv", frozenset({"to_uv", "prefilter"})
@@ -262,7 +265,7 @@ def gaussian_texture() -> type:
                 f"  resolution = [{self.width}, {self.height}],\n"
                 f"  space = {self.space},\n  raw = {int(self.raw)},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {self.prefilter_name()},\n"
-                f"  cutoff = {self.cutoff:g},\n"
+                f"  cutoff = {self.cutoff:g},\n  memory = {self.memory.name},\n"
                 f"  resident_bytes = {resident_bytes(self)},\n"
                 f"  transform = {transform}\n]"
             )

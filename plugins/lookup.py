@@ -11,14 +11,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from eigengs_dr.backend.arrays import indices_of, scope
-from eigengs_dr.backend.types import Bool
+from eigengs_dr.backend.arrays import indices_of, scope, upload
+from eigengs_dr.backend.types import Bool, Float
 from eigengs_dr.raster.binning.lists import TileLists
+from eigengs_dr.raster.evaluate import inverted
 from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
+from eigengs_dr.raster.lookup.coding import Coding, encode_rows
 from eigengs_dr.raster.lookup.footprint import bound_covariance
 from eigengs_dr.raster.lookup.points import Packed, invert
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered, where_any
@@ -57,8 +61,31 @@ class Lists:
     finest: TileLists | None = None
 
 
+class Memory(NamedTuple):
+    """What a texture holds, see the property ``memory`` of the plugins.
+
+    Attributes
+    ----------
+    name : str
+    coded : bool
+        Whether rows of Gaussians are words of `eigengs_dr.raster.lookup.coding` until one changes.
+    coarser : int
+        Factor of the sides of cells.
+    """
+
+    name: str
+    coded: bool = True
+    coarser: int = 1
+
+
+MEMORIES = {
+    memory.name: memory
+    for memory in (Memory("exact", coded=False), Memory("normal"), Memory("small", coarser=2))
+}
+
+
 def list_gaussians(
-    shape: list, size: tuple[int, int], cutoff: float, wrap: str, filtered: bool
+    shape: list, size: tuple[int, int], cutoff: float, wrap: str, filtered: bool, memory: Memory
 ) -> Lists:
     """List Gaussians for lookups at points or, if `filtered`, over footprints.
 
@@ -67,13 +94,13 @@ def list_gaussians(
     shape : list of 5 Float, shape (N,)
         See `eigengs_dr.raster.parameters.KernelParameters`.
     size : (int, int)
-    cutoff, wrap, filtered
+    cutoff, wrap, filtered, memory
         See the properties of the texture.
     """
     if filtered:
-        sizes = classify_by_size(shape, *size, cutoff, wrap)
+        sizes = classify_by_size(shape, *size, cutoff, wrap, memory.coarser)
         return Lists(sizes.cells, sizes)  # slopes and the survey look at points
-    level = shape, cell_side(*size, dr.width(shape))
+    level = shape, cell_side(*size, dr.width(shape), memory.coarser)
     return Lists(list_cells([level], *size, kernel_radius(cutoff)), None)
 
 
@@ -98,11 +125,24 @@ class Table:
     pyramid: GaussianPyramid | None
     average: list
 
+    def parameters(self) -> KernelParameters:
+        """Return the Gaussians in the order of the set, as the rows hold them."""
+        cells, packed = self.lists.cells, self.packed
+        row = upload(mi.UInt32, cells.rows_of(np.arange(cells.count)))
+        return KernelParameters(*packed.decode(*packed.gather(row)), self.background)
+
 
 def make_table(
-    lists: Lists, cutoff: float, inputs: Arrays, decode: Callable[[Arrays], KernelParameters]
+    lists: Lists,
+    cutoff: float,
+    inputs: Arrays,
+    decode: Callable[[Arrays], KernelParameters],
+    coded: bool = False,
 ) -> Table:
-    """Compute what lookups read; derivatives flow back to the `inputs` of `decode`."""
+    """Compute what lookups read; derivatives flow back to the `inputs` of `decode`.
+
+    Rows are `coded` if the set allows it and there are no derivatives.
+    """
     cells, sizes, finest = lists.cells, lists.sizes, lists.finest
     derivatives = dr.grad_enabled(inputs)
     if sizes and (finest is None or (derivatives and finest.pieces is None)):
@@ -112,14 +152,13 @@ def make_table(
     def compute(inputs: Arrays) -> Arrays:
         parameters = decode(inputs)
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
-        rows = invert(shape, color) if sizes else (shape, color)
-        arrays: Arrays = {
-            "packed": cells.pack(*rows),
-            "background": [keep_finite(b) for b in parameters.background],
-        }
+        rows, coding = _rows(cells, shape, color, bool(sizes), coded and not derivatives)
+        background = [keep_finite(b) for b in parameters.background]
+        arrays: Arrays = {"packed": rows, "background": background}
+        arrays |= {"coding": coding} if coding else {}
         dr.eval(arrays)
         if sizes is not None and finest is not None:
-            packed = Packed(arrays["packed"], len(color), cutoff, inverted=True)
+            packed = Packed(rows, len(color), cutoff, inverted=True, coding=coding)
             pyramid = build_pyramid(sizes, packed, finest, shape, color)
             arrays |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
             dr.eval(arrays["average"])
@@ -132,26 +171,40 @@ def make_table(
         levels = levels_of(sizes.width, sizes.height, cells.count, sizes.wrap)
         pyramid = GaussianPyramid(sizes.wrap, channels, levels, arrays["values"], mi.Float(1))
         pyramid = pyramid if derivatives else pyramid.halved()
-    packed = Packed(arrays["packed"], channels, cutoff, inverted=sizes is not None)
+    coding, filtered = arrays.get("coding"), sizes is not None
+    packed = Packed(arrays["packed"], channels, cutoff, inverted=filtered, coding=coding)
     return Table(
         replace(lists, finest=finest), packed, background, pyramid, arrays.get("average", [])
     )
 
 
-def table_of_file(file: SharedFile, cutoff: float, wrap: str, filtered: bool) -> Table:
+def _rows(
+    cells: CellLists, shape: list, color: list, filtered: bool, coded: bool
+) -> tuple[Float, Coding | None]:
+    """Return the rows of Gaussians as sums read them, and what decodes them."""
+    encoded = encode_rows(shape, inverted(shape) if filtered else shape, color) if coded else None
+    if encoded is None:
+        return cells.pack(*(invert(shape, color) if filtered else (shape, color))), None
+    coding, words = encoded
+    return cells.pack_rows(words, coding.blank), coding
+
+
+def table_of_file(
+    file: SharedFile, cutoff: float, wrap: str, filtered: bool, memory: Memory
+) -> Table:
     """Return the table of all channels of a file; the first call for these settings makes it.
 
     While Dr.Jit computes it, its thread may make another texture, which then is the first.
     """
-    key = (cutoff, wrap, filtered)
+    key = (cutoff, wrap, filtered, memory)
     table: Table | None = file.tables.get(key)
     if table is None:
         parameters, size = file.parameters(), (file.like.width, file.like.height)
         lists = list_gaussians(parameters.shape, size, *key)
-        table = make_table(lists, cutoff, {}, lambda _: parameters)
-        cells = lists.cells.once_packed()
-        sizes = replace(lists.sizes, cells=cells) if lists.sizes else None
-        table = file.tables.setdefault(key, replace(table, lists=Lists(cells, sizes)))
+        table = make_table(lists, cutoff, {}, lambda _: parameters, memory.coded)
+        table = file.tables.setdefault(key, replace(table, lists=lists))
+        if table.packed.coding is not None:
+            file.forget_tensors()
     return table
 
 

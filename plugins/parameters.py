@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -28,9 +29,11 @@ from eigengs_dr.gaussian.gaussians import (
     set_of,
     to_tensors,
 )
-from eigengs_dr.raster.parameters import KernelParameters
+from eigengs_dr.raster.parameters import EXP2_SCALE, KernelParameters
 from eigengs_dr.raster.render import decode_parameters
 from eigengs_dr.relight.model import Relightable
+
+from .emission import outside_of_recordings
 
 Arrays = Record
 
@@ -44,7 +47,7 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     gaussians : Gaussians or Fit
     **properties
         Other properties of the texture: ``wrap_mode``, ``to_uv``, ``raw``, ``prefilter``,
-        ``cutoff``. None stands for the default.
+        ``cutoff``, ``memory``. None stands for the default.
 
     Returns
     -------
@@ -152,34 +155,63 @@ class SharedFile:
     """The content of a file, which is read once for all textures of a scene that use it.
 
     Textures of the maps of a material have the same means and shapes. While no texture changes
-    its parameters, all textures of a file read the same tables.
+    its parameters, all textures of a file read the same tables. If the rows of a table are coded,
+    tensors are made again when somebody asks for them.
 
     Attributes
     ----------
+    count : int
+        Number of Gaussians.
     like : Gaussians
         The set without its Gaussians, see `without_arrays`; perhaps with maps.
-    maps : dict
-        For each map by its name, or for the whole set by None: a set like that of the map, and its
-        tensors.
+    maps : dict of str to Gaussians
+        For each map by its name, or for the whole set by None: a set like that of the map.
     tables : WeakValueDictionary
         What lookups of all channels read, by the properties that it depends on; textures hold it.
     """
 
     def __init__(self, path: str, backend: str | None, first: int | None) -> None:
-        self.path = path
-        whole = Gaussians.load(path, backend)
-        if first is not None and first > len(whole):
-            raise ValueError(f"{path}: first is {first}; the file has {len(whole)} Gaussians")
-        whole = whole if first is None else whole[:first]
-        self.like = without_arrays(whole)
+        self.path, self.backend, self.first = path, backend, first
+        self.state = state_of(path)
+        whole = self._load()
+        self.count, self.like = len(whole), without_arrays(whole)
         self.tables: WeakValueDictionary[tuple, Any] = WeakValueDictionary()
-        parts: dict[str | None, Gaussians] = {m.name: whole[m.name] for m in whole.maps}
-        parts = parts or {None: whole}
-        tensors = {name: to_tensors(part) for name, part in parts.items()}
-        shared = {key: next(iter(tensors.values()))[key] for key in SHAPES}
-        self.maps = {
-            name: (without_arrays(part), tensors[name] | shared) for name, part in parts.items()
+        self.maps = {name: without_arrays(part) for name, part in _parts(whole).items()}
+        self._tensors: dict[str | None, Arrays] | None = _shared_tensors(_parts(whole))
+
+    def _load(self) -> Gaussians:
+        """Read the set, or its first Gaussians."""
+        whole, first = Gaussians.load(self.path, self.backend), self.first
+        if first is not None and first > len(whole):
+            raise ValueError(f"{self.path}: first is {first}; the file has {len(whole)} Gaussians")
+        return whole if first is None else whole[:first]
+
+    def forget_tensors(self) -> None:
+        """Free the tensors, until somebody asks for them; a table must hold the Gaussians."""
+        self._tensors = None
+
+    def tensors(self, name: str | None) -> Arrays:
+        """Return the tensors of a map, or of the whole set.
+
+        After `forget_tensors` they are those of the file, or if this has changed or is gone, those
+        of the rows of a table.
+        """
+        if self._tensors is None:
+            self._tensors = outside_of_recordings(self._made_again)
+        return self._tensors[name]
+
+    def _made_again(self) -> dict[str | None, Arrays]:
+        try:
+            if state_of(self.path) == self.state:
+                return _shared_tensors(_parts(self._load()))
+        except (OSError, ValueError):
+            pass
+        found, parts = self.parameters(), slices(self.like.maps) or [slice(None)]
+        sets = {
+            name: _encoded(found.shape, found.color[part], found.background[part], like)
+            for (name, like), part in zip(self.maps.items(), parts, strict=True)
         }
+        return _shared_tensors(sets)
 
     def source(self, name: str | None) -> TextureParameters:
         """Return a map, or the whole file, as the source of a texture.
@@ -197,16 +229,56 @@ class SharedFile:
             raise ValueError(f"{self.path} {missing} map = one of {options}")
         names = list(self.maps)
         part = slice(None) if name is None else slices(self.like.maps)[names.index(name)]
-        return TextureParameters(*self.maps[name], file=self, part=part)
+        return TextureParameters(self.maps[name], file=self, name=name, part=part)
 
     def parameters(self) -> KernelParameters:
-        """Return the parameters of all channels, decoded map by map."""
-        parts = [decode_parameters(from_tensors(t, like)) for like, t in self.maps.values()]
+        """Return the parameters of all channels, decoded map by map, or those of a table."""
+        table = next(iter(self.tables.values()), None)
+        if self._tensors is None and table is not None:
+            parameters: KernelParameters = table.parameters()
+            return parameters
+        parts = [
+            decode_parameters(from_tensors(self.tensors(name), like))
+            for name, like in self.maps.items()
+        ]
         return KernelParameters(
             parts[0].shape,
             [c for part in parts for c in part.color],
             [b for part in parts for b in part.background],
         )
+
+
+def _parts(whole: Gaussians) -> dict[str | None, Gaussians]:
+    """Return the set of each map by its name, or the whole set by None."""
+    return {m.name: whole[m.name] for m in whole.maps} or {None: whole}
+
+
+def _shared_tensors(parts: dict[str | None, Gaussians]) -> dict[str | None, Arrays]:
+    """Return the tensors of some sets, which share those of means and shapes."""
+    tensors = {name: to_tensors(part) for name, part in parts.items()}
+    shared = {key: next(iter(tensors.values()))[key] for key in SHAPES}
+    return {name: own | shared for name, own in tensors.items()}
+
+
+def _encoded(shape: list, color: list, background: list, like: Gaussians) -> Gaussians:
+    """Return the set of some parameters of kernels in another space: undo `decode_parameters`."""
+    types, space = types_of(like.mean), like.space
+    mean_x, mean_y, *factor = shape
+    if space.affine and not space.identical:
+        black = space.decode([0.0] * like.channels)
+        background = [b - k for b, k in zip(background, black, strict=True)]
+        inverse = np.linalg.inv(space.to_rgb).tolist()
+        color, background = (
+            [sum(k * v for k, v in zip(row, values, strict=True)) for row in inverse]
+            for values in (color, background)
+        )
+    return replace(
+        like,
+        mean=types.Float2(mean_x, mean_y),
+        factor=types.Float3([f * (1 / EXP2_SCALE) for f in factor]),
+        color=types.FloatX(color),
+        background=types.FloatX(background),
+    )
 
 
 def without_arrays(gaussians: Gaussians) -> Gaussians:
@@ -223,15 +295,20 @@ _files: WeakValueDictionary[tuple, SharedFile] = WeakValueDictionary()
 """The files of living textures; the textures hold them."""
 
 
-def shared_file(path: str, backend: str | None, first: int | None) -> SharedFile:
-    """Return the content of a file; while a texture uses it, the file is not read again.
-
-    A file that has changed on disk counts as another one. For errors see `Gaussians.load`.
-    """
+def state_of(path: str) -> tuple[int, ...]:
+    """Return what differs if a file is another one, or has changed."""
     with file_errors(path):
         state = os.stat(path)
-    identity = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
-    key = (*identity, mi.variant(), backend, first)
+    return state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns
+
+
+def shared_file(path: str, backend: str | None, first: int | None, coded: bool) -> SharedFile:
+    """Return the content of a file; while a texture uses it, it is read again for tensors alone.
+
+    A file that has changed on disk counts as another one, and so does one whose tables are to be
+    `coded` or not: these keep the tensors. For errors see `Gaussians.load`.
+    """
+    key = (*state_of(path), mi.variant(), backend, first, coded)
     file = _files.get(key)
     # While Dr.Jit copies the content, its thread may make another texture, which reads it first.
     return file or _files.setdefault(key, SharedFile(path, backend, first))
@@ -255,37 +332,50 @@ class TextureParameters:
     start : Gaussians
         The set of a model at its mean, or a set like that of the texture, from `without_arrays`.
     read : dict of str to TensorXf
-        The parameters at the start; a light is a Vector3f.
-    tensors : dict of str to TensorXf
-        The parameters, which `mitsuba.traverse` shows.
+        The parameters at the start, but for those of a file; a light is a Vector3f.
     weights : list of TensorXf, shape (N + 1, k)
         Those of a model, one for each channel.
     lit : Relightable or None
         The model of a light.
     file : SharedFile or None
+    name : str or None
+        The map among those of the file.
     part : slice
         The channels of the texture among those of the file.
     """
 
     start: Gaussians
-    read: Arrays
+    read: Arrays = field(default_factory=dict)
     weights: Sequence[Tensor] = ()
     lit: Relightable | None = None
     file: SharedFile | None = None
+    name: str | None = None
     part: slice = field(default_factory=lambda: slice(None))
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def tensors(self) -> Arrays:
+        """The parameters, which `mitsuba.traverse` shows; those of a file from the first use on."""
         # Separate objects on shared memory, so that each texture has its own gradient.
-        self.tensors = {name: type(t)(t) for name, t in self.read.items()}
+        return {name: type(t)(t) for name, t in self._at_start().items()}
+
+    def _at_start(self) -> Arrays:
+        return self.file.tensors(self.name) if self.file else self.read
 
     @property
     def count(self) -> int:
         """Number of Gaussians."""
-        return int(self.tensors["mean"].shape[0]) if "mean" in self.tensors else len(self.start)
+        if self.file and "tensors" not in vars(self):
+            return self.file.count
+        if "mean" in self.tensors:
+            return int(self.tensors["mean"].shape[0])
+        return len(self.lit.planes if self.lit else self.start)
 
     def is_that_of_file(self) -> bool:
         """Return whether the parameters share the memory of the file: they have not changed."""
-        unchanged = (t.array.index == self.read[k].array.index for k, t in self.tensors.items())
+        if "tensors" not in vars(self):
+            return True
+        read = self._at_start()
+        unchanged = (t.array.index == read[k].array.index for k, t in self.tensors.items())
         return not dr.grad_enabled(self.tensors) and all(unchanged)
 
     def decode(self, inputs: Arrays) -> KernelParameters:
@@ -338,7 +428,7 @@ def light_source(model: Relightable, light: NDArray[np.float32]) -> TextureParam
     """Return the direction of the light of a model as the source of a texture."""
     start, towards = model.relight(light), mi.Vector3f(*light.tolist())
     dr.make_opaque(towards)  # another light compiles no other programs
-    return TextureParameters(start, {"light": towards}, lit=model)
+    return TextureParameters(without_arrays(start), {"light": towards}, lit=model)
 
 
 def model_source(model: EigenGS, coefficients: NDArray[np.float32] | None) -> TextureParameters:

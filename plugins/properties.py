@@ -17,6 +17,7 @@ from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
 from eigengs_dr.relight.model import Relightable, holds_lights
 
+from .lookup import MEMORIES, Memory
 from .parameters import (
     TextureParameters,
     light_source,
@@ -85,7 +86,8 @@ def source_of(props: mi.Properties) -> TextureParameters:
                 f"{file}: is an image, not a set of Gaussians; make one by 'eigengs-dr fit', or "
                 f"give the image to the plugin {bitmap}"
             )
-        source = shared_file(file, backend, first or None).source(name or None)
+        shared = shared_file(file, backend, first or None, memory(props).coded)
+        source = shared.source(name or None)
     else:
         gaussians = _from_arrays(props, backend)
         source = TextureParameters(without_arrays(gaussians), to_tensors(gaussians))
@@ -131,6 +133,14 @@ def cutoff(props: mi.Properties, default: float) -> float:
     if not 0 < value <= MAX_CUTOFF:
         raise _mistake(props, "cutoff", value, f"above 0 and at most {MAX_CUTOFF:g}")
     return value
+
+
+def memory(props: mi.Properties) -> Memory:
+    """Read ``memory``, one of `MEMORIES`; by default "exact" for arrays, for files "normal"."""
+    name = props.get("memory", "exact" if "mean" in props else "normal")
+    if not isinstance(name, str) or name not in MEMORIES:
+        raise _mistake(props, "memory", name, f"one of {', '.join(MEMORIES)}")
+    return MEMORIES[name]
 
 
 def prefilter(props: mi.Properties) -> tuple[float, bool]:

@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from eigengs_dr.backend.types import Bool, Float
 from eigengs_dr.raster.lookup.points import sum_at_points, value_terms
+from eigengs_dr.raster.parameters import KernelParameters
 
 from . import properties
 from .color import shown_channels, upload_table
@@ -54,6 +55,7 @@ def plugin_of_sums(base: type) -> Any:
             self.file = properties.file_name(props)
             self.raw = raw
             self.cutoff = properties.cutoff(props, start.cutoff)
+            self.memory = properties.memory(props)
             self.angle, self.follows = properties.prefilter(props)
             self.prefilter = dr.opaque(mi.Float, self.angle)
             self.sensor: mi.Sensor | None = None
@@ -64,6 +66,8 @@ def plugin_of_sums(base: type) -> Any:
             self.changed = False
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
+            if hasattr(callback, "only_objects"):
+                return
             for name, tensor in self.source.tensors.items():
                 callback.put(name, tensor, mi.ParamFlags.Differentiable)
             name = self.transform_name
@@ -82,21 +86,32 @@ def plugin_of_sums(base: type) -> Any:
 
         def _take_over(self, moved: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
-            source, settings = self.source, (self.cutoff, self.wrap, self.filtered())
+            source = self.source
+            settings = self.cutoff, self.wrap, self.filtered(), self.memory
             if source.file and source.is_that_of_file():
                 self.table, self.part = table_of_file(source.file, *settings), source.part
                 return
 
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
-            if moved or not self.table.lists.cells.packs:
+            if moved:
                 shape = source.decode(dr.detach(source.tensors)).shape
                 lists = list_gaussians(shape, (self.width, self.height), *settings)
             else:
                 lists = self.table.lists
-            table = make_table(lists, self.cutoff, source.tensors, source.decode)
+            # Rows of a texture that has changed stay floats: words would be another program.
+            coded = self.memory.coded and not self.changed
+            table = make_table(lists, self.cutoff, source.tensors, source.decode, coded)
             # A texture that has changed may change its colours next, and needs all lists again.
             self.table = table if self.changed else replace(table, lists=lists)
             self.part = slice(None)
+
+        def parameters(self) -> KernelParameters:
+            """Return the Gaussians; of a file, they need not be read again for it."""
+            source = self.source
+            if not (source.file and source.is_that_of_file()):
+                return source.decode(source.tensors)
+            found, part = source.file.parameters(), source.part
+            return KernelParameters(found.shape, found.color[part], found.background[part])
 
         # --- The prefilter -----------------------------------------------------------------------
 

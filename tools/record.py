@@ -838,10 +838,11 @@ def _() -> Figures:
     mi, path = mitsuba(), folder() / "material.npz"
     fitted_material().save(path)
     model().save(folder() / "texture-model.npz")
-    source = {"type": "gaussian_texture", "filename": str(path)}
+    exact = {"type": "gaussian_texture", "memory": "exact"}
+    source = {**exact, "filename": str(path)}
     rough = mi.load_dict({**source, "map": "roughness"})
     albedo = mi.load_dict({**source, "map": "albedo", "first": 100})
-    mean = mi.load_dict({"type": "gaussian_texture", "model": str(folder() / "texture-model.npz")})
+    mean = mi.load_dict({**exact, "model": str(folder() / "texture-model.npz")})
     si = points()
     values = rough.eval_1(si), rough.eval_1_grad(si), albedo.eval(si), mean.eval(si)
     return of_pixels(*map(np.array, values))

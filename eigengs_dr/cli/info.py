@@ -49,7 +49,7 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     for the held-out images.
 
     With --texture, texture_bytes is the memory of a gaussian_texture of the file for lookups at
-    points, and prefilter_bytes its memory with a prefilter.
+    points, prefilter_bytes its memory with a prefilter, and small_bytes with memory = small.
 
     For a model of lights, the command shows the number of planes, and the PSNR of left-out lights.
 
@@ -191,14 +191,18 @@ def _truncation(model: eg.EigenGS) -> list[Record]:
 
 
 def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Record:
-    """Return the memory of textures of a file in bytes, without and with a prefilter."""
+    """Return the memory of textures of a file in bytes, by some of their properties."""
     mi = load_mitsuba(None, quiet=True)
     from ..plugins import resident_bytes
 
     source = {"type": "gaussian_texture", key: file} | ({"map": maps[0]["name"]} if maps else {})
+    kinds: Record = {
+        "texture_bytes": {},
+        "prefilter_bytes": {"prefilter": 1e-3},
+        "small_bytes": {"memory": "small"},
+    }
     with scene_errors(Path(file)):  # one at a time: textures of a file share memory
-        sizes = [resident_bytes(mi.load_dict({**source, "prefilter": a})) for a in (0.0, 1e-3)]
-    return dict(zip(("texture_bytes", "prefilter_bytes"), sizes, strict=True))
+        return {name: resident_bytes(mi.load_dict(source | kind)) for name, kind in kinds.items()}
 
 
 def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:

@@ -37,7 +37,7 @@ CLOSER = (-6.0, 0.0, 8.0)
 """PSNR of the fit above the goal, in dB, tried in turn, since the fit weighs light differently from
 cameras."""
 
-BYTES = 100
+BYTES = 60
 """Fewest bytes of a Gaussian in memory; they limit a set to the memory of its bitmap."""
 
 NEWTON, TINY = 4, 1e-30

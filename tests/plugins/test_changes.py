@@ -81,7 +81,7 @@ def test_colours_alone_keep_the_lists(prefilter, of_file, tmp_path):
 
 @pytest.mark.parametrize("prefilter", PREFILTERS)
 def test_a_file_of_more_gaussians_than_16_bits_number(prefilter, tmp_path, monkeypatch):
-    """It keeps no rows by Gaussian, and the first change of colours finds them again."""
+    """The first change of colours finds their rows in each band."""
     size, random = (64, 256), np.random.default_rng(0)
     arrays = random.uniform(0, 1, (60, 2)) * size, np.tile([0.4, 0.1, 0.5], (60, 1))
     color, last = random.uniform(-0.1, 0.1, (60, 3)), [0.5] * 3
@@ -95,8 +95,8 @@ def test_a_file_of_more_gaussians_than_16_bits_number(prefilter, tmp_path, monke
     set_of(1).save(tmp_path / "x.npz")
     path = str(tmp_path / "x.npz")
     tex = mi.load_dict({"type": "gaussian_texture", "filename": path, "prefilter": prefilter})
-    assert not tex.table.lists.cells.packs
-    np.testing.assert_allclose(seen(tex), expected[0], atol=2e-5)
+    assert dr.width(tex.table.lists.cells.first) > 1
+    np.testing.assert_allclose(seen(tex), expected[0], atol=1e-3)  # of words of 16 bits
     parameters = mi.traverse(tex)
     parameters["color"] = 0.5 * parameters["color"]
     parameters.update()

@@ -503,6 +503,7 @@ class TestFile:
         scene.write_text(
             '<scene version="3.0.0"><emitter type="gaussian_environment">'
             '<string name="filename" value="sky.npz"/><float name="scale" value="2"/>'
+            '<string name="memory" value="exact"/>'
             '<transform name="to_world"><rotate y="1" angle="70"/></transform>'
             "</emitter></scene>"
         )

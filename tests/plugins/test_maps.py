@@ -49,7 +49,7 @@ def map_texture(path, name=None, **properties):
 def test_values_are_those_of_the_map_alone(file, prefilter):
     m = eg.Gaussians.load(file, backend())
     for name in [part.name for part in m.maps]:
-        found = map_texture(file, name, prefilter=prefilter)
+        found = map_texture(file, name, prefilter=prefilter, memory="exact")
         alone = mi.load_dict(texture_of(m[name], prefilter=prefilter))
         si = texel_centres()
         if m[name].channels == 1:
@@ -161,6 +161,7 @@ def of_files(file):
     def make(shared, prefilter=0.0):
         def texture(name):
             source = {"type": "gaussian_texture", "filename": str(file), "map": name}
+            source["memory"] = "exact"  # pictures are compared to rounding
             return {**(source if shared else texture_of(whole[name])), "prefilter": prefilter}
 
         coat = {"type": "principled", "base_color": texture("albedo")}
@@ -231,8 +232,8 @@ class TestMapsOfAFile:
         plain, inner = getattr(module, step), []
 
         def make():
-            held = files.shared_file(str(file), backend(), None)
-            return held, reuse.table_of_file(held, 3.0, "repeat", True)
+            held = files.shared_file(str(file), backend(), None, coded=True)
+            return held, reuse.table_of_file(held, 3.0, "repeat", True, reuse.MEMORIES["normal"])
 
         def nested(*inputs):
             monkeypatch.undo()

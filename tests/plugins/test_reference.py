@@ -33,6 +33,7 @@ def sources(tmp_path):
     material(backend=backend()).save(tmp_path / "maps.npz")
     small_model(backend()).save(tmp_path / "model.npz")
     common = {"wrap_mode": "mirror", "raw": True, "prefilter": 0.0, "cutoff": 3.0}
+    common["memory"] = "small"
     common["to_uv"] = mi.ScalarTransform4f()
     file = {"filename": str(tmp_path / "maps.npz"), "map": "albedo", "first": 3}
     coefficients = mi.traverse(

@@ -60,8 +60,8 @@ def test_nested_maps_and_several_uses(folder, tmp_path):
 
 
 def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
-    """A small photo takes less memory than its Gaussians, a large gradient takes more."""
-    monkeypatch.setattr(convert, "NEGLIGIBLE", 0)  # the photo is small
+    """A small bitmap of one channel takes less memory than its Gaussians, a large gradient more."""
+    monkeypatch.setattr(convert, "NEGLIGIBLE", 0)  # it is small
     y, x = np.mgrid[:512, :512] / 512
     eg.save_image(folder / "soft.png", np.stack([0.2 + 0.5 * x, y * x, 0.5 + 0 * x], axis=2))
     text = wall(folder).read_text()
@@ -72,7 +72,7 @@ def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     by_name = {t.names[0]: t for t in found.textures}
     assert by_name["soft.png (paint.reflectance)"].bytes == 512 * 512 * 4  # Dr.Jit pads colours
     assert all(t.gaussian_bytes <= t.bytes for t in found.textures)
-    assert "photo.png (principled.base_color)" in {t.names[0] for t in found.better}
+    assert "rough.png (principled.roughness)" in {t.names[0] for t in found.better}
     [(left, reason)] = found.left  # without renderings
     assert left == "normals.png (normalmap.normalmap)" and "renderings decide" in reason
     for texture in found.better:

@@ -1,7 +1,7 @@
 """Lists of the Gaussians near each cell of an image, with 16 bits per entry.
 
-Lists hold numbers, not copies of parameters: a Gaussian stands in some 20 lists, and its parameters
-take 32 bytes. A set of more Gaussians than 16 bits can number is cut into bands, each with rows of
+Lists hold numbers, not copies of parameters: a Gaussian stands in some 20 lists, and its row takes
+16 or 32 bytes. A set of more Gaussians than 16 bits can number is cut into bands, each with rows of
 parameters of its own; few Gaussians reach into two bands, and their rows are stored twice.
 """
 
@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.arrays import ArrayTypes, types_of, upload_rows
+from ...backend.arrays import ArrayTypes, types_of, upload, upload_rows
 from ...backend.recording import record
 from ...backend.types import Bool, Float, UInt
 from ..binning.lists import TileLists, build_lists
@@ -76,9 +76,9 @@ class CellLists:
     runs : UInt32, shape (2 * runs,)
         Numbers of 16 bits, in runs of `RUN`: rows of parameters, counted from the first row of the
         band. 0 is the blank row, which fills the last run of a list.
-    gaussian : UInt32, shape (rows,), or None
-        Gaussian of each row of parameters; `count` for a blank row. None for a single band, whose
-        Gaussians follow the blank row in order, and if parameters are not packed again.
+    members : UInt32, shape (bands * words,), or None
+        A bit for each Gaussian and band that it reaches into. The rows of a band are a blank one
+        and its Gaussians in order; Gaussians of no band come last. None for a single band of all.
     first : UInt32, shape (bands,)
         First row of each band.
     density : Float, shape (1,)
@@ -90,41 +90,46 @@ class CellLists:
     count: int
     levels: list[Cells]
     runs: UInt
-    gaussian: UInt | None
+    members: UInt | None
     first: UInt
     density: Float
     last: UInt
 
-    @property
-    def packs(self) -> bool:
-        """Whether `pack` knows the rows: it does not after `once_packed`, with several bands."""
-        return self.gaussian is not None or dr.width(self.first) == 1
-
-    def once_packed(self) -> CellLists:
-        """Return the lists without what only `pack` needs."""
-        return replace(self, gaussian=None)
-
     def pack(self, shape: list, color: list) -> Float:
         """Store parameters (N,) in rows, as sums read them; differentiable."""
-        values, blank = [*shape, *color], (*BLANK, *[0.0] * len(color))
-        gaussian = self.gaussian
-        if gaussian is None:
-            assert self.packs
+        return self.pack_rows([*shape, *color], (*BLANK, *[0.0] * len(color)))
+
+    def pack_rows(self, values: list, blank: Sequence[float]) -> Float:
+        """Store numbers (N,) in rows, with others in the rows of no Gaussian; differentiable."""
+        if self.members is None:
             return pack_parameters(values, blank)
-        real, one = gaussian < self.count, dr.opaque(types_of(shape[0]).Float, 1.0)
+        types = types_of(values[0])
+        gaussian = upload(types.UInt, self._gaussian_of_rows())
+        real, one = gaussian < self.count, dr.opaque(types.Float, 1.0)
         # A derivative that is both added to at indices and used elsewhere has lost parts in Dr.Jit
-        # 1.5: the product makes a variable that is only gathered.
+        # 1.5: the product makes a variable that is only gathered. Words are no factors.
+        values = [v * one if dr.grad_enabled(v) else v for v in values]
         rows = [
-            dr.select(real, dr.gather(type(v), v * one, gaussian, real), b)
+            dr.select(real, dr.gather(type(v), v, gaussian, real), b)
             for v, b in zip(values, blank, strict=True)
         ]
         return pack_parameters(rows)
 
+    def _gaussian_of_rows(self) -> NDArray[np.int64]:
+        """Return the Gaussian of each row, `count` for a blank one, where there are several bands.
+
+        The host finds it anew at each call: stored, it would take 4 bytes for each Gaussian.
+        """
+        assert self.members is not None
+        listed = _unpack_bits(self.members.numpy(), dr.width(self.first), self.count)
+        bands = [np.append(self.count, np.flatnonzero(band)) for band in listed]
+        return np.concatenate([*bands, np.flatnonzero(~listed.any(axis=0))])
+
     def rows_of(self, gaussian: NDArray[np.int64]) -> NDArray[np.uint32]:
         """Return the row of each of some Gaussians, or one of its rows."""
-        if self.gaussian is None:
+        if self.members is None:
             return (gaussian + 1).astype(np.uint32)
-        stored = self.gaussian.numpy()
+        stored = self._gaussian_of_rows()
         row = np.zeros(self.count + 1, np.uint32)
         row[stored] = np.arange(len(stored))
         return row[gaussian]
@@ -153,9 +158,9 @@ class CellLists:
         return dr.gather(types.UInt, self.first, band)
 
 
-def cell_side(width: int, height: int, count: int) -> int:
-    """Return the side of cells in pixels, about `SIDE`."""
-    return max(1, round(SIDE * math.sqrt(width * height / count)))
+def cell_side(width: int, height: int, count: int, coarser: int = 1) -> int:
+    """Return the side of cells in pixels, about `SIDE`, or a multiple of it."""
+    return coarser * max(1, round(SIDE * math.sqrt(width * height / count)))
 
 
 def list_cells(
@@ -205,7 +210,7 @@ def list_cells(
         count,
         cells,
         runs,
-        bands.gaussian,
+        bands.members,
         bands.first,
         dr.opaque(types.Float, 1 / bands.height),
         dr.opaque(types.UInt, dr.width(bands.first) - 1),
@@ -374,7 +379,7 @@ def _append(runs: UInt, active: Bool, number: UInt, slot: UInt, stop: UInt, half
 class _Bands:
     """Rows of parameters, see `CellLists`, and for each level the numbers of `_Strips`."""
 
-    gaussian: UInt | None
+    members: UInt | None
     first: UInt
     height: int  # of a band, in pixels
     numbers: list[UInt | None]
@@ -390,11 +395,13 @@ def _number(types: ArrayTypes, count: int, lists: list[TileLists]) -> _Bands:
     while True:
         band = side * -(-grid.ny // bands)
         cuts = [_cut(one, band) for one in lists]
-        members = [
-            _members(count, [splat[k] for splat, k in zip(splats, parts, strict=True)])
-            for parts in zip(*cuts, strict=True)
-        ]
-        if max(map(len, members)) <= MOST:
+        listed = np.stack(
+            [
+                _listed(count, [splat[k] for splat, k in zip(splats, parts, strict=True)])
+                for parts in zip(*cuts, strict=True)
+            ]
+        )
+        if listed.sum(axis=1).max() <= MOST:
             break
         if bands >= grid.ny:
             raise ValueError(
@@ -403,15 +410,13 @@ def _number(types: ArrayTypes, count: int, lists: list[TileLists]) -> _Bands:
             )
         bands = min(2 * bands, grid.ny)
     local, numbers = np.zeros(count, np.uint32), [np.zeros_like(splat) for splat in splats]
-    for inside, parts in zip(members, zip(*cuts, strict=True), strict=True):
-        local[inside] = np.arange(1, len(inside) + 1)
+    for inside, parts in zip(listed, zip(*cuts, strict=True), strict=True):
+        local[inside] = np.arange(1, inside.sum() + 1)
         for number, splat, part in zip(numbers, splats, parts, strict=True):
             number[part] = local[splat[part]]
-    rest = np.setdiff1d(np.arange(count), np.concatenate(members))
-    gaussian = np.concatenate([*(np.concatenate([[count], m]) for m in members), rest])
-    first = np.cumsum([0, *(1 + len(m) for m in members[:-1])])
-    stored, starts, *uploaded = upload_rows(types.UInt, [gaussian, first, *numbers])
-    return _Bands(stored, starts, band, list(uploaded))
+    first = np.cumsum(np.append(0, 1 + listed[:-1].sum(axis=1)))
+    bits, starts, *uploaded = upload_rows(types.UInt, [_pack_bits(listed), first, *numbers])
+    return _Bands(bits, starts, band, list(uploaded))
 
 
 def _cut(lists: TileLists, band: int) -> list[slice]:
@@ -422,9 +427,21 @@ def _cut(lists: TileLists, band: int) -> list[slice]:
     return [slice(*ends) for ends in pairwise(ends[rows * grid.nx].tolist())]
 
 
-def _members(count: int, lists: list[NDArray[np.uint32]]) -> NDArray[np.int64]:
-    """Return the Gaussians in some lists, in ascending order."""
+def _listed(count: int, lists: list[NDArray[np.uint32]]) -> NDArray[np.bool_]:
+    """Return for each Gaussian whether it is in one of some lists."""
     listed = np.zeros(count, bool)
     for splat in lists:
         listed[splat] = True
-    return np.flatnonzero(listed)
+    return listed
+
+
+def _pack_bits(rows: NDArray[np.bool_]) -> NDArray[np.uint32]:
+    """Store rows of booleans as bits, each row in whole words of 32 bits."""
+    padded = np.pad(rows, ((0, 0), (0, -rows.shape[1] % 32)))
+    return np.packbits(padded, axis=1).view(np.uint32).ravel()
+
+
+def _unpack_bits(words: NDArray[np.uint32], rows: int, count: int) -> NDArray[np.bool_]:
+    """Return the rows of `_pack_bits`, of `count` booleans each."""
+    bits = np.ascontiguousarray(words).view(np.uint8).reshape(rows, -1)
+    return np.unpackbits(bits, axis=1, count=count).astype(bool)

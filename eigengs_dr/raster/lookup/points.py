@@ -17,6 +17,7 @@ from ...backend.types import Bool, Float, Mask, UInt
 from ..evaluate import LN2, inverted, weights
 from ..parameters import NUM_SHAPE_PARAMS, kernel_radius, unpack_parameters
 from .cells import CellLists
+from .coding import Coding
 
 Terms = Callable[[list, list, Float, Float], list]
 """``terms(shape, color, x, y)`` returns what a Gaussian contributes to each sum at a point."""
@@ -36,12 +37,15 @@ class Packed:
         Standard deviations.
     inverted : bool
         Whether the rows are those of `invert`, for sums over footprints.
+    coding : Coding or None
+        What decodes the rows, if they hold words of it, without gradients.
     """
 
     values: Float
     channels: int
     cutoff: float
     inverted: bool = False
+    coding: Coding | None = None
 
     @property
     def radius(self) -> float:
@@ -50,6 +54,10 @@ class Packed:
 
     def gather(self, row: UInt, active: Mask = True) -> tuple[list, list]:
         """Return the shape and the channels in rows, as they are stored."""
+        if self.coding is not None:
+            words = unpack_parameters(self.values, row, self.coding.words, active)
+            shape, color = self.coding.decode(words)
+            return shape, times_determinant(shape, color) if self.inverted else color
         number = NUM_SHAPE_PARAMS + self.channels
         values = unpack_parameters(self.values, row, number, active)
         return values[:NUM_SHAPE_PARAMS], values[NUM_SHAPE_PARAMS:]
@@ -78,8 +86,13 @@ def invert(shape: list, color: list) -> tuple[list, list]:
         The colours times the determinant of the inverse.
     """
     shape = inverted(shape)
+    return shape, times_determinant(shape, color)
+
+
+def times_determinant(shape: list, color: list) -> list:
+    """Return colours times the determinant of an inverse."""
     determinant = shape[2] * shape[4]
-    return shape, [k * determinant for k in color]
+    return [k * determinant for k in color]
 
 
 def fold(x: Float, side: int, wrap: str) -> tuple[Float, Float]:

@@ -71,7 +71,9 @@ class SizeClasses:
     cells: CellLists
 
 
-def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: str) -> SizeClasses:
+def classify_by_size(
+    shape: list, width: int, height: int, cutoff: float, wrap: str, coarser: int = 1
+) -> SizeClasses:
     """Sort Gaussians for `eigengs_dr.raster.lookup.prefilter.sum_prefiltered`.
 
     Parameters
@@ -83,6 +85,8 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
     cutoff : float
         Standard deviations.
     wrap : {"repeat", "mirror", "clamp", "sphere"}
+    coarser : int, optional
+        Factor of the sides of cells.
 
     Returns
     -------
@@ -93,7 +97,7 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
     types = types_of(shape[0])
     x, y, a, b, c = (np.array(s.numpy(), np.float64) for s in shape)
     # Dr.Jit writes lists while the host sorts.
-    spreads, cells = _list_widened(shape, width, height, kernel_radius(cutoff))
+    spreads, cells = _list_widened(shape, width, height, kernel_radius(cutoff), coarser)
     with np.errstate(all="ignore"):
         size = EXP2_SCALE * max_deviation(a, b, c)
         visible = np.isfinite(x + y + size) & (a > 0) & (c > 0)
@@ -134,11 +138,11 @@ def classify_by_size(shape: list, width: int, height: int, cutoff: float, wrap: 
 
 
 def _list_widened(
-    shape: list, width: int, height: int, radius: float
+    shape: list, width: int, height: int, radius: float, coarser: int
 ) -> tuple[tuple[float, ...], CellLists]:
     """List the Gaussians widened by each of `LISTED_FOOTPRINTS`, all in one array."""
     Float, count = types_of(shape[0]).Float, dr.width(shape)
-    spacing, smallest = math.sqrt(width * height / count), cell_side(width, height, count)
+    spacing, smallest = math.sqrt(width * height / count), cell_side(width, height, count, coarser)
     spreads, levels = tuple(k * spacing for k in LISTED_FOOTPRINTS), []
     for number, spread in enumerate(spreads):
         variance = dr.opaque(Float, (spread / EXP2_SCALE) ** 2)
