@@ -1,4 +1,4 @@
-"""Settings of the manual: Sphinx, MyST-NB, numpydoc, sphinx-click and sphinx-gallery."""
+"""Settings of the manual: Sphinx, MyST-NB, numpydoc and sphinx-gallery."""
 
 import re
 import sys
@@ -31,7 +31,6 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",
     "numpydoc",
-    "sphinx_click",
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
@@ -100,7 +99,7 @@ def read_page(app: Any, name: str, source: list[str]) -> None:
     """Make a page of a checkout one of the HTML.
 
     Pages of `OUTSIDE` are shown where they belong, links to examples lead to their tutorials, and
-    what only the HTML can show comes out of its comment.
+    what only the HTML can show comes out of its comment, in place of the tables of names.
     """
     text = source[0]
     for file, page in OUTSIDE.items():
@@ -112,6 +111,7 @@ def read_page(app: Any, name: str, source: list[str]) -> None:
         text = re.sub(rf"\]\((\.\./)+{file}\.md", f"](/{page}.md", text)
     text = re.sub(r"\]\((\.\./)+examples/README\.md", "](/tutorials/index.rst", text)
     text = re.sub(r"\]\((?:\.\./)+examples/(\w+)\.py", r"](/tutorials/\1.rst", text)
+    text = re.sub(r"<!-- names: .*?<!-- end -->", "", text, flags=re.S)
     source[0] = re.sub(r"<!-- manual:\n(.*?)-->", r"\1", text, flags=re.S)
 
 
@@ -135,20 +135,6 @@ def write_pages(app: Any) -> None:
     pages.write_pages()
 
 
-def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
-    """Turn the lines of a help text that keep their breaks into a block of code."""
-    result: list[str] = []
-    for line in lines:
-        text = line.removeprefix("| ")
-        if text == line or not text.startswith(" "):
-            result.append(text)
-            continue
-        if not result[-1].startswith("   "):
-            result += ["", ".. code-block:: text", ""]
-        result.append("   " + text.strip())
-    lines[:] = result
-
-
 def setup(app: Any) -> None:
     """Connect the functions above."""
     app.connect("builder-inited", check_pages)
@@ -156,7 +142,6 @@ def setup(app: Any) -> None:
     app.connect("source-read", read_page)
     app.connect("doctree-read", link_names)
     app.connect("autodoc-skip-member", skip_tuple_fields)
-    app.connect("sphinx-click-process-description", show_examples_as_code)
 
 
 # --- Tutorials -----------------------------------------------------------------------------------
