@@ -134,10 +134,10 @@ def methods_of(found: object) -> list[str]:
 
 def helps() -> str:
     """Return what ``--help`` of the program and of each of its commands prints."""
-    top = click.Context(main, info_name="eigengs-dr", show_default=True, max_content_width=100)
+    top = click.Context(main, info_name="eigengs-dr", show_default=True, terminal_width=80)
     texts = {"eigengs-dr": main.get_help(top)}
     for name, command in main.commands.items():
-        context = click.Context(command, top, name, max_content_width=100)
+        context = click.Context(command, top, name)  # as wide as that above
         texts[f"eigengs-dr {name}"] = command.get_help(context)
     parts = [f"## {name}\n\n```text\n{text}\n```" for name, text in texts.items()]
     return "\n\n".join(parts)

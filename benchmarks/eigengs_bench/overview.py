@@ -100,7 +100,9 @@ def _kodak(axis: Axes, fits: pd.DataFrame, size: float = 8) -> None:
         for count, point in points.iterrows() if alpha == 1 else ():
             words = f"{count:,} Gaussians" if count == points.index.min() else f"{count:,}"
             at = (point.seconds, point.psnr_float)
-            axis.annotate(words, at, (-6, 3), textcoords="offset points", fontsize=size, ha="right")
+            axis.annotate(
+                words, at, (-6, 3), textcoords="offset points", fontsize=size - 1, ha="right"
+            )
     others = published().dropna(subset="seconds")
     marks = zip(
         others.groupby("method", sort=False), (fr.RED, fr.ORANGE, fr.GREY), "*XP", strict=False
