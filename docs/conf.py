@@ -66,7 +66,8 @@ numpydoc_class_members_toctree = False
 # A name in single backticks is a link where it is public, else plain code.
 default_role = "py:obj"
 smartquotes = False  # options keep both of their hyphens
-_public = "|".join(name for name in eg.__all__)
+PUBLIC = set(eg.__all__) - {"__version__", "paper", "plugins"}
+_public = "|".join(sorted(PUBLIC))
 nitpick_ignore_regex = [("py:obj", rf"(?!(eigengs_dr\.)?({_public})$).*"), ("py:class", r".*")]
 
 
@@ -81,7 +82,7 @@ def skip_tuple_fields(
 def check_pages(app: Any) -> None:
     """Warn of public names that the reference leaves out, and of what pages say without ground."""
     listed = set((Path(__file__).parent / "reference" / "python.md").read_text().split())
-    for name in sorted(set(eg.__all__) - listed):
+    for name in sorted(PUBLIC - listed):
         LOGGER.warning("reference/python.md: the public name %s is not listed", name)
     for line in missing():
         LOGGER.warning("%s does not exist", line)
@@ -119,11 +120,7 @@ def link_names(app: Any, page: nodes.document) -> None:
     """Make links of the public names in backticks, as in `eigengs_dr.fit`."""
     for code in list(page.findall(nodes.literal)):
         package, _, name = code.astext().rpartition(".")
-        if (
-            package == "eigengs_dr"
-            and name in eg.__all__
-            and isinstance(code.parent, nodes.Element)
-        ):
+        if package == "eigengs_dr" and name in PUBLIC and isinstance(code.parent, nodes.Element):
             if isinstance(code.parent, nodes.reference | addnodes.pending_xref):
                 continue
             target = {"reftype": "obj", "reftarget": code.astext(), "refdoc": app.env.docname}

@@ -317,7 +317,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         "reach above the better of 9 principal components with RBF and 27 planes of HSH, both "
         "without rounding; bytes per pixel in memory"
     )
-    columns = ("set", "dB; bytes a pixel", *ratios, "PSNR, dB", "in memory")
+    columns = ("set", "dB; bytes per pixel", *ratios, "PSNR, dB", "in memory")
     figures = {name: fr.number(middle[name], 2) for name in ("bytes", "held")}
     figures |= {f"over_{k}": fr.number(middle[name], 2) for k, name in enumerate(ratios)}
     charts = {"relight": _chart(points)}
