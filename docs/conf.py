@@ -1,4 +1,4 @@
-"""Settings of the manual: Sphinx, MyST-NB, numpydoc, sphinx-click and sphinx-gallery."""
+"""Settings of the manual: Sphinx, MyST-NB, numpydoc and sphinx-gallery."""
 
 import re
 import sys
@@ -31,7 +31,6 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",
     "numpydoc",
-    "sphinx_click",
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
@@ -67,7 +66,8 @@ numpydoc_class_members_toctree = False
 # A name in single backticks is a link where it is public, else plain code.
 default_role = "py:obj"
 smartquotes = False  # options keep both of their hyphens
-_public = "|".join(name for name in eg.__all__)
+PUBLIC = set(eg.__all__) - {"__version__", "paper", "plugins"}
+_public = "|".join(sorted(PUBLIC))
 nitpick_ignore_regex = [("py:obj", rf"(?!(eigengs_dr\.)?({_public})$).*"), ("py:class", r".*")]
 
 
@@ -82,7 +82,7 @@ def skip_tuple_fields(
 def check_pages(app: Any) -> None:
     """Warn of public names that the reference leaves out, and of what pages say without ground."""
     listed = set((Path(__file__).parent / "reference" / "python.md").read_text().split())
-    for name in sorted(set(eg.__all__) - listed):
+    for name in sorted(PUBLIC - listed):
         LOGGER.warning("reference/python.md: the public name %s is not listed", name)
     for line in missing():
         LOGGER.warning("%s does not exist", line)
@@ -100,7 +100,7 @@ def read_page(app: Any, name: str, source: list[str]) -> None:
     """Make a page of a checkout one of the HTML.
 
     Pages of `OUTSIDE` are shown where they belong, links to examples lead to their tutorials, and
-    what only the HTML can show comes out of its comment.
+    what only the HTML can show comes out of its comment, in place of the tables of names.
     """
     text = source[0]
     for file, page in OUTSIDE.items():
@@ -112,6 +112,7 @@ def read_page(app: Any, name: str, source: list[str]) -> None:
         text = re.sub(rf"\]\((\.\./)+{file}\.md", f"](/{page}.md", text)
     text = re.sub(r"\]\((\.\./)+examples/README\.md", "](/tutorials/index.rst", text)
     text = re.sub(r"\]\((?:\.\./)+examples/(\w+)\.py", r"](/tutorials/\1.rst", text)
+    text = re.sub(r"<!-- names: .*?<!-- end -->", "", text, flags=re.S)
     source[0] = re.sub(r"<!-- manual:\n(.*?)-->", r"\1", text, flags=re.S)
 
 
@@ -119,11 +120,7 @@ def link_names(app: Any, page: nodes.document) -> None:
     """Make links of the public names in backticks, as in `eigengs_dr.fit`."""
     for code in list(page.findall(nodes.literal)):
         package, _, name = code.astext().rpartition(".")
-        if (
-            package == "eigengs_dr"
-            and name in eg.__all__
-            and isinstance(code.parent, nodes.Element)
-        ):
+        if package == "eigengs_dr" and name in PUBLIC and isinstance(code.parent, nodes.Element):
             if isinstance(code.parent, nodes.reference | addnodes.pending_xref):
                 continue
             target = {"reftype": "obj", "reftarget": code.astext(), "refdoc": app.env.docname}
@@ -135,20 +132,6 @@ def write_pages(app: Any) -> None:
     pages.write_pages()
 
 
-def show_examples_as_code(app: Any, context: Any, lines: list[str]) -> None:
-    """Turn the lines of a help text that keep their breaks into a block of code."""
-    result: list[str] = []
-    for line in lines:
-        text = line.removeprefix("| ")
-        if text == line or not text.startswith(" "):
-            result.append(text)
-            continue
-        if not result[-1].startswith("   "):
-            result += ["", ".. code-block:: text", ""]
-        result.append("   " + text.strip())
-    lines[:] = result
-
-
 def setup(app: Any) -> None:
     """Connect the functions above."""
     app.connect("builder-inited", check_pages)
@@ -156,7 +139,6 @@ def setup(app: Any) -> None:
     app.connect("source-read", read_page)
     app.connect("doctree-read", link_names)
     app.connect("autodoc-skip-member", skip_tuple_fields)
-    app.connect("sphinx-click-process-description", show_examples_as_code)
 
 
 # --- Tutorials -----------------------------------------------------------------------------------

@@ -1,4 +1,7 @@
-"""What sphinx-gallery calls: the order of the tutorials, and the pictures that they wrote."""
+"""What sphinx-gallery calls: the order of the tutorials, and the pictures that they wrote.
+
+After ``make docs``, ``python docs/gallery.py`` writes the pictures of examples/README.md.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +24,10 @@ ORDER = (
 SMALLEST = 256
 """Pictures narrower than this are shown at a multiple of their size."""
 
-BUILD = Path(__file__).parent.parent / "build" / "docs" / "examples"
+ROOT = Path(__file__).parent.parent
+BUILD = ROOT / "build" / "docs" / "examples"
+
+HEIGHT, WIDTH, GAP = 160, 800, 4  # pixels: of a strip at most, and white between two pictures
 
 
 def sort_key(name: str) -> tuple[int, str]:
@@ -52,3 +58,24 @@ def scrape_pictures(block: Any, block_vars: dict[str, Any], gallery_conf: dict[s
             size = (times * picture.width, times * picture.height)
             picture.resize(size, Image.Resampling.NEAREST).save(names[-1])
     return figure_rst(names, gallery_conf["src_dir"])
+
+
+def write_strips() -> None:
+    """Write the pictures of each script side by side, in examples/images/."""
+    folder = ROOT / "examples" / "images"
+    folder.mkdir(exist_ok=True)
+    for script in sorted((ROOT / "examples").glob("*.py")):
+        files = sorted((BUILD / script.stem).glob("*.png"), key=lambda p: p.stat().st_mtime_ns)
+        pictures = [Image.open(file).convert("RGB") for file in files]
+        shown = [p.resize((p.width * HEIGHT // p.height, HEIGHT)) for p in pictures]
+        strip = Image.new("RGB", (sum(p.width + GAP for p in shown) - GAP, HEIGHT), "white")
+        left = 0
+        for picture in shown:
+            strip.paste(picture, (left, 0))
+            left += picture.width + GAP
+        strip.thumbnail((WIDTH, HEIGHT))
+        strip.save(folder / f"{script.stem}.jpg", quality=85, optimize=True)
+
+
+if __name__ == "__main__":
+    write_strips()

@@ -1,19 +1,26 @@
-"""Pages of `eigengs_dr.view` in the manual, and the parameters of the texture in its page.
+"""Pages of `eigengs_dr.view` in the manual, and the parts of the reference that the code writes.
 
-``python docs/pages.py`` writes the table of the parameters between its marks.
+``python docs/pages.py`` writes these between their marks: public names, the help of commands, and
+the parameters of plugins.
 """
 
+import ast
 import inspect
+import pydoc
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import FunctionType
 from typing import Any
 
+import click
 import numpy as np
 
 import eigengs_dr as eg
 from eigengs_bench.pages import filled
+from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
 from eigengs_dr.image.space import DATA
 from eigengs_dr.relight.lights import LightTable
@@ -21,11 +28,9 @@ from eigengs_dr.relight.lights import LightTable
 FOLDER = Path(__file__).parent.parent / "build" / "docs" / "extra"
 """Sphinx copies what is in it beside the manual."""
 
-REFERENCES = {
-    f"gaussian_{name}": Path(__file__).parent / "reference" / f"gaussian-{name}.md"
-    for name in ("texture", "environment")
-}
-"""The page of each plugin."""
+REFERENCE = Path(__file__).parent / "reference"
+
+PLUGINS = ("texture", "environment")
 
 
 def write_pages() -> None:
@@ -46,14 +51,96 @@ ENTRY = re.compile(r"^(\w[\w, ]*) : (.+)\n((?: {4}.*\n?)+)", re.M)
 """A parameter in a docstring: its name, or several, its type with the default, and what it is."""
 
 
+NAMES = re.compile(r"((?:^   [\w.]+\n)+)```\n-->\n\n<!-- (names: [\w-]+) -->", re.M)
+"""The names that an autosummary lists, and the mark of their table, which follows it."""
+
+LONG = 20
+"""Length of a default value from which a signature shows dots instead."""
+
+
 def outdated() -> dict[Path, str]:
-    """Return the pages of plugins with what they should hold, where a table is another one."""
-    pages = {}
-    for plugin, page in REFERENCES.items():
+    """Return the pages of the reference that differ from the code, with what they should hold."""
+    found = {}
+    for page in (REFERENCE / "python.md", REFERENCE / "commands.md", *plugin_pages().values()):
         there = page.read_text("utf-8")
-        right = filled(there, {f"parameters: {plugin}": plugin_parameters(plugin)}, page.name)
-        pages |= {} if right == there else {page: right}
-    return pages
+        parts = {mark: names_table(names.split()) for names, mark in NAMES.findall(there)}
+        if "<!-- commands: all -->" in there:
+            parts["commands: all"] = helps()
+        plugins = [plugin for plugin, its_page in plugin_pages().items() if page == its_page]
+        parts |= {f"parameters: {plugin}": plugin_parameters(plugin) for plugin in plugins}
+        right = filled(there, parts, page.name)
+        found |= {} if right == there else {page: right}
+    return found
+
+
+def plugin_pages() -> dict[str, Path]:
+    """Return the page of each plugin."""
+    return {f"gaussian_{name}": REFERENCE / f"gaussian-{name}.md" for name in PLUGINS}
+
+
+def names_table(names: list[str]) -> str:
+    """Return the table of public names: signature, methods, first line of the docstring."""
+    lines = ["| name | what it is |", "|---|---|"]
+    for name in names:
+        found = pydoc.locate(f"eigengs_dr.{name}")
+        text = inspect.getdoc(found) if callable(found) else documented(name)
+        first = str(text).splitlines()[0].replace("``", "`").replace("|", "\\|")
+        methods = ", ".join(f"`{method}`" for method in methods_of(found))
+        shown = f"{first} Methods: {methods}" if methods else first
+        lines.append(f"| `{name}{signature_of(found)}` | {shown} |")
+    return "\n".join(lines)
+
+
+def documented(name: str) -> str:
+    """Return the first sentence below the definition of a constant."""
+    package = Path(eg.__file__).parent
+    stub = (package / "__init__.pyi").read_text("utf-8")
+    (module,) = re.findall(rf"^from \.([\w.]+) import {name} as", stub, re.M)
+    source = package / f"{module.replace('.', '/')}.py"
+    for node, text in pairwise(ast.parse(source.read_text("utf-8")).body):
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
+            assert isinstance(text, ast.Expr), f"{name} has no text below its definition"
+            return " ".join(ast.literal_eval(text.value).split()).split(". ")[0]
+    raise ValueError(f"{source}: does not define {name}")
+
+
+def signature_of(found: object) -> str:
+    """Return the parameters of a function or a class, without types and long defaults."""
+    if not callable(found) or (isinstance(found, type) and issubclass(found, BaseException)):
+        return ""
+    shown = []
+    for parameter in inspect.signature(found).parameters.values():
+        default = repr(parameter.default)
+        if parameter.default is not parameter.empty and len(default) >= LONG:
+            parameter = parameter.replace(default=Dots())
+        shown.append(parameter.replace(annotation=parameter.empty))
+    return str(inspect.Signature(shown))
+
+
+class Dots:
+    """Stands for a long default value."""
+
+    def __repr__(self) -> str:
+        """Return three dots."""
+        return "..."
+
+
+def methods_of(found: object) -> list[str]:
+    """List the public methods and properties that a class of this package defines."""
+    kinds = (property, classmethod, staticmethod, FunctionType)
+    own = vars(found) if isinstance(found, type) else {}
+    return [name for name, made in own.items() if name[0] != "_" and type(made) in kinds]
+
+
+def helps() -> str:
+    """Return what ``--help`` of the program and of each of its commands prints."""
+    top = click.Context(main, info_name="eigengs-dr", show_default=True, terminal_width=80)
+    texts = {"eigengs-dr": main.get_help(top)}
+    for name, command in main.commands.items():
+        context = click.Context(command, top, name)  # as wide as that above
+        texts[f"eigengs-dr {name}"] = command.get_help(context)
+    parts = [f"## {name}\n\n```text\n{text}\n```" for name, text in texts.items()]
+    return "\n\n".join(parts)
 
 
 def plugin_parameters(plugin: str) -> str:

@@ -25,7 +25,7 @@ rocket = eg.fit(photo, gaussians=1500, iterations=100, space="rgb").gaussians
 # NumPy
 # -----
 #
-# ``to_arrays`` returns plain arrays with one row a Gaussian: mean (N, 2), factor (N, 3),
+# ``to_arrays`` returns plain arrays with one row per Gaussian: mean (N, 2), factor (N, 3),
 # color (N, 3), and the background (3,). This code mirrors the set: it reflects x, and
 # changes the sign of the shear b of the factor (a, b, c).
 
@@ -46,7 +46,7 @@ print(f"NumPy: the mirrored set and mirrored pixels differ by {difference:.4f} a
 # -------
 #
 # ``dr.wrap`` turns the rendering into a function of PyTorch tensors. The gradient passes through
-# it. PyTorch's colours have one row a Gaussian; a set has one row a channel.
+# it. PyTorch's colours have one row per Gaussian; a set has one per channel.
 
 try:
     import torch
@@ -104,7 +104,7 @@ if torch:
 #
 # Colourings of one geometry, such as a batch from a network, need one rendering: colours (B, 3, N)
 # are a set of 3 B channels of data. Its pictures are those of B renderings, bit for bit; with 5
-# colourings, the step of PyTorch takes about two thirds of the time. A set has up to 16 channels.
+# colourings, the step of PyTorch takes about two thirds of the time. A set has up to 64 channels.
 
 
 def render_batch(colors):

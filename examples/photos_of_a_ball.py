@@ -116,8 +116,8 @@ print(f"{3 * TEXELS**2:,} numbers as texels: {eg.psnr(view, by_texels):.1f} dB i
 # Gaussians
 # ---------
 #
-# ``photo_loss`` says which bitmap of the scene is looked for, and which photos there are. Then
-# ``eg.fit`` does the rest, by one Gaussian for 16 pixels if nothing else is asked for.
+# ``photo_loss`` names the bitmap to recover, and the photos. ``eg.fit`` does the rest, and
+# chooses the number of Gaussians.
 
 loss = photo_loss(room(GREY), "ball.bsdf.reflectance", photos, sensors=range(CAMERAS))
 result = eg.fit(loss=loss, size=(TEXELS, TEXELS), iterations=STEPS, space="linear")

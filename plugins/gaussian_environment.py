@@ -51,17 +51,17 @@ def gaussian_environment() -> type:
         Parameters
         ----------
         filename : string
-            A set of Gaussians, an ``.npz`` or ``.egs`` file; relative to the scene.
+            An ``.npz`` or ``.egs`` file, relative to the scene.
         map : string
-            With the `filename` of a set with maps: the name of a map.
+            Name of a map of `filename`.
         first : integer, default: all
-            With `filename`: use this many Gaussians, from the first; for sets fitted in levels.
+            Number of Gaussians of `filename` to use, for sets with levels.
         model : string
-            Instead of `filename`: a model, as ``eigengs-dr train`` writes it.
+            A model that ``eigengs-dr train`` writes.
         coefficients : tensor (C, k), default: 0
-            With `model`: one row per channel; 0 is the mean image.
+            Of `model`; 0 is the mean image.
         mean : tensor (N, 2)
-            Instead of `filename`: x, y in pixels.
+            x, y in pixels.
         factor : tensor (N, 3)
             a, b, c in 1 / pixels.
         color : tensor (N, C)
@@ -69,18 +69,16 @@ def gaussian_environment() -> type:
         background : tensor (C,)
             Value without Gaussians; `environment_of` writes it as (1, C).
         width, height : integer
-            With `mean`: native size in pixels, at least 2.
+            Native size in pixels, with `mean`.
         space : string
-            With `mean`: ``radiance`` or ``log``; or ``linear``, ``rgb`` or ``ycbcr``, whose light
-            ends at 1.
+            Space of `color`, with `mean`; only ``radiance`` and ``log`` exceed 1.
         to_world : transform, default: identity
             Rotates the light; before, the zenith is the y axis.
         scale : float, default: 1
             Factor of the light.
         prefilter : float or boolean, default: 0
-            Angle of a pixel in radians, below 1: lookups average over such a pixel, whose standard
-            deviation is 0.4 of it; 0 looks at points. With ``true`` the light follows a sensor:
-            call `follow` before a rendering, as ``eigengs-dr scene`` does.
+            Angle of a pixel in radians, below 1, over which lookups average; 0 looks at points;
+            ``true`` takes that of the sensor that `follow` names.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         memory : string, default: normal, of arrays exact

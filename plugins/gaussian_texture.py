@@ -33,44 +33,41 @@ def gaussian_texture() -> type:
         Parameters
         ----------
         filename : string
-            A set of Gaussians, an ``.npz`` or ``.egs`` file; relative to the scene. Textures of one
-            file share memory and lookups, each until one of its parameters changes.
+            An ``.npz`` or ``.egs`` file, relative to the scene. Textures of one file share memory
+            and lookups until a parameter changes.
         map : string
-            With the `filename` of a set with maps: the name of a map, such as ``roughness``.
+            Name of a map of `filename`, such as ``roughness``.
         first : integer, default: all
-            With `filename`: use this many Gaussians, from the first; for sets fitted in levels.
+            Number of Gaussians of `filename` to use, for sets with levels.
         model : string
-            Instead of `filename`: an `EigenGS` or a `Relightable`, as ``eigengs-dr train`` writes.
+            A model that ``eigengs-dr train`` writes.
         coefficients : tensor (C, k), default: 0
-            With the `model` of a family: one row per channel; 0 is the mean image.
+            Of the `model` of a family; 0 is the mean image.
         light : vector, default: (0, 0, 1)
-            With a relightable `model`: the direction towards the light, of any length, with x along
-            u, y against v and z towards the camera. Differentiable.
+            Of a relightable `model`: the direction towards the light, of any length; x along u, y
+            against v, z towards the camera.
         mean : tensor (N, 2)
-            Instead of `filename`: x, y in pixels.
+            x, y in pixels.
         factor : tensor (N, 3)
             a, b, c in 1 / pixels.
         color : tensor (N, C)
-            In the space of the set. C is 1 or 3; or 2 in the space ``data``: codes of x and y of
-            normals, whose z follows from the length 1.
+            In the space of the set; C is 1 or 3, or 2 for x and y of normals in ``data``.
         background : tensor (C,)
             Value without Gaussians; `texture_of` writes it as (1, C).
         width, height : integer
-            With `mean`: native size in pixels.
+            Native size in pixels, with `mean`.
         space : string
-            With `mean`: ``ycbcr``, ``rgb``, ``linear``, ``data``, ``normal``, ``radiance`` or
-            ``log``; the last two have no upper bound.
+            Space of `color`, with `mean`.
         to_uv : transform, default: identity
-            Applied to uv before the lookup; it must be invertible.
+            Applied to uv; invertible.
         wrap_mode : string, default: repeat
             Continuation outside of the image: ``repeat``, ``mirror`` or ``clamp``.
         raw : boolean, default: false
-            Return values as they are, neither decoded nor clamped.
+            Whether to return sums as they are, neither decoded nor clamped.
         prefilter : float or boolean, default: 0
-            Angle of a pixel in radians, below 1, see `pixel_angle`: lookups average over the
-            footprint of the pixel; 0 looks at points. With ``true`` the texture follows a sensor:
-            call `follow` before a rendering, as ``eigengs-dr scene`` does. Footprints that rays
-            carry (Mitsuba 3.10) take precedence over both. Slopes of bump maps ignore footprints.
+            Angle of a pixel in radians, below 1 (`pixel_angle`), over which lookups average; 0
+            looks at points; ``true`` takes that of the sensor that `follow` names. Footprints that
+            rays carry (Mitsuba 3.10) take precedence.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         memory : string, default: normal, of arrays exact

@@ -62,7 +62,7 @@ def photo_loss(
     scene : mitsuba.Scene
         Its bitmaps get the pictures, of any size; the last one stays in the scene.
     pictures : str or mapping of str to str
-        The bitmap that is looked for, as `mitsuba.traverse` names it, such as
+        The bitmap to recover, as `mitsuba.traverse` names it, such as
         ``"ball.bsdf.base_color"``; or the bitmaps of several maps by the names of the maps, which
         are those of the set. Bitmaps need ``raw: true``, and those of files of 8 bits also
         ``format: "variant"``, to hold floats. Their texels are then light or data, so the ``space``

@@ -137,5 +137,7 @@ def test_all_are_listed_and_tested():
     scripts = {path.name for path in FOLDER.glob("*.py")}
     listed = re.findall(r"^\| \[`(\w+\.py)`\]\(\1\) \|", (FOLDER / "README.md").read_text(), re.M)
     assert sorted(listed) == sorted(scripts)
+    sizes = {path.stem: path.stat().st_size for path in (FOLDER / "images").iterdir()}
+    assert {f"{name}.py" for name in sizes} == scripts and max(sizes.values()) < 60_000
     tested = {name.removeprefix("test_") + ".py" for name in globals() if name.startswith("test_")}
     assert scripts <= tested

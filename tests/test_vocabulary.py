@@ -1,15 +1,11 @@
 """One word for one thing: what users write, in Python and on the command line."""
 
 import inspect
-import re
-from pathlib import Path
 
 import click
 
 import eigengs_dr as eg
 from eigengs_dr.cli.main import main
-
-PAGE = Path(__file__).parents[1] / "docs" / "reference" / "vocabulary.md"
 
 OTHER_WORDS = {
     "spaces": "space",
@@ -53,11 +49,3 @@ def test_commands_use_the_words_of_the_functions():
         if name.lstrip("-").replace("-", "_") in OTHER_WORDS.keys() - {"target"}
     ]
     assert not wrong
-
-
-def test_the_page_names_words_that_exist():
-    words = re.findall(r"^\| `(\w+)` \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    known = {word for call in CALLS.values() for word in inspect.signature(call).parameters}
-    known |= set(inspect.signature(eg.Gaussians.load).parameters)
-    assert len(words) > 10
-    assert set(words) <= known

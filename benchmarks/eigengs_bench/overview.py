@@ -32,9 +32,30 @@ PEERS = (
 )
 
 
+LEGIBLE = 10.5
+"""Size of text in points that a chart of 5.4 inches shows with 14 pixels, and on a phone with 9."""
+
+
 def charts(rows: Mapping[str, Sequence[Row]]) -> dict[str, Figure]:
-    """Draw the chart of speed against accuracy, if there are rows for both of its parts."""
-    return {"speed": _speed(rows)} if {"pareto", "kodak"} <= rows.keys() else {}
+    """Draw the charts of speed against accuracy, if there are rows for both of their parts."""
+    if not {"pareto", "kodak"} <= rows.keys():
+        return {}
+    return {"speed": _speed(rows), "kodak-speed": _kodak_alone(fr.frame_of(rows["kodak"]))}
+
+
+def _kodak_alone(fits: pd.DataFrame) -> Figure:
+    """Draw Kodak beside published figures, for a front page that may be read on a phone."""
+    figure = fr.new_figure(5.4, 5.2)
+    axis = figure.subplots()
+    _kodak(axis, fits, LEGIBLE)
+    fr.label_axes(axis, "seconds per photo", "PSNR in RGB / dB", legend=False)
+    axis.xaxis.set_minor_formatter("")
+    axis.tick_params(labelsize=LEGIBLE)
+    for text in (axis.xaxis.label, axis.yaxis.label):
+        text.set_fontsize(LEGIBLE)
+    named = axis.get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower center", fontsize=LEGIBLE, ncols=1)
+    return figure
 
 
 def _speed(rows: Mapping[str, Sequence[Row]]) -> Figure:
@@ -68,7 +89,7 @@ def _methods(axis: Axes, fits: pd.DataFrame) -> None:
     axis.set_title(f"{fits.image.nunique()} photos of {size}", fontsize=9)
 
 
-def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
+def _kodak(axis: Axes, fits: pd.DataFrame, size: float = 8) -> None:
     """Draw timed fits, a line per number of steps, and published figures that have seconds."""
     timed = fits[fits.timed & (fits.iterations > 0)]
     for (steps, part), alpha in zip(timed.groupby("iterations"), (1.0, 0.5), strict=False):
@@ -79,7 +100,9 @@ def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
         for count, point in points.iterrows() if alpha == 1 else ():
             words = f"{count:,} Gaussians" if count == points.index.min() else f"{count:,}"
             at = (point.seconds, point.psnr_float)
-            axis.annotate(words, at, (-6, 3), textcoords="offset points", fontsize=7, ha="right")
+            axis.annotate(
+                words, at, (-6, 3), textcoords="offset points", fontsize=size - 1, ha="right"
+            )
     others = published().dropna(subset="seconds")
     marks = zip(
         others.groupby("method", sort=False), (fr.RED, fr.ORANGE, fr.GREY), "*XP", strict=False
@@ -89,7 +112,8 @@ def _kodak(axis: Axes, fits: pd.DataFrame) -> None:
         machine, source = part.machine.iloc[0], part.source.iloc[0]
         label = f"{method}, {counts}, {machine} ({source})"
         axis.plot(part.seconds, part.psnr_float, marker, color=color, ms=9, label=label)
-    axis.set_title(f"{fits.image.nunique()} photos of Kodak,\n2 cores beside GPUs", fontsize=9)
+    title = f"{fits.image.nunique()} photos of Kodak,\n2 cores beside GPUs"
+    axis.set_title(title, fontsize=max(size, 9))
 
 
 def _peers(axis: Axes, points: pd.DataFrame) -> None:

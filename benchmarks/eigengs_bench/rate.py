@@ -174,8 +174,8 @@ def _table(name: str, points: pd.DataFrame) -> fr.Table:
     reached = (str(len(sizes)) for sizes in by_level)
     lines.append(("images that all reach", *reached, *[fr.MISSING] * 3))
     caption = (
-        f"{name}, {fr.counted(points.image)}: bits a pixel for a PSNR in 8-bit RGB, interpolated; "
-        "BD-rate: bits of ours at equal PSNR against the codec's, mean over the images"
+        f"{name}, {fr.counted(points.image)}: bits per pixel for a PSNR in 8-bit RGB, interpolated"
+        "; BD-rate: bits of ours at equal PSNR against the codec's, mean over the images"
     )
     columns = ("codec", *(f"{level:g} dB" for level in LEVELS), "BD-rate", "s", "s to decode")
     return fr.table(caption, columns, lines, name)

@@ -375,7 +375,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         "without rounding; bytes per pixel in memory; the error of the light that Mitsuba finds "
         f"from one left-out photo, median of {FOUND}"
     )
-    columns = ("set", "dB; bytes a pixel", *ratios, "PSNR, dB", "in memory", "light")
+    columns = ("set", "dB; bytes per pixel", *ratios, "PSNR, dB", "in memory", "light")
     figures = {name: fr.number(middle[name], 2) for name in ("bytes", "held", "degrees", "exact")}
     figures |= {f"over_{k}": fr.number(middle[name], 2) for k, name in enumerate(ratios)}
     charts = {"relight": _chart(points)}

@@ -189,7 +189,7 @@ STYLES = ("o-", "s--", "^:", "D-.")
 FIGURES = {
     "step, ms": "step_ms",
     "with lists, ms": "mean_ms",
-    "ns a pixel": "ns_a_pixel",
+    "ns per pixel": "ns_a_pixel",
     "placing, s": "place_seconds",
     "colour solve, s": "solve_seconds",
     "peak, GiB": "peak_gib",
@@ -202,7 +202,7 @@ RATES = {
 CAPTIONS = {
     "pixels": "Time and memory over pixels, at equal density of Gaussians",
     "splats": "Time and memory over Gaussians",
-    "small": f"Small images: fits of {FIT_STEPS} steps, images a second",
+    "small": f"Small images: fits of {FIT_STEPS} steps, images per second",
 }
 
 

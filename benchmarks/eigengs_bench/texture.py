@@ -200,7 +200,7 @@ LOOKUPS = {
 
 def _memory(row: Row) -> Table:
     """Lay out the memory of textures, beside that of bitmaps with the pixels of their pictures."""
-    caption = f"Memory of a texture of {PIXELS} pixels a Gaussian; time from file to first lookup"
+    caption = f"Memory of a texture of {PIXELS} pixels per Gaussian; time from file to first lookup"
     columns = ["Gaussians", "arrays of the file", "points", "prefilter", "BC7", "ASTC 6x6"]
     columns += ["bitmap, mip maps", "points, ms", "prefilter, ms"]
     lines = []

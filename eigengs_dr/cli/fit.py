@@ -93,27 +93,25 @@ def fit(
     """Fit sums of Gaussians to images. Grey ones become RGB; --space data keeps one channel.
 
     An IMAGE may be a folder of images, a pattern in quotes, or a URL. For several images, -o and
-    --preview name folders. Files in these folders are named after the images, and manifest.jsonl
-    has one row per image. If an image cannot be fitted, the others still are, and the exit code is
-    2. With --cluster, the processes of a Dask cluster fit the images, with the same results.
+    --preview name folders, whose files are named after the images; manifest.jsonl has one row per
+    image. If an image cannot be fitted, the others still are, and the exit code is 2.
 
     The result of a single image is replaced if it exists. Of several images, those whose results
-    exist are skipped, so that the same command continues a run. Options that differ from those of
-    existing results are an error; --overwrite fits all images again. A file that is not a set of
-    Gaussians is never replaced.
+    exist are skipped, so that the same command continues a run; results of other options are an
+    error. A file that is not a set of Gaussians is never replaced.
 
     Ctrl-C writes the best fit so far of a single image, or stops after the last complete one of
-    several images, with exit code 130. If --target-psnr cannot be reached, the command reports it,
-    writes the best fit and exits with code 1.
+    several, with exit code 130. If --target-psnr cannot be reached, the command writes the best fit
+    and exits with code 1.
 
-    An image that is too large for the memory of this machine is refused, with the memory that it
-    takes. --blocks 1024 fits it block by block, by default with one Gaussian per 20 pixels. Ctrl-C
-    then keeps the finished blocks, and the same command continues.
+    An image that is too large for the memory of this machine is refused. --blocks 1024 fits it
+    block by block, by default with one Gaussian per 20 pixels. Ctrl-C then keeps the finished
+    blocks, and the same command continues.
 
     With --map, several maps of the same size, such as albedo, roughness and normal, share one set
-    of shapes, and -o names the file. Maps with names such as albedo or color are fitted in linear
-    light, normal as normals, and others as data; --map height:data=FILE sets the space of a map.
-    --target-psnr then applies to each map.
+    of shapes, and -o names the file. Albedo and color are fitted in linear light, normal as
+    normals, and other names as data; --map height:data=FILE sets the space of a map. --target-psnr
+    then applies to each map.
 
     \b
     Examples:
@@ -123,10 +121,7 @@ def fit(
       eigengs-dr fit photo.jpg -o photo.npz --basis natural --iterations 100
       eigengs-dr fit photo.jpg -o levels.npz --levels 5000,7000,9000
       eigengs-dr fit photos/ -o fits/ --iterations 300 --report fits.json
-      eigengs-dr fit photos/ extra.png -o fits/ --overwrite --preview previews/
-      eigengs-dr fit photos/ -o fits/ --recursive
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
-      eigengs-dr fit s3://bucket/photos/ -o /shared/fits/ --cluster tcp://node1:8786
       eigengs-dr fit roughness.png -o roughness.npz --space data
       eigengs-dr fit sky.exr -o sky.npz --space log --gaussians 20000
       eigengs-dr fit huge.tif -o huge.npz --blocks 1024

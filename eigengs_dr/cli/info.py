@@ -37,26 +37,20 @@ from .scene import load_mitsuba, scene_errors
 def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None:
     """Show the contents of a fitted image, a material or a model.
 
-    NAME is a basis of the package, such as natural. For a fitted image, bpp is the size of the
-    file in bits per pixel, and a table shows the size of each array. The PSNR, the number of steps
-    and the source are those of the fit. For a packed image, the command also shows the quantisation
-    steps.
-
-    For a material, a table shows its maps; bpp refers to all maps together.
+    NAME is a basis of the package, such as natural. PSNR, steps and source are those of the fit;
+    bpp is the size of the file in bits per pixel, of a material for all maps together.
 
     For a model, a table shows the first components of all channels in order of variance: their
     share of the variance, and the PSNR of PCA with these components, for the training images and
-    for the held-out images.
+    for the held-out images. For a model of lights, the command shows the number of planes, and the
+    PSNR of left-out lights.
 
     With --texture, texture_bytes is the memory of a gaussian_texture of the file for lookups at
     points, prefilter_bytes its memory with a prefilter, and small_bytes with memory = small.
 
-    For a model of lights, the command shows the number of planes, and the PSNR of left-out lights.
-
     The preview shows the rendered image or, for a model, the mean image, some components and the
-    outlines of the Gaussians.
-
-    Of a folder, the command shows all .npz and .egs files in it, and --preview names a folder.
+    outlines of the Gaussians. Of a folder, all .npz and .egs files are shown, and --preview names a
+    folder.
 
     \b
     Examples:

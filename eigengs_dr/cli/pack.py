@@ -42,11 +42,10 @@ def pack(
 ) -> None:
     """Compress a fitted image or a material.
 
-    The command quantises the parameters as coarsely as the allowed loss of PSNR permits, and
-    entropy-codes them. Every command that reads the .npz file of an image reads .egs files too.
-    Without --image, the command assumes that the fit has 40 dB. A material takes --map instead.
-
-    A model of lights takes none: its loss refers to the PSNR of left-out lights.
+    The parameters are quantised as coarsely as the allowed loss of PSNR permits. Every command that
+    reads the .npz file of an image reads .egs files too. Without --image, the fit counts as one of
+    40 dB. A material takes --map instead. A model of lights takes neither: its loss refers to the
+    PSNR of left-out lights.
 
     Of a folder, all .npz files in it are packed. If one fails, the others still are, and the exit
     code is 2.

@@ -70,10 +70,8 @@ def render(
     \b
     Examples:
       eigengs-dr render photo.npz -o photo.png
-      eigengs-dr render photo.npz -o wide.png --size 2048
       eigengs-dr render photo.npz -o large.tif --scale 4
       eigengs-dr render sky.npz -o sky.exr
-      eigengs-dr render normals.npz -o normals.png --bits 16
       eigengs-dr render photo.npz -o icon.png --size 64x48 --first 500
       eigengs-dr render bark.npz -o roughness.png --map roughness
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2

@@ -100,10 +100,10 @@ def scene(
 ) -> None:
     """Render Mitsuba scenes with Gaussian textures.
 
-    The mitsuba executable does not know the texture gaussian_texture, because it is a Python
-    plugin; this command does. For several scenes, -o names a folder, and the pictures are named
-    after the scenes. An EXR file has all AOVs and layers by name; a PNG file has the colours only.
-    Textures whose prefilter is true follow the camera.
+    The mitsuba executable does not know plugins in Python, such as gaussian_texture; this command
+    does. For several scenes, -o names a folder, and the pictures are named after the scenes. An EXR
+    file has all AOVs and layers by name, a PNG file the colours. Textures whose prefilter is true
+    follow the camera.
 
     \b
     Examples:
@@ -268,10 +268,9 @@ def convert(
     FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
     after, and 8 times their difference. If a rendering misses the PSNR, the command reports it and
     exits with code 1. A bitmap is kept if it takes less memory than its Gaussians, or if many of
-    them overlap; the command shows both. Bump and normal maps with which renderings would miss it,
-    environment maps whose light or picture would miss it, images of two values such as masks, data
-    outside of 0 to 1, and images that no camera sees are kept too; the command shows the reason.
-    Other files are not moved, and the new scene refers to them relative to FOLDER.
+    them overlap, if the PSNR would be missed, if it has two values as masks do, or data outside of
+    0 to 1, or if no camera sees it; the command shows the reason. Other files are not moved, and
+    the new scene refers to them relative to FOLDER.
 
     \b
     Examples:

@@ -60,9 +60,8 @@ def train(
     A model is one set of Gaussians that renders all principal components of the images. One image
     in ten is held out and measured at the end. --energy refers to the variance of each channel of
     the training images; --target-psnr to the PSNR of PCA, in --space, for the held-out images.
-    After Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint. With
-    --cluster, the processes of a Dask cluster compute components and weights; they all need access
-    to FOLDER and MODEL.npz.
+    After Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint. All
+    processes of a --cluster need access to FOLDER and MODEL.npz.
 
     With --lights, the folder holds photos of one object from one camera. The list names each photo,
     and the direction of its light. The model renders the object under any light; --components is

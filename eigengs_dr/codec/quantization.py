@@ -189,7 +189,16 @@ def quantize(arrays: dict[str, Floats], steps: Steps, dead_zone: float = 0.0) ->
 def dequantize(symbols: Symbols, steps: Steps) -> dict[str, Floats]:
     """Return mean (N, 2), factor (N, 3) and color (N, C) for integers.
 
-    Numbers of damaged files may overflow to infinity or zero.
+    With ``Q = max(1, |color|)`` and the integers i, j, k of scale, stretch and turn::
+
+        s = 1.2 i / Q,  l = j / Q,  K = max(1, round(pi sinh(2 l) Q)),  t = 2 pi k / K
+        a' = sqrt(exp(-2 l) + 2 sinh(2 l) cos(t / 2)^2)
+        (a, b, c) = exp(s) (a', sinh(2 l) sin(t) / a', 1 / a')
+
+    A cell with the side h has ``round(a Q h / sqrt(2))`` parts across and ``round(c Q h /
+    sqrt(2))`` along, from 1 to `MAX_PARTS`; the mean is in the middle of its part. The colour is
+    its integers times the step and ``exp(s)``. Numbers of damaged files may overflow to infinity
+    or zero.
     """
     quantizer = Quantizer(symbols.color, steps.cell)
     factor = quantizer.factors(symbols.scale, symbols.stretch, symbols.turn)

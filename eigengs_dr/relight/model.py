@@ -288,9 +288,12 @@ _HEAD = struct.Struct("<BBHfd")
 
 
 def table_bytes(model: Relightable) -> bytes:
-    """Return the table of a model for an ``.egs`` file: 16 bits a direction, 8 bits a factor.
+    """Return the table of a model for an ``.egs`` file: 16 bits per coordinate, 8 per factor.
 
-    Each plane has a scale. Rounding is 40 dB below the contrast of the photos.
+    It has the kind and K, the number of planes, both uint8; n, the number of lights, uint16; the
+    smoothing, float32; the PSNR of left-out photos, float64; K + 1 scales, float32; directions,
+    (n, 3) int16 over 32767; and values, (n, 3, K + 1) int8 times the scales. Rounding is 40 dB
+    below the contrast of the photos.
     """
     table, planes = model.table, model.planes.channels
     head = _HEAD.pack(

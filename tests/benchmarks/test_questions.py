@@ -156,7 +156,9 @@ def test_other_programs_stand_in_the_chart_of_speed():
     peer = row(job, seconds=2.0, psnr_rgb=31.0)
     assert overview.charts({"kodak": [fits]}) == {}
     for others in ([], [peer]):
-        left, right, *more = overview.charts({**rows, "peers": others})["speed"].axes
+        charts = overview.charts({**rows, "peers": others})
+        (alone,), (left, right, *more) = charts["kodak-speed"].axes, charts["speed"].axes
+        assert [line.get_label() for line in alone.lines] == [ln.get_label() for ln in right.lines]
         assert left.get_legend().get_texts()[0].get_text() == "eigengs_dr"
         published = [text.get_text() for text in right.get_legend().get_texts()]
         assert any("NVIDIA V100 (arXiv 2403.08551)" in text for text in published)
