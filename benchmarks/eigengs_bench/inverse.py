@@ -420,6 +420,6 @@ def _chart(curves: Mapping[tuple, Mapping[str, Mapping[int, Row]]]) -> Figure:
             points = np.array([(row["seconds"], row["psnr_rgb"]) for row in rows]).reshape(-1, 2).T
             axis.plot(*points, color=color, marker=MARKERS[method], ms=5, label=method)
         axis.set_title(f"{case[0]}, {case[1]} cameras", fontsize=9)
-        fr.label_axes(axis, "seconds", "psnr_rgb / dB", legend=False)
+        fr.label_axes(axis, "seconds", "PSNR in RGB / dB", legend=False)
     fr.legend_below(figure, axes[0], len(METHODS))
     return figure
