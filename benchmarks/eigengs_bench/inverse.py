@@ -326,6 +326,6 @@ def _chart(cases: Mapping[Case, Curves]) -> Figure:
             points = np.array([(row["seconds"], row["psnr_rgb"]) for row in rows]).reshape(-1, 2).T
             axis.plot(*points, color=color, marker=MARKERS[method], ms=5, label=method)
         axis.set_title(_title(case), fontsize=9)
-        fr.label_axes(axis, "seconds", "psnr_rgb / dB", legend=False)
+        fr.label_axes(axis, "seconds", "PSNR in RGB / dB", legend=False)
     fr.legend_below(figure, axes[0], len(METHODS))
     return figure

@@ -174,6 +174,6 @@ def _over_gaussians(photos: pd.DataFrame, others: pd.DataFrame) -> Figure:
     for color, marker, (name, part) in styles:
         label = name.partition(" (")[0]
         axis.plot(part.gaussians, part.psnr_float, f"{marker}--", ms=5, color=color, label=label)
-    fr.label_axes(axis, "Gaussians", "PSNR in float RGB / dB", legend=False)
+    fr.label_axes(axis, "Gaussians", "PSNR in RGB / dB", legend=False)
     fr.legend_beside(figure, axis)
     return figure

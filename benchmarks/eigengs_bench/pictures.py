@@ -94,7 +94,7 @@ def _curves_chart(rows: Sequence[Row]) -> Figure:
             # A fit that has failed is None in a file, and NaN here.
             means = np.mean(np.array([row["psnr_ycbcr"] for row in some], float), axis=0)
             axis.plot(some[0]["marks"], means, label=preset, color=fr.COLORS[preset])
-        fr.label_axes(axis, "iterations", "PSNR (YCbCr) / dB", "", False, title=name)
+        fr.label_axes(axis, "iterations", "PSNR in YCbCr / dB", "", False, title=name)
     fr.legend_below(figure, axes[0], len(PRESETS))
     return figure
 

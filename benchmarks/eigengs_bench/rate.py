@@ -265,7 +265,7 @@ def _chart(points: pd.DataFrame, name: str) -> Figure:
     rank = points.groupby(["codec", "image"]).cumcount().rename("rank")
     means = points.groupby(["codec", rank])[["bits_per_pixel", "psnr_rgb", "ms_ssim"]].mean()
     styles = {OURS: (fr.BLUE, "o-")} | {k: (c.color, c.style) for k, c in CODECS.items()}
-    labels = {"psnr_rgb": "PSNR in 8-bit RGB / dB", "ms_ssim": "MS-SSIM"}
+    labels = {"psnr_rgb": "PSNR in RGB / dB", "ms_ssim": "MS-SSIM"}
     for axis, (what, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
         for codec, (color, style) in styles.items():
             if codec in means.index:

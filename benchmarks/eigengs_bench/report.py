@@ -235,11 +235,13 @@ def label_axes(
     axis: Axes, x: str, y: str, logarithmic: str = "x", legend: bool = True, **rest: Any
 ) -> None:
     """Label the axes, give some of them logarithmic scales with plain numbers, add a legend."""
+    labels = {"x": x, "y": y}
     for side in logarithmic:
         getattr(axis, f"set_{side}scale")("log", subs=(2, 5))
         getattr(axis, f"{side}axis").set_major_formatter("{x:,g}")
         getattr(axis, f"{side}axis").set_minor_formatter("{x:,g}")
-    axis.set(xlabel=x, ylabel=y, **rest)
+        labels[side] += " (log)"
+    axis.set(xlabel=labels["x"], ylabel=labels["y"], **rest)
     axis.grid(alpha=0.3)
     if legend:
         axis.legend(fontsize=8, framealpha=0.6)
