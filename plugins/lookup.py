@@ -137,11 +137,11 @@ def make_table(
     cutoff: float,
     inputs: Arrays,
     decode: Callable[[Arrays], KernelParameters],
-    coded: bool = False,
+    coded_for: tuple[int, int] | None = None,
 ) -> Table:
     """Compute what lookups read; derivatives flow back to the `inputs` of `decode`.
 
-    Rows are `coded` if the set allows it and there are no derivatives.
+    Rows are coded for a size of the picture if the set allows it and there are no derivatives.
     """
     cells, sizes, finest = lists.cells, lists.sizes, lists.finest
     derivatives = dr.grad_enabled(inputs)
@@ -152,7 +152,8 @@ def make_table(
     def compute(inputs: Arrays) -> Arrays:
         parameters = decode(inputs)
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
-        rows, coding = _rows(cells, shape, color, bool(sizes), coded and not derivatives)
+        coded = None if derivatives else coded_for
+        rows, coding = _rows(cells, shape, color, bool(sizes), coded)
         background = [keep_finite(b) for b in parameters.background]
         arrays: Arrays = {"packed": rows, "background": background}
         arrays |= {"coding": coding} if coding else {}
@@ -179,10 +180,11 @@ def make_table(
 
 
 def _rows(
-    cells: CellLists, shape: list, color: list, filtered: bool, coded: bool
+    cells: CellLists, shape: list, color: list, filtered: bool, size: tuple[int, int] | None
 ) -> tuple[Float, Coding | None]:
-    """Return the rows of Gaussians as sums read them, and what decodes them."""
-    encoded = encode_rows(shape, inverted(shape) if filtered else shape, color) if coded else None
+    """Return the rows of Gaussians as sums read them, and what decodes those for a size."""
+    stored = inverted(shape) if filtered else shape
+    encoded = encode_rows(shape, stored, color, size) if size else None
     if encoded is None:
         return cells.pack(*(invert(shape, color) if filtered else (shape, color))), None
     coding, words = encoded
@@ -201,7 +203,8 @@ def table_of_file(
     if table is None:
         parameters, size = file.parameters(), (file.like.width, file.like.height)
         lists = list_gaussians(parameters.shape, size, *key)
-        table = make_table(lists, cutoff, {}, lambda _: parameters, memory.coded)
+        coded_for = size if memory.coded else None
+        table = make_table(lists, cutoff, {}, lambda _: parameters, coded_for)
         table = file.tables.setdefault(key, replace(table, lists=lists))
         if table.packed.coding is not None:
             file.forget_tensors()

@@ -201,17 +201,23 @@ class SharedFile:
         return self._tensors[name]
 
     def _made_again(self) -> dict[str | None, Arrays]:
+        tensors = _shared_tensors(self._parts_again())
+        dr.eval(list(tensors.values()))  # else a recording that asks would compute them
+        return tensors
+
+    def _parts_again(self) -> dict[str | None, Gaussians]:
+        """Read the sets again, or decode those of a table."""
         try:
-            if state_of(self.path) == self.state:
-                return _shared_tensors(_parts(self._load()))
+            if not self.tables or state_of(self.path) == self.state:
+                return _parts(self._load())
         except (OSError, ValueError):
-            pass
+            if not self.tables:
+                raise
         found, parts = self.parameters(), slices(self.like.maps) or [slice(None)]
-        sets = {
+        return {
             name: _encoded(found.shape, found.color[part], found.background[part], like)
             for (name, like), part in zip(self.maps.items(), parts, strict=True)
         }
-        return _shared_tensors(sets)
 
     def source(self, name: str | None) -> TextureParameters:
         """Return a map, or the whole file, as the source of a texture.

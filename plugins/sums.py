@@ -86,7 +86,7 @@ def plugin_of_sums(base: type) -> Any:
 
         def _take_over(self, moved: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
-            source = self.source
+            source, size = self.source, (self.width, self.height)
             settings = self.cutoff, self.wrap, self.filtered(), self.memory
             if source.file and source.is_that_of_file():
                 self.table, self.part = table_of_file(source.file, *settings), source.part
@@ -95,12 +95,12 @@ def plugin_of_sums(base: type) -> Any:
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
             if moved:
                 shape = source.decode(dr.detach(source.tensors)).shape
-                lists = list_gaussians(shape, (self.width, self.height), *settings)
+                lists = list_gaussians(shape, size, *settings)
             else:
                 lists = self.table.lists
             # Rows of a texture that has changed stay floats: words would be another program.
-            coded = self.memory.coded and not self.changed
-            table = make_table(lists, self.cutoff, source.tensors, source.decode, coded)
+            coded_for = size if self.memory.coded and not self.changed else None
+            table = make_table(lists, self.cutoff, source.tensors, source.decode, coded_for)
             # A texture that has changed may change its colours next, and needs all lists again.
             self.table = table if self.changed else replace(table, lists=lists)
             self.part = slice(None)

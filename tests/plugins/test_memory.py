@@ -206,6 +206,18 @@ def test_without_its_file_a_texture_shows_what_its_rows_hold(tmp_path, space, pr
         np.testing.assert_allclose(found[name], values, rtol=4e-3, atol=2e-3, err_msg=name)
 
 
+def test_maps_without_their_file_show_what_rows_hold(tmp_path):
+    whole = material(size=SIZE, backend=backend())
+    whole.save(tmp_path / "m.npz")
+    file = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz")}
+    textures = {m.name: mi.load_dict({**file, "map": m.name}) for m in whole.maps}
+    (tmp_path / "m.npz").write_bytes(b"another one")
+    for name, tex in textures.items():
+        found = gaussians_of(mi.traverse(tex), "", like=whole[name]).to_arrays()
+        for key, values in whole[name].to_arrays().items():
+            np.testing.assert_allclose(found[key], values, rtol=4e-3, atol=2e-3, err_msg=key)
+
+
 def test_the_rows_of_several_bands_are_in_the_order_of_the_set(tmp_path, monkeypatch):
     from eigengs_dr.raster.lookup import cells
 
@@ -281,8 +293,7 @@ def test_what_words_do_not_hold_stays_floats(tmp_path):
 
 def test_light_above_65504(tmp_path):
     arrays = gaussians("radiance").to_arrays()
-    arrays["color"] = np.abs(arrays["color"])
-    arrays["color"][:3] *= 1e6 / arrays["color"][:3].max()
+    arrays["color"] = np.abs(arrays["color"]) * (1e6 / np.abs(arrays["color"]).max())
     g = eg.Gaussians.from_arrays(**arrays, size=SIZE, space="radiance", backend=backend())
     whole = {"cutoff": 8.0}  # at the usual one, the sun has an edge of 1 %
     tex = mi.load_dict(in_a_file(tmp_path, g, **whole))
