@@ -299,12 +299,12 @@ def _file(pixels: NDArray[np.uint8], kind: str, quality: int, options: Any) -> t
 STYLES = {
     OURS: (fr.BLUE, "o-"),
     RELIGHT: (fr.INK, "*"),
-    "PTM": (fr.GREY, "v:"),
-    "HSH": (fr.GREY, "^:"),
-    "JPEG planes": (fr.RED, "s--"),
-    "JPEG planes, tuned": (fr.ORANGE, "D--"),
-    "AVIF planes": (fr.PINK, "x--"),
-    "AVIF planes, tuned": (fr.GREEN, "P--"),
+    "PTM": (fr.GREY, ":"),
+    "HSH": (fr.GREY, "-."),
+    "JPEG planes": (fr.RED, "--"),
+    "JPEG planes, tuned": (fr.ORANGE, "-"),
+    "AVIF planes": (fr.PINK, "--"),
+    "AVIF planes, tuned": (fr.GREEN, "-"),
 }
 CODED = tuple(STYLES)[4:]
 
