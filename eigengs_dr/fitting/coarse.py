@@ -257,7 +257,7 @@ def texel_sums(
     ------
     Float, shape (H * W * C,)
         The sums of all levels before the first step and after each, as rows of pixels; and last
-        those of `fill`.
+        those of `fill_unseen`.
     """
     types, optimizer, channels = objective.types, coarse.optimizer, objective.channels
     levels = texel_levels(*objective.size)
@@ -301,14 +301,14 @@ def texel_sums(
             )
             yield sums
     if steps:
-        yield dr.ravel(fill(_planes(sums, channels), squares, levels))
+        yield dr.ravel(fill_unseen(_planes(sums, channels), squares, levels))
 
 
 DOUBT = 0.01
 """Share of the mean square of derivatives at which a texel counts half."""
 
 
-def fill(picture: Rows, squares: Rows, levels: Sequence[TexelLevel]) -> Rows:
+def fill_unseen(picture: Rows, squares: Rows, levels: Sequence[TexelLevel]) -> Rows:
     """Replace texels on which a loss hardly depends by what lies around them.
 
     A texel of a coarser level is the mean of finer ones, by their weights, and shows where theirs
@@ -327,7 +327,7 @@ def fill(picture: Rows, squares: Rows, levels: Sequence[TexelLevel]) -> Rows:
 
 
 def _filled(plane: Float, square: Float, levels: Sequence[TexelLevel]) -> Float:
-    """Fill a channel, see `fill`."""
+    """Fill a channel, see `fill_unseen`."""
     weight = square / dr.maximum(square + DOUBT * dr.mean(square), TINY)
     steps, sums = [*pairwise(levels)], [(plane * weight, weight)]
     for fine, coarse in steps:

@@ -12,7 +12,7 @@ from drjit.opt import Adam
 import eigengs_dr as eg
 from eigengs_dr.backend.arrays import _types, types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.coarse import Coarse, enlarge, fill, shrink, texel_levels, texel_sums
+from eigengs_dr.fitting.coarse import Coarse, enlarge, fill_unseen, shrink, texel_levels, texel_sums
 from eigengs_dr.fitting.loss import LossObjective
 from eigengs_dr.fitting.objective import Channels, Pixels, Target
 from eigengs_dr.image.space import RGB, Affine, space_of
@@ -600,7 +600,9 @@ def test_texels_without_a_derivative_show_what_lies_around(backend, size):
     true = 0.2 + 0.02 * x
     picture = types.FloatX([np.where(hole, 0.9, true).ravel(), np.full(true.size, 0.7)])
     squares = types.FloatX([np.where(hole, 0, 1).ravel(), np.zeros(true.size)])
-    filled, rest = (row.numpy().reshape(true.shape) for row in fill(picture, squares, levels))
+    filled, rest = (
+        row.numpy().reshape(true.shape) for row in fill_unseen(picture, squares, levels)
+    )
     np.testing.assert_allclose(filled[~hole], true[~hole], atol=2e-3)
     np.testing.assert_allclose(filled[hole], true[hole], atol=0.06)
     np.testing.assert_allclose(rest, 0.7, rtol=1e-5)
