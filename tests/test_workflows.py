@@ -10,6 +10,7 @@ ROOT = Path(__file__).parent.parent
 FILES = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 PINNED = re.compile(r"uses: [\w-]+/[\w-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+")
+PUBLISH = [("manual", "publish"), ("publish", "publish")]
 PYTHONS = ["3.10", "3.11", "3.12", "3.13"]
 
 
@@ -35,20 +36,21 @@ def test_steps(file):
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_rights(file):
-    """A workflow reads the code; only the job that publishes the manual may do more."""
+    """A workflow reads the code; only jobs that publish, the manual or a release, may do more."""
     assert yaml.safe_load(file.read_text())["permissions"] == {"contents": "read"}
     for name, job in jobs(file).items():
-        assert "permissions" not in job or (file.stem, name) == ("manual", "publish")
+        assert "permissions" not in job or (file.stem, name) in PUBLISH
 
 
 def test_what_is_run():
     run = {file.stem: [step["run"] for step in steps(file) if "run" in step] for file in FILES}
-    assert set(run) == {"test", "nightly", "manual", "package"}
+    assert set(run) == {"test", "nightly", "manual", "package", "publish"}
     for name, target in (
         ("test", "test"),
         ("nightly", "test-slow"),
         ("manual", "docs"),
         ("package", "dist"),
+        ("publish", "dist"),
     ):
         assert f"make {target} PYTHON=python" in run[name]
     made = jobs(ROOT / ".github" / "workflows" / "test.yml")

@@ -534,7 +534,10 @@ def lit(tmp_path):
 LATER = directions(5, 0.5) @ np.diag([-1, 1, 1])
 
 
+@pytest.mark.mitsuba
 def test_relight(lit, tmp_path, backend, monkeypatch):
+    pytest.importorskip("mitsuba")
+    eg.register_plugins()  # before the first row, which names the threads of Dr.Jit
     monkeypatch.setattr(relight, "PLANES", (6,))
     monkeypatch.setattr(relight, "QUALITIES", (30, 90))
     monkeypatch.setattr(relight, "PIXELS", (16,))
