@@ -52,13 +52,13 @@ class Quadratic(NamedTuple):
     curvature: Float | None = None
 
     def compare(
-        self, packed: Float, background: list, lists: TileLists, radius: float
+        self, packed: Float, background: list, lists: TileLists, radius: float, pairs: bool = False
     ) -> tuple[Float, list]:
         """Return the derivative ``h (p - t)`` for a set, and the sums of ``h (p - t)^2``.
 
         They come from one pass, `eigengs_dr.raster.kernels.residual`.
         """
-        return residual(packed, background, lists, radius, self.target, self.curvature)
+        return residual(packed, background, lists, radius, self.target, self.curvature, pairs)
 
     def curvatures(self, grid: Grid) -> Float:
         """Return the curvature of every pixel: one value, or one per channel; 0 outside."""
@@ -111,9 +111,9 @@ class Slope(NamedTuple):
     size: Float
 
     def compare(
-        self, packed: Float, background: list, lists: TileLists, radius: float
+        self, packed: Float, background: list, lists: TileLists, radius: float, pairs: bool = False
     ) -> tuple[Float, list]:
-        """Return the derivative; there are no squares."""
+        """Return the derivative, which is given in Floats; there are no squares."""
         return self.derivative, []
 
 

@@ -163,7 +163,7 @@ def step_program(objective: Pixels, method: Method) -> StepProgram:
         radius, background = kernel_radius(fixed.cutoff), list(fixed.background)
         gradient: list = []
         for listed in lists:
-            delta, squares = model.compare(moving.packed, background, listed, radius)
+            delta, squares = model.compare(moving.packed, background, listed, radius, pairs=True)
             parts = adjoint_pieces(moving.packed, delta, channels, listed, radius)
             dr.eval(parts)
             number = listed.sizes.width * listed.sizes.height * channels

@@ -33,7 +33,7 @@ def adjoint(
     packed : Float
         As for `forward`.
     delta : Float
-        Derivative of a loss with respect to the image, in tile layout.
+        Derivative of a loss with respect to the image, in tile layout; or from `in_pairs`.
     channels : int
     lists : TileLists
         With pieces.

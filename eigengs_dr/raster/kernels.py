@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import drjit as dr
 
-from ..backend.arrays import ArrayTypes, types_of
+from ..backend.arrays import ArrayTypes, in_pairs, types_of
 from ..backend.types import Float, UInt
 from .binning.lists import TileLists
 from .binning.tiles import Grid, GridArrays, granularity_of
@@ -171,6 +171,7 @@ def residual(
     radius: float,
     target: Float | None,
     curvature: Float | None = None,
+    pairs: bool = False,
 ) -> tuple[Float, list]:
     """Sum the Gaussians of every tile, and compare them with an image, in one pass over memory.
 
@@ -186,10 +187,13 @@ def residual(
         Image T in tile layout; None for 0.
     curvature : Float, optional
         Factors h in tile layout, one for each pixel or for each channel of it; by default 1.
+    pairs : bool, optional
+        Whether delta is stored by `in_pairs`, if it is in single precision. A descent does: the
+        adjoint reads half the memory, and a fit takes about 5 % less time.
 
     Returns
     -------
-    delta : Float, shape (tiles * pixels * channels,)
+    delta : Float, shape (tiles * pixels * channels,), or UInt32 of half that shape
         ``h e`` in tile layout.
     squares : list of Float, shape (lanes,)
         For each channel, the sums of ``h e^2`` over the pixels of each lane; `sum_lanes` adds them.
@@ -214,7 +218,12 @@ def residual(
         factors = load(curvature, values)
         deltas = [e * factors[k * values // channels] for k, e in enumerate(errors)]
     squares = sum_channels([e * d for e, d in zip(errors, deltas, strict=True)], channels)
-    delta = dr.empty(types.Float, grid.tiles * grid.pixels * channels)
+    number = grid.tiles * grid.pixels * channels
+    if pairs and types.bits == 32:
+        delta = dr.empty(types.UInt, number // 2)
+        dr.scatter(delta, dr.uint32_array_t(types.FloatX)(in_pairs(types, deltas)), blocks.run)
+        return delta, squares
+    delta = dr.empty(types.Float, number)
     dr.scatter(delta, types.FloatX(deltas), blocks.run)
     return delta, squares
 

@@ -149,9 +149,10 @@ def test_a_weight_says_where_the_picture_matters():
     """Most of the loss lies in a quarter of the picture; the texels' picture does not say so."""
     weight = np.full((SIDE, SIDE, 1), 0.001, np.float32)
     weight[: SIDE // 2, : SIDE // 2] = 1
+    image = eg.sample("coffee")[60 : 60 + SIDE, 60 : 60 + SIDE]
 
     def loss(picture, step):
-        return dr.mean(dr.square(picture - type(picture)(IMAGE)) * type(picture)(weight), axis=None)
+        return dr.mean(dr.square(picture - type(picture)(image)) * type(picture)(weight), axis=None)
 
     asked = {"loss": loss, "size": (SIDE, SIDE), "gaussians": 100, "iterations": 100}
     plain, weighed = (eg.fit(**asked, space="rgb", weight=w).loss for w in (None, weight))

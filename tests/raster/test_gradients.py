@@ -15,6 +15,9 @@ from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import concatenate
 from eigengs_dr.image.color import from_log
 from eigengs_dr.image.space import YCBCR
+from eigengs_dr.raster.adjoint import adjoint
+from eigengs_dr.raster.kernels import residual
+from eigengs_dr.raster.parameters import kernel_radius, kernel_shape, pack_parameters
 from eigengs_dr.raster.render import bin_gaussians, render
 
 COUNT = 7
@@ -212,6 +215,26 @@ def test_forward_and_reverse_are_adjoint(backend, bits, share, scene, direction)
     size = sum(np.abs(t).sum() for t in terms) + np.abs(image_tangent * delta).sum()
     difference = (image_tangent * delta).sum() - sum(t.sum() for t in terms)
     assert abs(difference) <= share * size
+
+
+@pytest.mark.parametrize("bits", [32, 64])
+def test_pairs(backend, bits):
+    """The adjoint of a derivative in pairs is that of the rounded derivative."""
+    gaussians = random_scene(6).on(backend, bits)
+    lists, radius = bin_gaussians(gaussians), kernel_radius(gaussians.cutoff)
+    packed = pack_parameters([*kernel_shape(gaussians), *gaussians.color])
+    background = list(gaussians.background)
+    delta, squares = residual(packed, background, lists, radius, None)
+    pairs, same_squares = residual(packed, background, lists, radius, None, pairs=True)
+    np.testing.assert_array_equal(squares, same_squares)
+    rounded = delta.numpy()
+    if bits == 32:
+        assert pairs.numpy().nbytes == rounded.nbytes // 2
+        rounded = ((rounded.view(np.uint32) + 0x8000) & 0xFFFF0000).view(np.float32)
+        np.testing.assert_allclose(rounded, delta.numpy(), rtol=2**-8)
+    of_pairs = adjoint(packed, pairs, 3, lists, radius)
+    of_rounded = adjoint(packed, type(delta)(rounded), 3, lists, radius)
+    np.testing.assert_array_equal(np.array(of_pairs), np.array(of_rounded))
 
 
 def test_gradients_are_bit_equal(backend):
