@@ -17,6 +17,7 @@ import eigengs_dr as eg
 
 from ..backend.selection import select
 from ..backend.types import Record
+from ..image.io import displayed
 from ..image.space import SPACES, YCBCR, space_of
 from . import options
 from .console import FAILED, INTERRUPTED, MISSED, bar, open_cluster, prefix_errors, print_message
@@ -321,8 +322,6 @@ def _figures(result: eg.Fit | eg.LargeFit) -> Record:
 
 def _similarity(image: Any, result: eg.Fit) -> Record:
     """Return SSIM and MS-SSIM of a fit of colours; nothing for maps and other data."""
-    from ..viewer.pictures import displayed
-
     space = result.gaussians.space
     if result.maps:
         return {}
@@ -338,7 +337,7 @@ def _comparison(image: Any, gaussians: eg.Gaussians, drawn: Any) -> Any:
     """Return a picture of image, fit and outlines side by side, with a row for each map."""
     import numpy as np
 
-    from ..viewer.pictures import comparison, displayed
+    from ..viewer.pictures import comparison
 
     if not gaussians.maps:
         return comparison(displayed(image, gaussians.space), drawn, gaussians)

@@ -71,8 +71,9 @@ class Method:
     decay : float
         Fraction of the rates at the end, after half a cosine.
     drift : float
-        Sum of the largest rates after which the tile lists are built again. A build enlarges the
-        Gaussians by what they may move until the next build, see `Coordinates.reach`.
+        Sum of the largest rates after which the tile lists are built again, up to 96x96 pixels
+        1.6 times as much. A build enlarges the Gaussians by what they may move until the next
+        build, see `Coordinates.reach`.
     rate_exponent : float
         Exponent by which the rates of means and shapes fall with the colour, see
         `eigengs_dr.fitting.step.rate_scale_of`.

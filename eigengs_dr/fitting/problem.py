@@ -13,7 +13,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from ..backend.arrays import ArrayTypes, types_in, types_of
 from ..backend.doors import plain_numbers
@@ -486,6 +485,8 @@ def _filled(image: EncodedImage, weight: Image) -> Values:
         )
     ignored = ~(weight.reshape(*weight.shape[:2], -1) > 0).any(axis=2)
     if ignored.any():
+        from scipy.ndimage import distance_transform_edt  # it takes 80 ms, and few fits need it
+
         nearest = distance_transform_edt(ignored, return_distances=False, return_indices=True)
         pixels = pixels[tuple(nearest)]
     return pixels

@@ -7,6 +7,7 @@ Gaussian. `eigengs_dr.fitting.loop.descend` takes the steps.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
@@ -25,6 +26,14 @@ from ..raster.render import bin_gaussians
 from .method import Method
 from .objective import Pixels, Quadratic, Slope
 from .state import Coordinates, Moving, State, Variables
+
+SMALL_IMAGE = 96 * 96
+"""Largest number of pixels of an image whose lists last longer, as a build takes as long as many
+steps."""
+
+SMALL_IMAGE_DRIFT = 1.6
+"""Factor of `Method.drift` for such images: fits of 64x64 pixels take 14 % less time, of 96x96 6 %
+less, with the same PSNR; 2.1 gains no more, and slows batches."""
 
 LOSS_EPSILON = 1e-10
 """Mean loss added before the logarithm of a level, which would diverge at 0."""
@@ -61,8 +70,10 @@ def listed(
 ) -> State:
     """Make the tile lists of the current set, which last until `end` or until it moves too far."""
     assert state.fixed is not None and state.moving is not None
-    slowed = [factor * state.speed for factor in factors]
-    until, moves = next_build(method, slowed, step, end, state.since)
+    slowed, drift = [factor * state.speed for factor in factors], method.drift
+    if math.prod(objective.size) <= SMALL_IMAGE:
+        drift *= SMALL_IMAGE_DRIFT
+    until, moves = next_build(method, drift, slowed, step, end, state.since)
     pad, growth = method.coordinates.reach(state.fixed, moves)
     if state.moving.rate_scale is not None:
         pad *= state.moving.rate_scale
@@ -86,13 +97,15 @@ def _lists_of_first(
 
 
 def next_build(
-    method: Method, factors: Sequence[float], step: int, end: int, since: int = 0
+    method: Method, drift: float, factors: Sequence[float], step: int, end: int, since: int = 0
 ) -> tuple[int, dict[str, float]]:
     """Return how long the tile lists of a step last, and how far the variables move until then.
 
     Parameters
     ----------
     method : Method
+    drift : float
+        `Method.drift` for an image of this size.
     factors : sequence of float
         From `Method.rate_factors`.
     step : int
@@ -113,7 +126,7 @@ def next_build(
     while stop < end:
         warm = min(1.0, (stop - since + 1) / max(1, method.warm_up))
         factor = factors[stop] * warm
-        if stop > step and largest * (total + factor) > method.drift:
+        if stop > step and largest * (total + factor) > drift:
             break
         total += factor
         stop += 1

@@ -35,6 +35,7 @@ from .read import (
     transparency_note,
 )
 from .remote import is_copied, local_copy
+from .space import Space
 from .strips import Pixels, by_strips
 
 
@@ -209,6 +210,13 @@ def check_data(image: object, copy: bool = True) -> NDArray[np.float32]:
 
 
 @takes_numbers
+def displayed(image: ArrayLike, space: Space, encoding: str | None = None) -> NDArray[np.float32]:
+    """Return an image as display values, for sets of a space: sRGB, or data."""
+    if space.is_color:
+        return check_image(image, copy=False, encoding=encoding)
+    return check_data(image, copy=False)
+
+
 def save_image(
     path: str | Path, image: ArrayLike, encoding: str | None = None, bits: int | None = None
 ) -> None:

@@ -8,13 +8,12 @@ from io import BytesIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.types import ArrayLike
 from ..eigenbasis.basis import Eigenbasis
 from ..eigenbasis.eigengs import EigenGS
 from ..eigenbasis.truncation import CHANNELS
 from ..gaussian.covariance import outline
 from ..gaussian.gaussians import Gaussians, with_colors
-from ..image.io import check_data, check_image, to_8bit
+from ..image.io import to_8bit
 from ..image.resize import resample
 from ..image.sheet import join_pictures, text_line
 from ..image.space import DATA, Space, space_of
@@ -85,13 +84,6 @@ def overlay(gaussians: Gaussians, picture: Picture) -> Picture:
     light = WHITE_SHARE + (1 - WHITE_SHARE) * np.clip(picture, 0, 1)
     subset = gaussians[selection]
     return _outlined(light, subset, [HIGH_COLOR] * len(subset))
-
-
-def displayed(image: ArrayLike, space: Space, encoding: str | None = None) -> NDArray[np.float32]:
-    """Return an image as display values, for sets of a space: sRGB, or data."""
-    if space.is_color:
-        return check_image(image, copy=False, encoding=encoding)
-    return check_data(image, copy=False)
 
 
 def comparison(image: Picture, picture: Picture, gaussians: Gaussians) -> Picture:

@@ -23,12 +23,13 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
+from ..image.io import displayed
 from ..image.pixels import check_encoding
 from ..image.resize import resample
 from ..raster.render import picture_of
 from ..relight.model import Relightable
 from ..storage.atomic import atomic_write
-from .pictures import check_aspect, displayed, first_components, photo_uri, within
+from .pictures import check_aspect, first_components, photo_uri, within
 
 
 @dataclass(frozen=True, repr=False)

@@ -172,7 +172,7 @@ def test_lists_that_last_hold_what_gaussians_reach(backend, count):
     missed = []
     while stop < steps:
         built = sets[stop]
-        stop, moves = next_build(method, method.rate_factors(steps), stop, steps)
+        stop, moves = next_build(method, method.drift, method.rate_factors(steps), stop, steps)
         margin = method.coordinates.reach(gaussians, moves)
         needed = pairs_of(bin_gaussians(sets[stop - 1]))
         held = (pairs_of(bin_gaussians(built, *m)) for m in (margin, ()))

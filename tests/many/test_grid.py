@@ -70,7 +70,7 @@ def test_rates_rise_from_the_start_of_a_part():
     factors = DEFAULT.rate_factors(100, chosen=True)
 
     def moved(step, since):
-        end, moves = next_build(DEFAULT, factors, step, step + 1, since)
+        end, moves = next_build(DEFAULT, DEFAULT.drift, factors, step, step + 1, since)
         assert end == step + 1
         return moves["mean"] / (DEFAULT.rates["mean"] * factors[step])
 
