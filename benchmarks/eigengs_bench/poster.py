@@ -92,8 +92,8 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
     dict
         `kind`; `side` of the bitmap in texels, and `gaussians`; `psnr_bitmap` and `psnr` of their
         pictures; `bitmap_bytes` and `bytes` that they hold in memory between renderings,
-        `filtered_bytes` with a prefilter; `ratio`, of the bytes of Gaussians over those of the
-        bitmap of 8 bits, and `ratio_floats`, over those of a bitmap of floats.
+        `filtered_bytes` with a prefilter, `small_bytes` with `memory="small"`; `ratio` and
+        `ratio_small`, of the bytes of Gaussians over those of the bitmap of 8 bits.
     """
     mi = load_mitsuba(variant, quiet=False)
     from eigengs_dr.plugins import resident_bytes
@@ -125,8 +125,9 @@ def compare(variant: str, load: Callable[[], Poster]) -> Row:
             target_psnr += poster.goal - row["psnr"] + 0.05
         row["bytes"] = resident_bytes(mi.load_dict(file))
         row["filtered_bytes"] = resident_bytes(mi.load_dict(file | {"prefilter": 1e-3}))
-    row["ratio"] = row["bytes"] / row["bitmap_bytes"]
-    return row | {"ratio_floats": row["ratio"] / 4}
+        row["small_bytes"] = resident_bytes(mi.load_dict(file | {"memory": "small"}))
+    ratios = {"ratio": "bytes", "ratio_small": "small_bytes"}
+    return row | {name: row[held] / row["bitmap_bytes"] for name, held in ratios.items()}
 
 
 def _smallest_side(suffices: Callable[[int], bool]) -> int:

@@ -91,6 +91,9 @@ def _costs(balls: Sequence[Row]) -> list[Table]:
     return [one._replace(rows=balls) for one in tables]
 
 
+HELD_BY_POSTERS = ("bitmap_bytes", "bytes", "filtered_bytes", "small_bytes")
+
+
 def _posters(posters: Sequence[Row]) -> Table:
     """Lay out the bitmaps and the Gaussians whose pictures of posters are equally good."""
     caption = (
@@ -98,16 +101,16 @@ def _posters(posters: Sequence[Row]) -> Table:
         f"of {poster.TEXELS:,} x {poster.TEXELS:,} texels, seen aslant on a film of "
         f"{poster.PIXELS} x {poster.PIXELS} pixels, keeps 40 dB; the text 30 dB"
     )
-    columns = ["poster", "bitmap, texels", "Gaussians", "bitmap", "points", "prefilter"]
-    columns += ["points over bitmap", "over a bitmap of floats"]
+    columns = ["poster", "bitmap, texels", "Gaussians", "bitmap", "points", "prefilter", "small"]
+    columns += ["points over bitmap", "small over bitmap"]
     lines = [
         (
             row["job"]["poster"],
             f"{row['side']} x {row['side']}",
             f"{row['gaussians']:,}",
-            *(f"{row[k] / 1e3:.0f} kB" for k in ("bitmap_bytes", "bytes", "filtered_bytes")),
+            *(f"{row[k] / 1e3:.0f} kB" for k in HELD_BY_POSTERS),
             f"{row['ratio']:.2f}",
-            f"{row['ratio_floats']:.2f}",
+            f"{row['ratio_small']:.2f}",
         )
         for row in posters
     ]
@@ -155,13 +158,13 @@ def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
     """Lay out where Gaussians lose to a bitmap, and what to use instead."""
     row, kinds = balls[-1], ("photo", "material", "text")
     ratio = {k: [r["ratio"] for r in posters if r["kind"] == k] for k in kinds}
-    floats = [r["ratio_floats"] for r in posters if r["kind"] != "text"]
+    small = [r["ratio_small"] for r in posters if r["kind"] != "text"]
     bake, texels = "`eigengs-dr render`, then a bitmap", "a fit through texels"
     memory = [
         ("memory, photos", ratio["photo"]),
         ("memory, materials", ratio["material"]),
         ("memory, sharp text", ratio["text"]),
-        ("memory, a bitmap of floats", floats),
+        ('memory, `memory="small"`, no text', small),
     ]
     lines = [
         (what, f"{median(n):.2f}", f"{min(n):.2f} to {max(n):.2f}", _better(median(n)))
