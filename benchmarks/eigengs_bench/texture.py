@@ -37,8 +37,9 @@ def run(task: Task, variant: str, parts: Sequence[str] = TEXTURE_PARTS) -> list[
 
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_filtered_N` with
     the prefilter, `ratio_prefiltered` that of 5,000, `ratio_step` picture and gradient of all
-    parameters by `prb`, and `ratio_step_filtered` these with the prefilter. Each scene has a
-    process of its own, as beside others Mitsuba takes longer.
+    parameters by `prb`, `ratio_step_filtered` these with the prefilter, and `ratio_step_drawn`
+    these by a bitmap that `eg.render` draws in each step. Each scene has a process of its own, as
+    beside others Mitsuba takes longer.
     `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
     `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
     memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
@@ -75,6 +76,7 @@ def _costs(balls: Sequence[Row]) -> list[Table]:
     costs += [(f"{n:,} Gaussians, prefilter", f"{row[f'ratio_filtered_{n}']:.2f}") for n in CHANGED]
     costs.append((f"a step of prb, {SETTLED:,} Gaussians", f"{row['ratio_step']:.2f}"))
     costs.append(("a step of prb, prefilter", f"{row['ratio_step_filtered']:.2f}"))
+    costs.append(("a step of prb, drawn into a bitmap", f"{row['ratio_step_drawn']:.2f}"))
     changes = [
         (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
         for what, name in LOOKUPS.items()
@@ -159,7 +161,7 @@ def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
     row, kinds = balls[-1], ("photo", "material", "text")
     ratio = {k: [r["ratio"] for r in posters if r["kind"] == k] for k in kinds}
     small = [r["ratio_small"] for r in posters if r["kind"] != "text"]
-    bake, texels = "`eigengs-dr render`, then a bitmap", "a fit through texels"
+    bake, texels = "`eigengs-dr render`, then a bitmap", "a set drawn into a bitmap"
     memory = [
         ("memory, photos", ratio["photo"]),
         ("memory, materials", ratio["material"]),
@@ -179,6 +181,7 @@ def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
             (f"the same, {CHANGED[-1]:,} Gaussians", f"ratio_filtered_{CHANGED[-1]}", bake),
             ("time of a step of `prb`", "ratio_step", texels),
             ("time of a step of `prb`, prefilter", "ratio_step_filtered", texels),
+            ("the same, drawn into a bitmap", "ratio_step_drawn", ""),
         )
     ]
     caption = (
@@ -237,6 +240,7 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         ends = {"bitmap": "bitmap", "gaussians": f"gaussians_{SETTLED}"}
         ends["filtered"] = f"filtered_{SETTLED}"
         makers |= {f"step_{n}": partial(makers[end], by_step=True) for n, end in ends.items()}
+        makers["step_drawn"] = partial(_drawn_step, variant, SIDE, SPP, files[SETTLED])
         timed = interleaved_apart(makers, WARM_UP, ROUNDS, partial(progress, "pictures"))
     programs: dict[str, Callable[[], Any]] = {}
     for count in CHANGED:
@@ -253,6 +257,7 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         "ratio_prefiltered": timed[f"filtered_{SETTLED}"] / timed["bitmap"],
         "ratio_step": timed["step_gaussians"] / timed["step_bitmap"],
         "ratio_step_filtered": timed["step_filtered"] / timed["step_bitmap"],
+        "ratio_step_drawn": timed["step_drawn"] / timed["step_bitmap"],
     }
 
 
@@ -277,6 +282,29 @@ def _picture(
         texture = {"type": "bitmap", "data": data, "raw": True}
     scene = mi.load_dict(ball(mi, texture, camera(mi, side, samples)))
     return _step(mi, scene) if by_step else partial(mi.render, scene)
+
+
+def _drawn_step(variant: str, side: int, samples: int, path: Path) -> Callable[[], Any]:
+    """Return what differentiates the ball by a set that is drawn into its bitmap.
+
+    It runs in a process of its own, see `interleaved_apart`.
+    """
+    mi = load_mitsuba(variant, quiet=False)
+    blank = {"type": "bitmap", "data": dr.zeros(mi.TensorXf, (TEXELS, TEXELS, 3)), "raw": True}
+    scene = mi.load_dict(ball(mi, blank, camera(mi, side, samples)))
+    gaussians, parameters = eg.Gaussians.load(path), mi.traverse(scene)
+    integrator = mi.load_dict({"type": "prb", "max_depth": 5})
+    (data,) = (name for name, _ in parameters if name.endswith("base_color.data"))
+
+    def step() -> Any:
+        moving = gaussians.mean, gaussians.factor, gaussians.color
+        dr.enable_grad(moving)
+        parameters[data] = to_linear(eg.render(gaussians, TEXELS, TEXELS))
+        parameters.update()
+        dr.backward(dr.mean(mi.render(scene, parameters, integrator=integrator), axis=None))
+        return dr.grad(moving)
+
+    return step
 
 
 def camera(mi: Any, side: int, samples: int) -> dict[str, Any]:
