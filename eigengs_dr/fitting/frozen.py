@@ -55,7 +55,7 @@ def arrays_of(function: FunctionType) -> list[DrJitArray]:
         elif isinstance(value, (list, tuple, dict)):
             parts = value.values() if isinstance(value, dict) else value
             found += [(name, part) for part in parts]
-        elif isinstance(value, FunctionType) and package not in (*KNOWN, "eigengs_dr"):
+        elif isinstance(value, FunctionType) and package != "eigengs_dr":
             found += _used(value)
         elif value is not None and type(value) not in (*CONSTANTS, slice) and package not in KNOWN:
             raise TypeError(
@@ -67,7 +67,11 @@ def arrays_of(function: FunctionType) -> list[DrJitArray]:
 
 
 def _used(function: FunctionType) -> list[tuple[str, Any]]:
-    """Return what the code of a function names; of modules, their members that it names."""
+    """Return what a function names in its code; of modules, their members that it names."""
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    used = {name: cell.cell_contents for name, cell in cells}
+    if _package(function) in KNOWN:  # it may hold a function of the user, as those of `drjit.wrap`
+        return list(used.items())
     codes, names = [function.__code__], set[str]()
     for code in codes:  # it grows
         codes += [part for part in code.co_consts if isinstance(part, CodeType)]
@@ -79,8 +83,6 @@ def _used(function: FunctionType) -> list[tuple[str, Any]]:
             f"loss: frozen=True, but its function uses {min(refused)}, which Dr.Jit cannot record; "
             "drop frozen=True"
         )
-    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-    used = {name: cell.cell_contents for name, cell in cells}
     used |= {name: function.__globals__[name] for name in names & {*function.__globals__}}
     used["a default"] = (function.__defaults__, function.__kwdefaults__)
     for name, module in list(used.items()):
