@@ -72,13 +72,12 @@ def _used(function: FunctionType) -> list[tuple[str, Any]]:
     used = {name: cell.cell_contents for name, cell in cells}
     if _package(function) in KNOWN:  # it may hold a function of the user, as those of `drjit.wrap`
         return list(used.items())
-    codes, names = [function.__code__], set[str]()
+    codes, names, imports = [function.__code__], set[str](), set[str]()
     for code in codes:  # it grows
         codes += [part for part in code.co_consts if isinstance(part, CodeType)]
         names |= {*code.co_names}
-        if any(step.opname == "IMPORT_NAME" for step in get_instructions(code)):
-            names.add("import")
-    if refused := names & {*CONVERSIONS, "import"}:
+        imports |= {s.argval for s in get_instructions(code) if s.opname == "IMPORT_NAME"}
+    if refused := names & CONVERSIONS | imports - {*KNOWN}:  # `drjit.syntax` imports drjit
         raise TypeError(
             f"loss: frozen=True, but its function uses {min(refused)}, which Dr.Jit cannot record; "
             "drop frozen=True"

@@ -125,9 +125,9 @@ def test_what_changes_is_noticed(kind):
 
 
 def imports(picture, step):
-    import math
+    import cmath
 
-    return math.pi * squares(picture)
+    return cmath.pi * squares(picture)
 
 
 class Losses:
@@ -152,7 +152,7 @@ LOSSES = Losses()
         (lambda p, s: absolute(p, type(p)(eg.sample("coffee")[:64, :64])), "uses eg.sample of eig"),
         (lambda p, s: squares(p) + float(p.numpy().mean()), "uses numpy, which"),
         (lambda p, s: LOSSES.l1(p, s), "uses LOSSES of"),
-        (imports, "uses import, which"),
+        (imports, "uses cmath, which"),
     ],
 )
 def test_what_may_convert_arrays_of_numpy_is_refused(function, message):
