@@ -91,7 +91,7 @@ def _used(function: FunctionType) -> list[tuple[str, Any]]:
     return list(used.items())
 
 
-def _package(value: Any) -> str:
+def _package(value: object) -> str:
     """Return the name of the package that a value, or else its type, comes from."""
     own = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
     return str(own or type(value).__module__).split(".")[0]

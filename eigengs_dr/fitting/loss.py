@@ -78,7 +78,8 @@ class Loss:
         are no more.
     frozen : bool, optional
         Whether Dr.Jit records the function and its derivative in the first step, and replays their
-        kernels in the others, where the function is not called. A replay sees another picture and
+        kernels in the others, where the function is not called: L1 and SSIM of 64x64 pixels take a
+        seventh of the time, those of 256x256 nine tenths (CPU). A replay sees another picture and
         another step, which is an array UInt of one number then. All else is as it was in the first
         step: each number and each array that the function uses, by closures and global names too;
         the size; the state of a generator of random numbers, so take ``dr.rng(seed=step)``. Each
@@ -142,11 +143,8 @@ class Loss:
                 f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser of "
                 "Dr.Jit, such as drjit.opt.Adam"
             )
-        if self.frozen is not False and (
-            self.frozen is not True
-            or self.parameters is not None
-            or not isinstance(self.function, FunctionType)
-        ):
+        plain = isinstance(self.function, FunctionType) and self.parameters is None
+        if not isinstance(self.frozen, bool) or (self.frozen and not plain):
             raise TypeError(
                 f"Loss: frozen is {self.frozen!r}; give True or False, and True only with a plain "
                 "function and no parameters"
@@ -309,8 +307,8 @@ CHECK_EVERY = 10
 """Calls after which the values are read back; each read waits for the device."""
 
 CHECK_FROZEN = 100
-"""Steps between two comparisons of a frozen loss with its function. One takes ten replays or more
-of small pictures."""
+"""Steps between two comparisons of a frozen loss with its function. One takes as long as 8 replays
+of L1 and SSIM, for a picture of 64x64 pixels."""
 
 ROUNDING = 1e-3
 """Largest difference of a frozen loss from its function, relative to value and derivative. That of
@@ -383,6 +381,7 @@ class LossObjective(Pixels):
         if not self.loss.frozen:
             yield partial(self.differentiate, parameters=self.loss.parameters)
             return
+        assert isinstance(self.loss.function, FunctionType)
         used = arrays_of(self.loss.function)
         with freeze_program(
             lambda pictures, step, used: self.differentiate(pictures, step)
