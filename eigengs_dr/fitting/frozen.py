@@ -20,8 +20,8 @@ from ..image.metrics import ssim
 KNOWN = ("drjit", "math")
 """Packages whose functions and types Dr.Jit records, or refuses by an error."""
 
-CONVERSIONS = {"numpy", "torch", "jax", "tf", "__array__", "__dlpack__"}
-"""Members of an array of Dr.Jit that give arrays with its memory."""
+REFUSED = {"numpy", "torch", "jax", "tf", "__array__", "__dlpack__", "sort", "argsort"}
+"""Members of an array that share its memory; and sorting, which ends the process on cuda."""
 
 
 def arrays_of(function: FunctionType) -> list[DrJitArray]:
@@ -77,7 +77,7 @@ def _used(function: FunctionType) -> list[tuple[str, Any]]:
         codes += [part for part in code.co_consts if isinstance(part, CodeType)]
         names |= {*code.co_names}
         imports |= {s.argval for s in get_instructions(code) if s.opname == "IMPORT_NAME"}
-    if refused := names & CONVERSIONS | imports - {*KNOWN}:  # `drjit.syntax` imports drjit
+    if refused := names & REFUSED | imports - {*KNOWN}:  # `drjit.syntax` imports drjit
         raise TypeError(
             f"loss: frozen=True, but its function uses {min(refused)}, which Dr.Jit cannot record; "
             "drop frozen=True"

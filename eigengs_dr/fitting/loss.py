@@ -89,8 +89,8 @@ class Loss:
         the fit ends with an error. Rows, controls and the judge call the function itself.
         It must be a plain function of Dr.Jit's functions and arrays, of `eigengs_dr.ssim`, of
         numbers, and of such functions. An array of NumPy that it converted would end the process:
-        a function that names anything of NumPy or of another package is refused. So are branches
-        on values, which Dr.Jit cannot record, and `parameters`.
+        a function that names anything of NumPy or of another package is refused. So are methods,
+        sorting, branches on values, and `parameters`.
 
     Raises
     ------
@@ -392,7 +392,7 @@ class LossObjective(Pixels):
                     found = replay(pictures, dr.opaque(self.types.UInt, step), used)
                 except Exception as error:
                     self.differentiate(pictures, step)  # it may raise the same
-                    reason = str(error).splitlines()[0]
+                    reason = str(error).partition("\n")[0]
                     raise ValueError(
                         f"loss: frozen=True, but Dr.Jit cannot record its function: {reason}; take "
                         "the step as an array, make arrays outside, or drop frozen=True"
