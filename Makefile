@@ -17,7 +17,7 @@ ON_ALL_CORES := -n logical --maxprocesses 4 --dist loadfile
 # Path of a simulator of the CUDA driver: a program that runs the command it is given.
 CUDASIM ?= $(wildcard ../shared/cudasim/cudasim)
 
-LLVM_ADVICE := install LLVM 17 or newer and libatomic (as root: Debian, Ubuntu 'apt install \
+LLVM_ADVICE := install LLVM 18 or newer and libatomic (as root: Debian, Ubuntu 'apt install \
 libllvm19 libatomic1', Fedora 'dnf install llvm-libs libatomic', macOS 'brew install llvm'), \
 then make again
 VENV_ADVICE := as root, type 'apt install python3-venv', then make again

@@ -19,7 +19,6 @@ from eigengs_dr.relight.planes import directions
 from . import properties
 from .color import luminance, upload_table, upsample
 from .gaussian_texture import gaussian_texture
-from .parameters import texture_of
 
 RESOLUTION = 32
 """Directions along each side of the octahedron on which factors of planes are tabulated."""
@@ -51,7 +50,7 @@ def gaussian_relightable() -> type:
             scene. Photos lie over uv as those of a ``gaussian_texture``, row 0 at v = 0.
         scale : float, default: 1
             Factor of all values.
-        wrap_mode, to_uv, prefilter
+        wrap_mode, to_uv, prefilter, memory
             See ``gaussian_texture``. Photos are not turned by `to_uv`: it may scale and move.
         """
 
@@ -59,11 +58,11 @@ def gaussian_relightable() -> type:
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             path = properties.path(props, "model")
-            model = Relightable.load(path, backend_of(mi.variant()))
+            lights = Relightable.load(path, backend_of(mi.variant())).table
             self.scale = dr.opaque(mi.Float, properties.light_scale(props))
-            self.planes = texture(_properties_of(model, props))
+            self.planes = texture(_properties_of_planes(path, props))
             properties.check_known(props)
-            table = model.table.at(directions(RESOLUTION)).reshape(RESOLUTION, RESOLUTION, -1)
+            table = lights.at(directions(RESOLUTION)).reshape(RESOLUTION, RESOLUTION, -1)
             self.factors = mi.Texture2f(
                 upload(mi.TensorXf, table.astype(np.float32)),
                 use_accel=False,
@@ -146,16 +145,14 @@ def gaussian_relightable() -> type:
     return GaussianRelightable
 
 
-def _properties_of(model: Relightable, props: mi.Properties) -> mi.Properties:
+def _properties_of_planes(path: str, props: mi.Properties) -> mi.Properties:
     """Return the properties of the texture of the planes: a channel for each."""
     texture = mi.Properties("gaussian_texture")
     texture.set_id(props.id())
-    for key in ("wrap_mode", "to_uv", "prefilter"):
+    texture["planes"], texture["raw"] = path, True
+    for key in ("wrap_mode", "to_uv", "prefilter", "memory"):
         if key in props:
             texture[key] = props[key]
-    for key, value in texture_of(model.planes, raw=True).items():
-        if key != "type":
-            texture[key] = value
     return texture
 
 

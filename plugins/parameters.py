@@ -151,6 +151,10 @@ def _tensors_in(parameters: Mapping[str, object], texture: str) -> Arrays:
 # ---------------------------------------------------------------------------------------------
 
 
+Reader = Callable[[str, str | None], Gaussians]
+"""Reads a set from a path, for a backend."""
+
+
 class SharedFile:
     """The content of a file, which is read once for all textures of a scene that use it.
 
@@ -170,8 +174,10 @@ class SharedFile:
         What lookups of all channels read, by the properties that it depends on; textures hold it.
     """
 
-    def __init__(self, path: str, backend: str | None, first: int | None) -> None:
-        self.path, self.backend, self.first = path, backend, first
+    def __init__(
+        self, path: str, backend: str | None, first: int | None, read: Reader = Gaussians.load
+    ) -> None:
+        self.path, self.backend, self.first, self.read = path, backend, first, read
         self.state = state_of(path)
         whole = self._load()
         self.count, self.like = len(whole), without_arrays(whole)
@@ -181,7 +187,7 @@ class SharedFile:
 
     def _load(self) -> Gaussians:
         """Read the set, or its first Gaussians."""
-        whole, first = Gaussians.load(self.path, self.backend), self.first
+        whole, first = self.read(self.path, self.backend), self.first
         if first is not None and first > len(whole):
             raise ValueError(f"{self.path}: first is {first}; the file has {len(whole)} Gaussians")
         return whole if first is None else whole[:first]
@@ -308,16 +314,18 @@ def state_of(path: str) -> tuple[int, ...]:
     return state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns
 
 
-def shared_file(path: str, backend: str | None, first: int | None, coded: bool) -> SharedFile:
+def shared_file(
+    path: str, backend: str | None, first: int | None, coded: bool, read: Reader = Gaussians.load
+) -> SharedFile:
     """Return the content of a file; while a texture uses it, it is read again for tensors alone.
 
     A file that has changed on disk counts as another one, and so does one whose tables are to be
-    `coded` or not: these keep the tensors. For errors see `Gaussians.load`.
+    `coded` or not: these keep the tensors. For errors see `read`.
     """
-    key = (*state_of(path), mi.variant(), backend, first, coded)
+    key = (*state_of(path), mi.variant(), backend, first, coded, read)
     file = _files.get(key)
     # While Dr.Jit copies the content, its thread may make another texture, which reads it first.
-    return file or _files.setdefault(key, SharedFile(path, backend, first))
+    return file or _files.setdefault(key, SharedFile(path, backend, first, read))
 
 
 SHAPES = ("mean", "factor")
@@ -428,6 +436,11 @@ def _direction(light: Any) -> Any:
     """Return a light that an optimiser may have spoilt, or the light of the camera."""
     length = dr.squared_norm(light)
     return dr.select(dr.isfinite(length) & (length > 0), light, type(light)(0, 0, 1))
+
+
+def read_planes(path: str, backend: str | None) -> Gaussians:
+    """Read the planes of a model of lights."""
+    return Relightable.load(path, backend).planes
 
 
 def light_source(model: Relightable, light: NDArray[np.float32]) -> TextureParameters:

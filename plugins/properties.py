@@ -22,9 +22,13 @@ from .parameters import (
     TextureParameters,
     light_source,
     model_source,
+    read_planes,
     shared_file,
     without_arrays,
 )
+
+FILES = ("filename", "model", "planes")
+"""Properties that name the file of the Gaussians."""
 
 UP = (0.0, 0.0, 1.0)
 """Default light of a relightable model: from the camera."""
@@ -49,13 +53,15 @@ def _read(props: mi.Properties, key: str, default: object, kind: type, must: str
 def source_of(props: mi.Properties) -> TextureParameters:
     """Read the Gaussians from the properties ``filename``, ``model`` or ``mean``, ...
 
+    Of a ``gaussian_relightable``, they are those of its model, under ``planes``.
+
     Raises
     ------
     ValueError
         If none or several of these properties are given, a file has other content, or a set
         has more than three channels.
     """
-    given = [key for key in ("filename", "model", "mean") if key in props]
+    given = [key for key in (*FILES, "mean") if key in props]
     if len(given) != 1:
         raise ValueError(
             f"{props.plugin_name()}: give one of filename (a saved set), model (a saved EigenGS or "
@@ -74,6 +80,9 @@ def source_of(props: mi.Properties) -> TextureParameters:
             if coefficients.dtype.kind not in "fiu" or not np.isfinite(coefficients).all():
                 raise ValueError(f"{props.plugin_name()}: coefficients must be finite numbers")
         return model_source(EigenGS.load(path(props, "model"), backend), coefficients)
+    if given[0] == "planes":
+        shared = shared_file(path(props, "planes"), backend, None, memory(props).coded, read_planes)
+        return shared.source(None)
     if given[0] == "filename":
         first = _read(props, "first", 0, int, "a number of Gaussians")
         if first < 0:
@@ -119,7 +128,7 @@ def path(props: mi.Properties, key: str) -> str:
 
 def file_name(props: mi.Properties) -> str:
     """Return the name of the file of the Gaussians, without folders; "" if there is no file."""
-    return next((Path(props[key]).name for key in ("filename", "model") if key in props), "")
+    return next((Path(props[key]).name for key in FILES if key in props), "")
 
 
 def raw(props: mi.Properties) -> bool:

@@ -66,7 +66,8 @@ def plugin_of_sums(base: type) -> Any:
             self.changed = False
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
-            if hasattr(callback, "only_objects"):
+            # C++ looks for objects alone: scenes of Mitsuba 3.10 for textures that are `filtered`.
+            if type(callback) is mi.TraversalCallback or hasattr(callback, "only_objects"):
                 return
             for name, tensor in self.source.tensors.items():
                 callback.put(name, tensor, mi.ParamFlags.Differentiable)
@@ -130,7 +131,7 @@ def plugin_of_sums(base: type) -> Any:
                 self._take_over(True)
 
         def filtered(self) -> bool:
-            """Return whether lookups average over a footprint; Mitsuba 3.10 asks."""
+            """Return whether lookups average over a footprint; scenes of Mitsuba 3.10 ask once."""
             return self.follows or self.sensor is not None or self.angle > 0
 
         def pixel(self) -> Float | None:

@@ -160,7 +160,9 @@ def footprint_of(si: mi.SurfaceInteraction3f) -> tuple[Float, ...] | None:
     -------
     tuple of 4 Float, or None
         The matrix m00, m01, m10, m11 whose columns span the ellipse of a pixel in uv; a column is
-        as long as a pixel is wide, and 0 if the ray has no cone. None before Mitsuba 3.10.
+        as long as a pixel is wide, or shorter where a pixel takes several samples, and 0 if the
+        ray has no cone or the scene had no texture to filter when it was made. None before
+        Mitsuba 3.10.
     """
     if not hasattr(si, "footprint"):
         return None

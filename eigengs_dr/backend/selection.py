@@ -73,7 +73,7 @@ def select(backend: str | None = None) -> ModuleType:
         raise BackendError(f"{fault or load_failure()}; {advice()}")
     version = _llvm_version(dr)[0]
     if version < MIN_VERSION:
-        raise BackendError(f"{loaded_path()} is LLVM {version}, which crashes Dr.Jit; {advice()}")
+        raise BackendError(f"{loaded_path()} is LLVM {version}, which is too old; {advice()}")
     return dr.llvm.ad
 
 
@@ -204,8 +204,9 @@ def _silent_stderr() -> Iterator[None]:
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 """The environment variable from which Dr.Jit takes the path of libLLVM."""
 
-MIN_VERSION = 17
-"""The oldest major version of LLVM that is accepted."""
+MIN_VERSION = 18
+"""The oldest major version of LLVM that is accepted. 15 and 16 end the process in `drjit.clip`, and
+Dr.Jit 1.6 requires 18, as its changelog says."""
 
 TESTED_VERSIONS = (19, 22)
 """Major versions that the tests ran with; they are preferred to all others."""
@@ -316,9 +317,7 @@ def too_old() -> str | None:
     library = _library(os.environ.get(PATH_VARIABLE, ""))
     if library.usable:
         return None
-    return (
-        f"{library.path} (from {PATH_VARIABLE}) is LLVM {library.version}, which Dr.Jit cannot use"
-    )
+    return f"{library.path} (from {PATH_VARIABLE}) is LLVM {library.version}, which is too old"
 
 
 def load_failure() -> str:

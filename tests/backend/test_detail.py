@@ -1,11 +1,13 @@
 """What the package needs of `drjit.detail`: if a test fails, what it names has to be mended."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
 
 import eigengs_dr
+from _helpers.kernels import jit, launches
 from eigengs_dr.backend.arrays import (
     indices_of,
     kernel_misses,
@@ -21,6 +23,21 @@ def test_libllvm_says_its_version():
     """`select` refuses versions that crash; `doctor` and reports show it."""
     if dr.has_backend(dr.JitBackend.LLVM):
         assert dr.detail.llvm_version() >= (8, 0, 0)
+
+
+def test_launches_of_the_next_version_are_read():
+    class Later(list):
+        """The history of Dr.Jit 1.6, filled when its block ends."""
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            self.append(SimpleNamespace(type=dr.KernelType.JIT, hash="7f"))
+
+    with launches(Later) as launched:
+        pass
+    assert [kernel.hash for kernel in jit(launched)] == ["7f"]
 
 
 def test_scopes_are_numbered(backend):

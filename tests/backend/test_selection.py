@@ -38,8 +38,8 @@ def fake_drjit(monkeypatch, *, llvm=True, version=(19, 1, 7), cuda=False, metal=
 @pytest.mark.parametrize(
     ("works", "version", "words"),
     [
-        (False, (-1, -1, -1), r"no libLLVM was found; install LLVM 17.*libllvm19"),
-        (True, (15, 0, 6), r"LLVM 15, which crashes.*libllvm19"),
+        (False, (-1, -1, -1), r"no libLLVM was found; install LLVM 18.*libllvm19"),
+        (True, (15, 0, 6), r"LLVM 15, which is too old; .*libllvm19"),
     ],
 )
 def test_machine_without_an_llvm_that_works(monkeypatch, works, version, words):

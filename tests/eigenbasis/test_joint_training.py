@@ -4,6 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from _helpers.kernels import jit, launches
 from _helpers.reference import render_plain
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.backend.selection import select
@@ -132,12 +133,10 @@ def test_ragged_empty_and_constant_channels(backend, counts):
 def test_replays_compile_nothing(backend):
     """Once a run was made, one of other components uses its kernels."""
     train(backend, 4)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
+    with launches() as launched:
         train(backend, 4, band(seed=1))
-        history = dr.kernel_history([dr.KernelType.JIT])
-    assert history
-    assert all(kernel["cache_hit"] for kernel in history)
+    assert jit(launched)
+    assert all(kernel.cache_hit for kernel in jit(launched))
 
 
 def test_no_components():

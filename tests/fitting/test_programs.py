@@ -1,12 +1,11 @@
 """Programs of Dr.Jit: one serves images of every size, and sets of every number of Gaussians."""
 
-from contextlib import contextmanager
-
 import drjit as dr
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.kernels import jit, launches
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
 
 
@@ -16,21 +15,12 @@ def picture(width, height, seed=0):
     return (wave + np.random.default_rng(seed).normal(0, 0.05, wave.shape)).astype(np.float32)
 
 
-@contextmanager
-def programs():
-    """Collect the names of the programs that a block runs."""
-    names = set()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        yield names
-        names.update(k["hash"] for k in dr.kernel_history([dr.KernelType.JIT]))
-
-
 def programs_of(call, *arguments):
-    with programs() as names:
+    """Return the names of the programs that a call runs."""
+    with launches() as launched:
         call(*arguments)
-    assert names
-    return names
+    assert jit(launched)
+    return {kernel.hash for kernel in jit(launched)}
 
 
 MORE = {"llvm": 0, "cuda": 5}

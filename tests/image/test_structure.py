@@ -6,6 +6,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 import eigengs_dr as eg
+from _helpers.kernels import jit, launches
 from eigengs_dr.backend.arrays import _types, upload
 from eigengs_dr.backend.selection import select
 
@@ -234,11 +235,10 @@ def test_one_program_serves_all_sizes(types):
         dr.eval(dr.backward(eg.ssim(a, b)), dr.grad(a))
 
     run((40, 30, 3))
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
+    with launches() as launched:
         for shape in ((40, 30, 3), (31, 55, 1)):
             run(shape)
-        hashes = [k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    hashes = [kernel.hash for kernel in jit(launched)]
     half = len(hashes) // 2
     assert half >= 4
     assert hashes[:half] == hashes[half:]

@@ -181,7 +181,7 @@ def test_parameters_are_made_when_they_are_asked_for(tmp_path):
 
 
 def test_nothing_but_traverse_asks_for_parameters(tmp_path):
-    """Neither a mean, nor a lamp, nor a camera that is followed."""
+    """Neither a mean, nor a lamp, nor a camera that is followed, nor Mitsuba itself."""
     file = in_a_file(tmp_path)
     scene = small_scene({"type": "plastic", "diffuse_reflectance": file})
     follow(scene)
@@ -191,6 +191,7 @@ def test_nothing_but_traverse_asks_for_parameters(tmp_path):
     np.testing.assert_allclose(seen(tex), seen(exact), atol=2 * LOSS)  # of words again made words
     mi.render(scene, spp=1)
     tex.mean(), tex.max(), str(tex)
+    tex.traverse(mi.TraversalCallback())  # as C++ of Mitsuba 3.10 looks for textures to filter
     dr.eval(tex.sample_position(mi.Point2f(0.3, 0.4)))
     assert "tensors" not in vars(tex.source) and is_coded(tex)
 
@@ -336,6 +337,14 @@ def test_a_model_of_lights_loses_little(tmp_path):
             parameters["light"] = mi.Vector3f(*light)
             parameters.update()
         np.testing.assert_array_equal(seen(tex), seen(exact))  # it has changed: floats
+    file["type"] = "gaussian_relightable"
+    tex, exact = (mi.load_dict({**file, "memory": name}).planes for name in ("normal", "exact"))
+    assert is_coded(tex) and not is_coded(exact)
+    # Rows of 8 words instead of 12 numbers, and no parameters: 9 numbers.
+    assert resident_bytes(exact) - resident_bytes(tex) == pytest.approx(52 * 80, abs=100)
+    si = in_front(texel_centres())
+    values = [np.array(mi.Float(sum(one.values(si, mi.Bool(True))))) for one in (tex, exact)]
+    np.testing.assert_allclose(*values, atol=5 * LOSS)
 
 
 def test_a_memory_that_is_none():
