@@ -229,7 +229,7 @@ SHARED: dict[str, Option] = {
         "--cluster",
         "local[:N]|tcp://HOST:PORT|FILE",
         str,
-        "Run on N local processes, or on a Dask cluster.",
+        "Run on N local processes or a Dask cluster.",
     ),
     "backend": choice(
         "--backend", BACKENDS, "Backend of Dr.Jit.  [default: cuda if present]", True
