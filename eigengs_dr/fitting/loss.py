@@ -39,7 +39,7 @@ LossFunction: TypeAlias = Callable[[Any, int], Any]
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """What a fit minimises, if it is not the squared error of an image.
+    """What a fit minimises instead of the squared error of an image.
 
     Attributes
     ----------
