@@ -56,7 +56,7 @@ ENTRY = re.compile(r"^(\w[\w, ]*) : (.+)\n((?: {4}.*\n?)+)", re.M)
 NAMES = re.compile(r"((?:^   [\w.]+\n)+)```\n-->\n\n<!-- (names: [\w-]+) -->", re.M)
 """The names that an autosummary lists, and the mark of their descriptions, which follow it."""
 
-HELP = re.compile(r"\n *--help +Show this message and exit\.")
+HELP = re.compile(r"(\n\nOptions:(?=\n *--help))?\n *--help +Show this message and exit\.")
 """What the help of every command says of itself."""
 
 LONG = 20
@@ -159,7 +159,8 @@ def plugin_parameters(plugin: str) -> str:
     """
     flags = _flags_of(plugin)
     texture = [] if plugin == "gaussian_texture" else _entries("gaussian_texture")
-    same, lines = [], ["| parameter | type | description | default | flags |", "|---|---|---|---|---|"]
+    lines = ["| parameter | type | description | default | flags |", "|---|---|---|---|---|"]
+    same = []
     for names, kind, text in _entries(plugin):
         shown = ", ".join(f"`{name}`" for name in names.split(", "))
         if (names, kind, text) in texture:

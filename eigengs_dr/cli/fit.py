@@ -55,10 +55,8 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
 @options.choice("--target-space", ["rgb", "ycbcr"], "Colour space of --target-psnr.", True)
 @options.number("--max-gaussians", "Largest number of Gaussians for --target-psnr.")
 @options.value("--blocks", "SIZE", int, "Fit blocks of this side, in less memory.")
-@options.level_counts(
-    "Number of levels of detail, each 4 times as large, or Gaussians up to each."
-)
-@options.number("--iterations", "Number of optimisation steps.", 1000)
+@options.level_counts("Number of levels of detail, each 4 times as large, or Gaussians up to each.")
+@options.number("--iterations", "Optimisation steps.", 1000)
 @options.choice("--init", INITS, "Initial placement.  [default: adaptive]", True)
 @options.value("--basis", "NAME|FILE", str, "Model to start from: natural, or a file.")
 @options.choice("--preset", PRESETS, "Our method, or the method of a paper.")
@@ -70,12 +68,10 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
     True,
 )
 @options.encoding
-@options.number("--seed", "Seed of the random numbers.", 0)
-@options.value(
-    "--preview", "FILE", options.path, "Picture, or folder, of photo, fit and outlines."
-)
+@options.number("--seed", "Seed of random numbers.", 0)
+@options.value("--preview", "FILE", options.path, "Picture, or folder, of photo, fit and outlines.")
 @click.option("--recursive", is_flag=True, help="Also take images in subfolders.")
-@click.option("--overwrite", is_flag=True, help="Of several, also fit images with results again.")
+@click.option("--overwrite", is_flag=True, help="Also fit images that have results.")
 @options.shared("cluster", "backend", "report", "quiet")
 def fit(
     run: options.Run,
@@ -94,7 +90,7 @@ def fit(
     folders, whose files are named after the images; manifest.jsonl has a row per image. If an image
     fails, the rest is still fitted, and the exit code is 2.
 
-    A single result is replaced if it exists. Several images are skipped where results exist, so
+    A single result is replaced if it exists. Of several images, those with results are skipped, so
     that the same command continues a run; results of other options are an error. A file that is
     not a set of Gaussians is never replaced.
 

@@ -32,7 +32,7 @@ from .scene import load_mitsuba, scene_errors
 @click.option(
     "--texture",
     is_flag=True,
-    help="Also load the file as a texture, and show its memory.",
+    help="Also load the file as a Mitsuba texture, and show its memory.",
 )
 def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None:
     """Show the contents of a fitted image, a material or a model.

@@ -17,7 +17,7 @@ from .outputs import check_outputs, lock_outputs, name_outputs
 @click.command()
 @click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
 @options.output("Picture, or folder of PNG files.", "Y.png|FOLDER", False)
-@options.value("--light", "X,Y,Z", options.light, "Light of a model of lights.")
+@options.value("--light", "X,Y,Z", options.light, "Light direction for a model of lights.")
 @click.option(
     "--planes",
     type=options.path,

@@ -262,13 +262,14 @@ def convert(
     variant: str | None,
     definitions: dict[str, str],
 ) -> None:
-    """Replace the bitmaps of a Mitsuba scene by as many Gaussians as its cameras resolve.
+    """Replace the bitmaps of a Mitsuba scene by Gaussians.
 
-    FOLDER gets scene.xml, a set per image, and per camera the renderings before and after, and 8
-    times their difference. If a rendering misses the PSNR, the exit code is 1. The command keeps a
-    bitmap, and says why, if it takes less memory than its Gaussians, if many of them overlap, if
-    the PSNR would be missed, if it has two values as masks do, or data outside of 0 to 1, or if no
-    camera sees it. The new scene refers to other files relative to FOLDER.
+    Each gets as many as the cameras resolve. FOLDER gets scene.xml, a set per image, and per camera
+    the renderings before and after, and 8 times their difference. If a rendering misses the PSNR,
+    the exit code is 1. The command keeps a bitmap, and says why, if it takes less memory than its
+    Gaussians, if many of them overlap, if the PSNR would be missed, if it has two values as masks
+    do, or data outside of 0 to 1, or if no camera sees it. The new scene refers to other files
+    relative to FOLDER.
 
     \b
     Examples:
