@@ -1,7 +1,8 @@
 """Run the notebook of the manual and store small outputs: ``python docs/run_notebook.py``.
 
-Pictures become small JPEG files. A page of `eigengs_dr.view` needs a browser and is large: its text
-stays. The build of the manual runs the notebook again, and shows all of it.
+Pictures become JPEG files, which any viewer of notebooks shows. A page of `eigengs_dr.view` needs a
+browser and is large: its text stays. The build of the manual runs the notebook again, and shows all
+of it.
 """
 
 import re
@@ -10,12 +11,13 @@ from io import BytesIO
 from pathlib import Path
 
 import nbformat
+import numpy as np
 from nbclient import NotebookClient
 from PIL import Image
 
 NOTEBOOK = Path(__file__).parent / "notebook.ipynb"
-SIDE, QUALITY = 320, 80  # pixels; of JPEG
-PICTURE = re.compile(r"data:image/\w+;base64,([^\"]+)")
+WIDTH, QUALITY = 960, 80  # pixels, at most; of JPEG
+PICTURE = re.compile(r"<img src=\"data:image/\w+;base64,([^\"]+)")
 
 
 def main() -> None:
@@ -25,27 +27,23 @@ def main() -> None:
     NotebookClient(book, kernel_name="python3", record_timing=False).execute()
     book.metadata = metadata  # without the versions of this machine
     for cell in book.cells:
-        if cell.cell_type == "code":
+        if cell.cell_type == "code":  # without bars of progress
             cell.outputs = [output for output in cell.outputs if output.output_type != "stream"]
-            for output in cell.outputs:  # but for bars of progress
+            for output in cell.outputs:
                 shrink(output.get("data", {}))
     nbformat.write(book, NOTEBOOK)
 
 
 def shrink(shown: dict[str, str]) -> None:
-    """Make the pictures of an output small, or drop its page."""
-    html = shown.pop("text/html", "")
-    if html and "<iframe" not in html:
-        shown["text/html"] = PICTURE.sub(smaller, html)
-
-
-def smaller(found: re.Match[str]) -> str:
-    """Return the data URI of a picture of at most `SIDE` pixels."""
-    picture = Image.open(BytesIO(b64decode(found[1]))).convert("RGB")
-    picture.thumbnail((SIDE, SIDE))
-    file = BytesIO()
-    picture.save(file, "jpeg", quality=QUALITY)
-    return f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
+    """Replace the HTML of an output by its pictures, side by side."""
+    codes = PICTURE.findall(shown.pop("text/html", ""))
+    pictures = [Image.open(BytesIO(b64decode(code))).convert("RGB") for code in codes]
+    if pictures:
+        row = Image.fromarray(np.hstack([np.asarray(picture) for picture in pictures]))
+        row.thumbnail((WIDTH, WIDTH))
+        file = BytesIO()
+        row.save(file, "jpeg", quality=QUALITY)
+        shown["image/jpeg"] = b64encode(file.getvalue()).decode()
 
 
 if __name__ == "__main__":

@@ -264,7 +264,7 @@ def convert(
 ) -> None:
     """Replace the bitmaps of a Mitsuba scene by Gaussians.
 
-    Each gets as many as the cameras resolve. FOLDER gets scene.xml, a set per image, and per camera
+    Each gets as many as cameras resolve. FOLDER gets scene.xml, a set per image, and per camera
     the renderings before and after, and 8 times their difference. If a rendering misses the PSNR,
     the exit code is 1. The command keeps a bitmap, and says why, if it takes less memory than its
     Gaussians, if many of them overlap, if the PSNR would be missed, if it has two values as masks
