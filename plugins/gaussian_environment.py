@@ -51,7 +51,8 @@ def gaussian_environment() -> type:
         Parameters
         ----------
         filename : string
-            An ``.npz`` or ``.egs`` file, relative to the scene.
+            An ``.npz`` or ``.egs`` file, relative to the scene. Plugins of one file share its
+            memory until a parameter changes.
         map : string
             Name of a map of `filename`.
         first : integer, default: all
@@ -82,8 +83,8 @@ def gaussian_environment() -> type:
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         memory : string, default: normal, of arrays exact
-            ``normal``: lookups read 16 bytes per Gaussian until a parameter changes; ``small``:
-            also lists of larger cells; ``exact``: floats.
+            ``normal``: a Gaussian takes 16 bytes until a parameter changes; ``small``: also lists
+            of larger cells; ``exact``: floats.
         """
 
         transform_name = "to_world"

@@ -33,8 +33,8 @@ def gaussian_texture() -> type:
         Parameters
         ----------
         filename : string
-            An ``.npz`` or ``.egs`` file, relative to the scene. Textures of one file share memory
-            and lookups until a parameter changes.
+            An ``.npz`` or ``.egs`` file, relative to the scene. Plugins of one file share its
+            memory until a parameter changes.
         map : string
             Name of a map of `filename`.
         first : integer, default: all
@@ -71,8 +71,8 @@ def gaussian_texture() -> type:
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         memory : string, default: normal, of arrays exact
-            ``normal``: lookups read 16 bytes per Gaussian until a parameter changes; ``small``:
-            also lists of larger cells; ``exact``: floats.
+            ``normal``: a Gaussian takes 16 bytes until a parameter changes; ``small``: also lists
+            of larger cells; ``exact``: floats.
         """
 
         transform_name, others = "to_uv", frozenset({"to_uv", "prefilter"})
