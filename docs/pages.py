@@ -170,7 +170,8 @@ def plugin_parameters(plugin: str) -> str:
         said = " ".join(text.split()).replace("``", "`").removesuffix(".")
         lines.append(f"| {shown} | {kind} | {said} | {default or '-'} | {flags.get(names, '')} |")
     if same:
-        lines.append(f"| {', '.join(same)} | | [as of a texture]({TEXTURE_PAGE}#parameters) | | |")
+        row = f"| {', '.join(same)} | | [as of a texture]({TEXTURE_PAGE}#parameters) | | |"
+        lines.insert(2, row)
     return "\n".join(lines)
 
 
