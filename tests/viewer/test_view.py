@@ -39,6 +39,7 @@ def test_a_page_is_one_file(tmp_path):
     assert [link for link in links if "http" in link] == []
     assert "default-src 'none'" in page.html
     page.save(tmp_path / "a.html")
+    assert repr(page) == f"Page({(tmp_path / 'a.html').stat().st_size:,} bytes)"
     assert (tmp_path / "a.html").read_text(encoding="utf-8") == page.html
     with pytest.raises(ValueError, match="must end in"):
         page.save(tmp_path / "a.png")
