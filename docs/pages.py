@@ -32,6 +32,8 @@ REFERENCE = Path(__file__).parent / "reference"
 
 PLUGINS = ("texture", "environment")
 
+TEXTURE_PAGE = "gaussian-texture.md"
+
 
 def write_pages() -> None:
     """Write pages/photo.html, pages/levels.html and pages/model.html."""
@@ -52,7 +54,10 @@ ENTRY = re.compile(r"^(\w[\w, ]*) : (.+)\n((?: {4}.*\n?)+)", re.M)
 
 
 NAMES = re.compile(r"((?:^   [\w.]+\n)+)```\n-->\n\n<!-- (names: [\w-]+) -->", re.M)
-"""The names that an autosummary lists, and the mark of their table, which follows it."""
+"""The names that an autosummary lists, and the mark of their descriptions, which follow it."""
+
+HELP = re.compile(r"(\n\nOptions:(?=\n *--help))?\n *--help +Show this message and exit\.")
+"""What the help of every command says of itself."""
 
 LONG = 20
 """Length of a default value from which a signature shows dots instead."""
@@ -63,7 +68,7 @@ def outdated() -> dict[Path, str]:
     found = {}
     for page in (REFERENCE / "python.md", REFERENCE / "commands.md", *plugin_pages().values()):
         there = page.read_text("utf-8")
-        parts = {mark: names_table(names.split()) for names, mark in NAMES.findall(there)}
+        parts = {mark: names_list(names.split()) for names, mark in NAMES.findall(there)}
         if "<!-- commands: all -->" in there:
             parts["commands: all"] = helps()
         plugins = [plugin for plugin, its_page in plugin_pages().items() if page == its_page]
@@ -78,16 +83,16 @@ def plugin_pages() -> dict[str, Path]:
     return {f"gaussian_{name}": REFERENCE / f"gaussian-{name}.md" for name in PLUGINS}
 
 
-def names_table(names: list[str]) -> str:
-    """Return the table of public names: signature, methods, first line of the docstring."""
-    lines = ["| name | what it is |", "|---|---|"]
+def names_list(names: list[str]) -> str:
+    """Return the list of public names: signature, first line of the docstring, methods."""
+    lines = []
     for name in names:
         found = pydoc.locate(f"eigengs_dr.{name}")
         text = inspect.getdoc(found) if callable(found) else documented(name)
-        first = str(text).splitlines()[0].replace("``", "`").replace("|", "\\|")
+        first = str(text).splitlines()[0].replace("``", "`").removesuffix(".")
         methods = ", ".join(f"`{method}`" for method in methods_of(found))
-        shown = f"{first} Methods: {methods}" if methods else first
-        lines.append(f"| `{name}{signature_of(found)}` | {shown} |")
+        shown = f"{first}. Methods: {methods}" if methods else first
+        lines.append(f"- `{name}{signature_of(found)}`: {shown}")
     return "\n".join(lines)
 
 
@@ -133,12 +138,15 @@ def methods_of(found: object) -> list[str]:
 
 
 def helps() -> str:
-    """Return what ``--help`` of the program and of each of its commands prints."""
+    """Return what ``--help`` of the program and of each of its commands prints.
+
+    Only that of the program lists the option itself.
+    """
     top = click.Context(main, info_name="eigengs-dr", show_default=True, terminal_width=80)
     texts = {"eigengs-dr": main.get_help(top)}
     for name, command in main.commands.items():
         context = click.Context(command, top, name)  # as wide as that above
-        texts[f"eigengs-dr {name}"] = command.get_help(context)
+        texts[f"eigengs-dr {name}"] = HELP.sub("", command.get_help(context))
     parts = [f"## {name}\n\n```text\n{text}\n```" for name, text in texts.items()]
     return "\n\n".join(parts)
 
@@ -147,11 +155,38 @@ def plugin_parameters(plugin: str) -> str:
     """Return the table of the parameters of a plugin, from the docstring of its class.
 
     Flags are those of `mitsuba.traverse`: what it shows can be changed, and perhaps differentiated.
+    One row stands for all parameters that the texture describes in the same words.
     """
+    flags = _flags_of(plugin)
+    texture = [] if plugin == "gaussian_texture" else _entries("gaussian_texture")
+    lines = ["| parameter | type | description | default | flags |", "|---|---|---|---|---|"]
+    same = []
+    for names, kind, text in _entries(plugin):
+        shown = ", ".join(f"`{name}`" for name in names.split(", "))
+        if (names, kind, text) in texture:
+            same.append(shown)
+            continue
+        kind, _, default = kind.partition(", default: ")
+        said = " ".join(text.split()).replace("``", "`").removesuffix(".")
+        lines.append(f"| {shown} | {kind} | {said} | {default or '-'} | {flags.get(names, '')} |")
+    if same:
+        row = f"| {', '.join(same)} | | [as of a texture]({TEXTURE_PAGE}#parameters) | | |"
+        lines.insert(2, row)
+    return "\n".join(lines)
+
+
+def _entries(plugin: str) -> list[tuple[str, str, str]]:
+    """Return the parameters in the docstring of a plugin: names, type with default, description."""
+    from eigengs_dr.plugins.registration import PLUGINS
+
+    return ENTRY.findall(str(inspect.getdoc(PLUGINS[plugin][1]())) + "\n")
+
+
+def _flags_of(plugin: str) -> dict[str, str]:
+    """Return the flags of all parameters of a plugin, whatever its source."""
     import mitsuba as mi
 
     from eigengs_dr.plugins.parameters import plugin_of
-    from eigengs_dr.plugins.registration import PLUGINS
 
     mi.set_variant("llvm_ad_rgb")
     eg.register_plugins()
@@ -164,13 +199,7 @@ def plugin_parameters(plugin: str) -> str:
             table = LightTable(np.eye(3), np.ones((3, 3, 2)), "hsh", 0.1)
             eg.Relightable(replace(gaussians, space=DATA), table).save(lit["model"])
             flags |= _flags(mi, lit)
-    lines = ["| parameter | type | description | default | flags |", "|---|---|---|---|---|"]
-    for names, kind, text in ENTRY.findall(str(inspect.getdoc(PLUGINS[plugin][1]())) + "\n"):
-        kind, _, default = kind.partition(", default: ")
-        shown = ", ".join(f"`{name}`" for name in names.split(", "))
-        said = " ".join(text.split()).replace("``", "`").removesuffix(".")
-        lines.append(f"| {shown} | {kind} | {said} | {default or '-'} | {flags.get(names, '')} |")
-    return "\n".join(lines)
+    return flags
 
 
 def _flags(mi: Any, plugin: dict[str, Any]) -> dict[str, str]:

@@ -49,7 +49,7 @@ noise = np.random.default_rng(0).normal(0, 1 / 255, (FRAMES, SIDE, SIDE, 3))
 # neighbouring frames as they are rendered, beside that of the noisy ones. Bytes are those of packed
 # files.
 
-print(f"{'film':21}  {'PSNR':>11}  {'between neighbours':>24}  {'bytes a frame':>13}")
+print(f"{'film':21}  {'PSNR':>11}  {'between neighbours':>24}  {'bytes per frame':>13}")
 for name, frames in films.items():
     frames = [np.float32(np.clip(frame + n, 0, 1)) for frame, n in zip(frames, noise, strict=True)]
     alone = [eg.fit(frame, GAUSSIANS, STEPS) for frame in frames]

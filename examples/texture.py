@@ -70,8 +70,8 @@ def write(name, image):
 # A distant pixel covers many pictures. One sample sees one point of them, which is noise. With the
 # angle of a pixel, one sample sees their mean: a Gaussian blurred by a Gaussian is a Gaussian.
 #
-# The first picture has one sample a pixel at points. The second has one prefiltered sample a pixel.
-# The third has 128 samples a pixel at points.
+# The first picture has one sample per pixel at points, the second one prefiltered sample per pixel,
+# and the third 128 samples per pixel at points.
 
 points = mi.render(floor(prefilter=0.0), spp=1)
 write("floor_points", points)
@@ -90,4 +90,4 @@ def error_of(image):
 
 
 error, error_filtered = error_of(points), error_of(filtered)
-print(f"error of one sample a pixel: {error:.3f} at points, {error_filtered:.3f} prefiltered")
+print(f"error of one sample per pixel: {error:.3f} at points, {error_filtered:.3f} prefiltered")

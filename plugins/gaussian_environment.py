@@ -51,7 +51,8 @@ def gaussian_environment() -> type:
         Parameters
         ----------
         filename : string
-            An ``.npz`` or ``.egs`` file, relative to the scene.
+            An ``.npz`` or ``.egs`` file, relative to the scene. Plugins of one file share its
+            memory until a parameter changes.
         map : string
             Name of a map of `filename`.
         first : integer, default: all
@@ -59,7 +60,7 @@ def gaussian_environment() -> type:
         model : string
             A model that ``eigengs-dr train`` writes.
         coefficients : tensor (C, k), default: 0
-            Of `model`; 0 is the mean image.
+            Of the `model` of a family; 0 is the mean image.
         mean : tensor (N, 2)
             x, y in pixels.
         factor : tensor (N, 3)
@@ -67,23 +68,23 @@ def gaussian_environment() -> type:
         color : tensor (N, C)
             In the space of the set; C is 1 or 3.
         background : tensor (C,)
-            Value without Gaussians; `environment_of` writes it as (1, C).
+            Value without Gaussians; also as (1, C).
         width, height : integer
             Native size in pixels, with `mean`.
         space : string
             Space of `color`, with `mean`; only ``radiance`` and ``log`` exceed 1.
         to_world : transform, default: identity
-            Rotates the light; before, the zenith is the y axis.
+            Rotates the light, whose zenith is the y axis before.
         scale : float, default: 1
             Factor of the light.
         prefilter : float or boolean, default: 0
-            Angle of a pixel in radians, below 1, over which lookups average; 0 looks at points;
-            ``true`` takes that of the sensor that `follow` names.
+            Angle of a pixel in radians, below 1 (`pixel_angle`), over which lookups average; 0
+            looks at points; ``true`` takes that of the sensor that `follow` names.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         memory : string, default: normal, of arrays exact
-            ``normal``: lookups read 16 bytes for a Gaussian, until a parameter changes; ``small``:
-            lists of larger cells too; ``exact``: floats.
+            ``normal``: a Gaussian takes 16 bytes until a parameter changes; ``small``: also lists
+            of larger cells; ``exact``: floats.
         """
 
         transform_name = "to_world"

@@ -52,6 +52,14 @@ def gaussian_relightable() -> type:
             Factor of all values.
         wrap_mode, to_uv, prefilter, memory
             See ``gaussian_texture``. Photos are not turned by `to_uv`: it may scale and move.
+
+        Raises
+        ------
+        ValueError
+            If the file has another format or is damaged, a value is out of range, or a property is
+            unknown. `mitsuba.load_dict` raises it as a RuntimeError with the same text.
+        OSError
+            If the file cannot be opened; from `mitsuba.load_dict` a RuntimeError, too.
         """
 
         @guest()  # a thread of Mitsuba, whose caller may hold the lock

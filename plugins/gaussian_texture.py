@@ -33,10 +33,10 @@ def gaussian_texture() -> type:
         Parameters
         ----------
         filename : string
-            An ``.npz`` or ``.egs`` file, relative to the scene. Textures of one file share memory
-            and lookups until a parameter changes.
+            An ``.npz`` or ``.egs`` file, relative to the scene. Plugins of one file share its
+            memory until a parameter changes.
         map : string
-            Name of a map of `filename`, such as ``roughness``.
+            Name of a map of `filename`.
         first : integer, default: all
             Number of Gaussians of `filename` to use, for sets with levels.
         model : string
@@ -44,8 +44,8 @@ def gaussian_texture() -> type:
         coefficients : tensor (C, k), default: 0
             Of the `model` of a family; 0 is the mean image.
         light : vector, default: (0, 0, 1)
-            Of a relightable `model`: the direction towards the light, of any length; x along u, y
-            against v, z towards the camera.
+            Of a `model` of lights: towards the light, of any length; x along u, y against v, z
+            towards the camera.
         mean : tensor (N, 2)
             x, y in pixels.
         factor : tensor (N, 3)
@@ -53,7 +53,7 @@ def gaussian_texture() -> type:
         color : tensor (N, C)
             In the space of the set; C is 1 or 3, or 2 for x and y of normals in ``data``.
         background : tensor (C,)
-            Value without Gaussians; `texture_of` writes it as (1, C).
+            Value without Gaussians; also as (1, C).
         width, height : integer
             Native size in pixels, with `mean`.
         space : string
@@ -61,9 +61,9 @@ def gaussian_texture() -> type:
         to_uv : transform, default: identity
             Applied to uv; invertible.
         wrap_mode : string, default: repeat
-            Continuation outside of the image: ``repeat``, ``mirror`` or ``clamp``.
+            Outside of the image: ``repeat``, ``mirror`` or ``clamp``.
         raw : boolean, default: false
-            Whether to return sums as they are, neither decoded nor clamped.
+            Whether sums stay as they are, neither decoded nor clamped.
         prefilter : float or boolean, default: 0
             Angle of a pixel in radians, below 1 (`pixel_angle`), over which lookups average; 0
             looks at points; ``true`` takes that of the sensor that `follow` names. Footprints that
@@ -71,8 +71,8 @@ def gaussian_texture() -> type:
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         memory : string, default: normal, of arrays exact
-            ``normal``: lookups read 16 bytes for a Gaussian, until a parameter changes; ``small``:
-            lists of larger cells too; ``exact``: floats.
+            ``normal``: a Gaussian takes 16 bytes until a parameter changes; ``small``: also lists
+            of larger cells; ``exact``: floats.
         """
 
         transform_name, others = "to_uv", frozenset({"to_uv", "prefilter"})

@@ -909,7 +909,7 @@ def _() -> Figures:
 
 
 def wall(texture: Any, side: int = 24, depth: int = 2) -> Any:
-    """A wall under even light, seen by three cameras, one sample a pixel."""
+    """A wall under even light, seen by three cameras, one sample per pixel."""
     mi, cameras = mitsuba(), {}
     film = {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}}
     for number, x in enumerate((-1, 0, 1)):

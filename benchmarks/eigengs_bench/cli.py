@@ -131,7 +131,7 @@ def main() -> None:
 @number("--images", "Number of images from each set.", 20, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def tables() -> None:
-    """Measure every method on images of test folders, on which nothing was trained or tuned.
+    """Measure every method on images that nothing was tuned on.
 
     \b
     main      gaussianimage, default, and eigengs with its own and with the universal basis
@@ -148,7 +148,7 @@ def tables() -> None:
 @number("--images", "Images per set, for curves.", 8, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def pictures() -> None:
-    """Draw the curves of the paper from our fits, and where Gaussians show as tiles.
+    """Draw PSNR over steps, and where Gaussians show as tiles.
 
     \b
     curves  PSNR every 50 iterations
@@ -162,9 +162,9 @@ def pictures() -> None:
 @number("--images", "Number of images from each set.", 3, 1)
 @number("--iterations", "Steps of the longest fits.", 1000, 1)
 def pareto() -> None:
-    """Measure speed against accuracy: fits that differ from the default in one setting.
+    """Measure speed against accuracy, one setting at a time.
 
-    An image takes about two minutes.
+    Fits differ from the default in one setting. An image takes about two minutes.
     """
 
 
@@ -174,9 +174,9 @@ def pareto() -> None:
 @number("--images", "Number of images from each set.", 3, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def rate() -> None:
-    """Compare packed fits with JPEG, JPEG 2000, WebP, AVIF and JPEG XL, and with published means.
+    """Compare packed fits with codecs and with published means.
 
-    A photo of Kodak takes a minute.
+    The codecs are JPEG, JPEG 2000, WebP, AVIF and JPEG XL. A photo of Kodak takes a minute.
     """
 
 
@@ -187,7 +187,7 @@ def rate() -> None:
 @number("--images", "Number of images from each set.", 20, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def number_of_gaussians() -> None:
-    """Measure how many Gaussians the search of fit --target-psnr finds, and what it costs.
+    """Measure numbers and cost of the search of fit --target-psnr.
 
     A default fit with the same number of Gaussians is timed for comparison. An image of 256x256
     pixels takes ten seconds.
@@ -199,9 +199,9 @@ def number_of_gaussians() -> None:
 @several("--preset", "presets", PRESETS, "Method, by default all", PRESETS)
 @number("--iterations", "Largest number of steps of a fit.", 10_000, 0)
 def stability() -> None:
-    """Try every method on hard cases: odd images, odd starts, rates too high, seeds, units.
+    """Try every method on hard cases.
 
-    All cases take three minutes.
+    They are odd images, odd starts, rates too high, seeds and units. All cases take three minutes.
     """
 
 
@@ -213,7 +213,9 @@ def stability() -> None:
 @number("--images", "Number of photos, from the first.", 24, 1)
 @click.option("--timed", is_flag=True, help="Record seconds: nothing else runs on the machine.")
 def kodak() -> None:
-    """Fit the Kodak photos with several numbers of Gaussians, beside published figures.
+    """Fit the Kodak photos with several numbers of Gaussians.
+
+    Published figures stand beside the fits.
 
     \b
     Examples:
@@ -234,7 +236,7 @@ def kodak() -> None:
 @number("--iterations", "Steps of our longer fits.", 1000, 1)
 @click.option("--timed", is_flag=True, help="Record seconds: nothing else runs on the machine.")
 def peers() -> None:
-    """Compare fits with the alternatives on a laptop, each on its own terms.
+    """Compare fits with the alternatives on a laptop.
 
     \b
     splatthis  2D Gaussians in PyTorch, in an environment in FOLDER: a gigabyte, minutes per photo
@@ -248,10 +250,11 @@ def peers() -> None:
 @click.option("--set", "names", multiple=True, help="Folder in DATA, by default all.")
 @number("--iterations", "Steps of every fit.", 300, 1)
 def relight() -> None:
-    """Compare planes of shared Gaussians with planes of pixels, under lights that were left out.
+    """Compare planes of Gaussians with planes of pixels.
 
-    DATA holds folders of photos with their lights, an .lp file. A folder Dome has others in Test.
-    Without it every fifth photo is left out. A set of 50 photos takes a minute.
+    DATA holds folders of photos with their lights, an .lp file. PSNRs are those of photos that were
+    left out: those in Test beside a folder Dome, or every fifth one. A set of 50 photos takes a
+    minute.
     """
 
 
@@ -260,7 +263,7 @@ def relight() -> None:
 @number("--max-side", "Largest side of an image in pixels, up to 8192.", 4096, 1)
 @number("--iterations", "Fewest steps that a mean is taken over.", 24, 1)
 def scaling() -> None:
-    """Measure what size costs: the time of a step and of the start, and memory.
+    """Measure the time of steps and starts, and memory, over sizes.
 
     \b
     pixels   images of 128x128 to 8192x8192 with 0.076 Gaussians per pixel
@@ -281,7 +284,7 @@ def kernels() -> None:
 @several("--part", "parts", TEXTURE_PARTS, "What to compare", TEXTURE_PARTS)
 @click.option("--variant", default="llvm_ad_rgb", help="Variant of Mitsuba.")
 def texture() -> None:
-    """Compare Gaussians with bitmaps in Mitsuba: memory, time and pictures.
+    """Compare Gaussians with bitmaps in Mitsuba.
 
     \b
     posters  a bitmap and Gaussians that look alike at a slant; DATA has three of them in textures/
@@ -297,7 +300,7 @@ def texture() -> None:
 @several("--scene", "subjects", SUBJECTS_OF_SAMPLES + SUBJECTS_OF_DATA, "Scene, by default all")
 @number("--seeds", "Number of seeds whose figures are averaged.", 2, 1)
 def inverse() -> None:
-    """Recover textures from photos by texels, a pyramid of texels, or Gaussians.
+    """Recover textures from photos by texels and by Gaussians.
 
     \b
     poster    a flat picture, with 3 and with 16 cameras around it
@@ -315,7 +318,7 @@ def inverse() -> None:
 @options.output("Folder for README.md and its charts.", "REPORT")
 @options.shared("quiet")
 def report(run: options.Run, folder: Path, output: Path) -> None:
-    """Write a README.md with charts for all questions that the rows of a folder answer.
+    """Write a README.md with tables and charts of the rows of a folder.
 
     Every section names the commands, days, machines, versions and commits behind its figures.
     """
@@ -329,10 +332,10 @@ def report(run: options.Run, folder: Path, output: Path) -> None:
 @click.option("--check", is_flag=True, help="Write nothing; fail if a page is not up to date.")
 @options.shared("quiet")
 def pages(run: options.Run, check: bool) -> None:
-    """Write tables, charts and figures of docs/rows.jsonl into README.md and docs/.
+    """Write what docs/rows.jsonl holds into README.md and docs/.
 
-    They go between marks, <!-- table: kodak.quality --> and <!-- end -->; charts lie in
-    docs/images/measured/.
+    Tables and figures go between marks, <!-- table: kodak.quality --> and <!-- end -->; charts lie
+    in docs/images/measured/.
     """
     from eigengs_bench.pages import outdated, write
 

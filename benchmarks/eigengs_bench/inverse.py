@@ -234,7 +234,7 @@ def summarize(rows: Sequence[Row]) -> Section:
 
 
 def _by_seed(rows: Sequence[Row]) -> dict[tuple, Row]:
-    """Return the means of the figures of rows that differ in their seed."""
+    """Return the means of the figures of rows that differ in their seed, and how many seeds."""
     alike: dict[tuple, list[Row]] = {}
     for row in rows:
         job = row["job"]
@@ -246,6 +246,7 @@ def _by_seed(rows: Sequence[Row]) -> dict[tuple, Row]:
             for name, value in group[0].items()
             if isinstance(value, (int, float))
         }
+        | {"seeds": len(group)}
         for key, group in alike.items()
     }
 
@@ -271,16 +272,21 @@ def gain(curves: Curves, figure: str = "psnr_rgb") -> list[float]:
 def _gains(cases: Mapping[Case, Curves]) -> Table:
     """Lay out the gains of a scene and its cameras: a column per descent."""
     cells: dict[str, dict[tuple[int, int], str]] = {}
+    fits = [row for curves in cases.values() for row in curves["fit"].values()]
+    most = max((row["seeds"] for row in fits), default=1)
     for case, curves in cases.items():
-        gains = zip(sorted(curves["fit"]), gain(curves), strict=True)
         line = cells.setdefault(_title(case), {})
-        line.update({(steps, case[2]): f"{decibels:+.1f}" for steps, decibels in gains})
+        for (steps, row), decibels in zip(sorted(curves["fit"].items()), gain(curves), strict=True):
+            seeds = "" if row["seeds"] == most else f" ({row['seeds']})"
+            line[steps, case[2]] = f"{decibels:+.1f}{seeds}"
     descents = sorted({d for line in cells.values() for d in line}, key=lambda d: (d[1] != SPP, d))
     lines = [
         (title, *(line.get(descent, "") for descent in descents)) for title, line in cells.items()
     ]
     columns = ("photos", *(f"{steps} steps, {spp} spp" for steps, spp in descents))
     caption = "psnr_rgb of fit in dB over the best of texels and pyramid at equal seconds"
+    if most > 1:
+        caption += f"; means of {most} seeds, or of as many as brackets say"
     return table(caption, columns, lines, name="gains")
 
 

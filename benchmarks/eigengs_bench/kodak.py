@@ -131,8 +131,8 @@ def _by_counts(both: pd.DataFrame) -> fr.Table:
         name += "" if source == "measured" else f" ({source})"
         lines.append((name, *(cells.get(count, "") for count in KODAK_COUNTS)))
     caption = (
-        "PSNR in RGB in dB of the Kodak photos by numbers of Gaussians, and the median seconds of "
-        "a photo: default on 2 cores, others on their GPU"
+        "PSNR in RGB in dB of the Kodak photos by numbers of Gaussians, and median seconds per "
+        "photo: default on 2 cores, published methods on their GPU"
     )
     return fr.table(caption, ("method", *(f"{n:,}" for n in KODAK_COUNTS)), lines, "quality")
 

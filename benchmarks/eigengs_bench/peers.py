@@ -248,9 +248,9 @@ def _table(name: str, points: pd.DataFrame) -> fr.Table:
     timed = points[points.timed]  # instead of those of the same name that are not
     lines = pd.concat([timed, points[~points.timed]]).drop_duplicates(["image", "peer", "setting"])
     caption = (
-        f"{name}, {fr.counted(points.image)}, {points.gaussians.iloc[0]:,} Gaussians: what else "
-        "makes a picture of them; parts are Gaussians or texels, codecs have the bytes of the "
-        "packed set, and texels its memory with their pyramid"
+        f"{name}, {fr.counted(points.image)}, {points.gaussians.iloc[0]:,} Gaussians and their "
+        "alternatives; parts are Gaussians or texels; codecs have the bytes of the packed set, "
+        "texels with their pyramid its memory"
     )
     return fr.grouped(caption, lines, ["peer", "setting"], cells)._replace(name=name)
 

@@ -19,7 +19,7 @@ from eigengs_bench.rows import Job, Row
 from eigengs_dr.cli.scene import load_mitsuba
 from eigengs_dr.image.color import to_coded
 
-ROWS, PIXELS, SPP = 256, 128, 16  # of the bitmap, twice as wide; of the film; samples a pixel
+ROWS, PIXELS, SPP = 256, 128, 16  # of the bitmap, twice as wide; of the film; samples per pixel
 GOAL, STEPS = 40.0, 100
 SEEDS, LOOKUPS = 32, 1 << 18  # renderings of each light; directions that are even over the sphere
 WARM_UP, ROUNDS = 2, 9

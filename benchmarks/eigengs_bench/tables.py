@@ -163,8 +163,8 @@ def _few(fits: pd.DataFrame) -> fr.Table:
         last = part[part.iteration == part.iterations]
         lines.append((first, text, *cells, fr.median(last.seconds)))
     caption = (
-        f"PSNR in YCbCr after so many steps in dB, in brackets what the paper prints of "
-        f"{_sets(fits)}; median seconds of a fit; {fr.counted(fits.image)} per set"
+        f"PSNR in YCbCr in dB by steps, in brackets the paper's for {_sets(fits)}; median seconds "
+        f"of a fit; {fr.counted(fits.image)} per set"
     )
     return fr.table(caption, ("set", "method", *(f"{n:,}" for n in steps), "s"), lines)
 
@@ -189,8 +189,8 @@ def _ablation(fits: pd.DataFrame) -> fr.Table:
         lines.append((f"{line['space']}, {line['split']}", *cells))
     caption = (
         f"psnr_ycbcr / psnr_rgb in dB after {last.iterations.max():,} steps of eigengs, by the "
-        "space of the descent and the frequency-aware split; in brackets the one PSNR that the "
-        f"paper prints after 10,000 steps; {fr.counted(last.image)} per set"
+        "space of the descent and the frequency-aware split; in brackets the paper's one PSNR "
+        f"after 10,000 steps; {fr.counted(last.image)} per set"
     )
     return fr.table(caption, ("fitted in", *names), lines)
 

@@ -123,9 +123,9 @@ def _lights(lights: Sequence[Row]) -> Table:
     """Lay out what lights of Gaussians differ by from their bitmaps, and what they cost."""
     caption = (
         f"Gaussians for {sky.GOAL:g} dB beside the envmap of a bitmap of {2 * sky.ROWS} x "
-        f"{sky.ROWS} texels: PSNR of lookups in even directions, and of pictures without their "
-        "noise; largest difference of the mean of a channel; variance at equal samples, and time "
-        "of a picture, over those with the envmap; memory"
+        f"{sky.ROWS} texels: PSNR of lookups in even directions, and of pictures without noise; "
+        "largest difference of the mean of a channel; variance at equal samples and time of a "
+        "picture, over those with the envmap; memory"
     )
     columns = ["light", "Gaussians", "lookups", "pictures", "mean", "variance", "time"]
     columns += ["Gaussians hold", "envmap holds"]

@@ -33,9 +33,9 @@ def doctor(
 ) -> None:
     """Show which backends work on this machine and what to install.
 
-    With --gpu, a small fit and a scene run on the GPU and on llvm. The table that follows shows
-    their times and differences, ready to be pasted into a report. The exit code is 1 if no backend
-    works, or if the results of the GPU differ.
+    With --gpu, a small fit and a scene run on the GPU and on llvm, and a table shows their times
+    and differences, to be pasted into a report. The exit code is 1 if no backend works, or if the
+    results of the GPU differ.
 
     \b
     Examples:

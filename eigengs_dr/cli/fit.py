@@ -50,16 +50,14 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
 @click.command()
 @click.argument("images", nargs=-1, type=options.images, metavar="IMAGE...")
 @options.output(".npz file or folder.  [default: the current folder]", "OUT", required=False)
-@options.maps("A map of a material, instead of IMAGE; repeat the option for more maps.")
+@options.maps("A map of a material, instead of IMAGE; repeatable.")
 @options.number("--gaussians", "Number of Gaussians.  [default: 5000]")
 @options.value("--target-psnr", "DB", float, "Use the fewest Gaussians that reach this PSNR.")
 @options.choice("--target-space", ["rgb", "ycbcr"], "Colour space of --target-psnr.", True)
 @options.number("--max-gaussians", "Largest number of Gaussians for --target-psnr.")
-@options.value("--blocks", "SIZE", int, "Fit blocks of this side, such as 1024, in less memory.")
-@options.level_counts(
-    "Number of levels of detail, each 4 times as large, or the number of Gaussians up to each."
-)
-@options.number("--iterations", "Number of optimisation steps.", 1000)
+@options.value("--blocks", "SIZE", int, "Fit blocks of this side, in less memory.")
+@options.level_counts("Number of levels of detail, each 4 times as large, or Gaussians up to each.")
+@options.number("--iterations", "Optimisation steps.", 1000)
 @options.choice("--init", INITS, "Initial placement.  [default: adaptive]", True)
 @options.value("--basis", "NAME|FILE", str, "Model to start from: natural, or a file.")
 @options.choice("--preset", PRESETS, "Our method, or the method of a paper.")
@@ -71,14 +69,10 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
     True,
 )
 @options.encoding
-@options.number("--seed", "Seed of the random numbers.", 0)
-@options.value(
-    "--preview", "FILE", options.path, "Picture, or folder, that shows photo, fit and outlines."
-)
-@click.option("--recursive", is_flag=True, help="Also take images in subfolders of a folder.")
-@click.option(
-    "--overwrite", is_flag=True, help="Also fit images again whose results exist, if several."
-)
+@options.number("--seed", "Seed of random numbers.", 0)
+@options.value("--preview", "FILE", options.path, "Picture, or folder, of photo, fit and outlines.")
+@click.option("--recursive", is_flag=True, help="Also take images in subfolders.")
+@click.option("--overwrite", is_flag=True, help="Also fit images that have results.")
 @options.shared("cluster", "backend", "report", "quiet")
 def fit(
     run: options.Run,
@@ -91,28 +85,25 @@ def fit(
     overwrite: bool,
     **choices: Any,
 ) -> None:
-    """Fit sums of Gaussians to images. Grey ones become RGB; --space data keeps one channel.
+    """Fit sums of Gaussians to images. Grey images become RGB; --space data keeps one channel.
 
-    An IMAGE may be a folder of images, a pattern in quotes, or a URL. For several images, -o and
-    --preview name folders, whose files are named after the images; manifest.jsonl has one row per
-    image. If an image cannot be fitted, the others still are, and the exit code is 2.
+    IMAGE may be a folder, a pattern in quotes, or a URL. For several images, -o and --preview name
+    folders, whose files are named after the images; manifest.jsonl has a row per image. If an image
+    fails, the rest is still fitted, and the exit code is 2.
 
-    The result of a single image is replaced if it exists. Of several images, those whose results
-    exist are skipped, so that the same command continues a run; results of other options are an
-    error. A file that is not a set of Gaussians is never replaced.
+    A single result is replaced if it exists. Of several images, those with results are skipped, so
+    that the same command continues a run; results of other options are an error. A file that is
+    not a set of Gaussians is never replaced.
 
-    Ctrl-C writes the best fit so far of a single image, or stops after the last complete one of
-    several, with exit code 130. If --target-psnr cannot be reached, the command writes the best fit
-    and exits with code 1.
+    Ctrl-C writes the best fit so far, or of several images stops after the last complete one, with
+    exit code 130. If --target-psnr is out of reach, the best fit is written, with exit code 1.
 
-    An image that is too large for the memory of this machine is refused. --blocks 1024 fits it
-    block by block, by default with one Gaussian per 20 pixels. Ctrl-C then keeps the finished
-    blocks, and the same command continues.
+    An image too large for the memory of this machine is refused. --blocks 1024 fits it block by
+    block, by default with one Gaussian per 20 pixels; after Ctrl-C, the same command continues.
 
-    With --map, several maps of the same size, such as albedo, roughness and normal, share one set
-    of shapes, and -o names the file. Albedo and color are fitted in linear light, normal as
-    normals, and other names as data; --map height:data=FILE sets the space of a map. --target-psnr
-    then applies to each map.
+    With --map, maps of one size share one set of shapes, and -o names the file. Albedo and color
+    are fitted in linear light, normal as normals, and other names as data; --map height:data=FILE
+    sets a space. --target-psnr then applies to each map.
 
     \b
     Examples:

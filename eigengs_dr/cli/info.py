@@ -32,25 +32,23 @@ from .scene import load_mitsuba, scene_errors
 @click.option(
     "--texture",
     is_flag=True,
-    help="Also load the file as a texture in Mitsuba, and show its memory.",
+    help="Also load the file as a Mitsuba texture, and show its memory.",
 )
 def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None:
     """Show the contents of a fitted image, a material or a model.
 
     NAME is a basis of the package, such as natural. PSNR, steps and source are those of the fit;
-    bpp is the size of the file in bits per pixel, of a material for all maps together.
+    bpp is the size of the file in bits per pixel, for all maps of a material together.
 
-    For a model, a table shows the first components of all channels in order of variance: their
-    share of the variance, and the PSNR of PCA with these components, for the training images and
-    for the held-out images. For a model of lights, the command shows the number of planes, and the
-    PSNR of left-out lights.
+    For a model, a table shows the first components by variance: their share of it, and the PSNR of
+    PCA with them, for training and held-out images. For a model of lights, the command shows the
+    number of planes, and the PSNR of left-out lights.
 
-    With --texture, texture_bytes is the memory of a gaussian_texture of the file for lookups at
-    points, prefilter_bytes its memory with a prefilter, and small_bytes with memory = small.
+    With --texture, texture_bytes is the memory of a gaussian_texture for lookups at points,
+    prefilter_bytes with a prefilter, and small_bytes with memory = small.
 
-    The preview shows the rendered image or, for a model, the mean image, some components and the
-    outlines of the Gaussians. Of a folder, all .npz and .egs files are shown, and --preview names a
-    folder.
+    The preview shows the image, or the mean image, some components and the outlines of a model. Of
+    a folder, all .npz and .egs files are shown, and --preview names a folder.
 
     \b
     Examples:

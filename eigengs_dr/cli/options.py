@@ -229,12 +229,12 @@ SHARED: dict[str, Option] = {
         "--cluster",
         "local[:N]|tcp://HOST:PORT|FILE",
         str,
-        "Run on N local processes, or on a Dask cluster.",
+        "Run on N local processes or a Dask cluster.",
     ),
     "backend": choice(
         "--backend", BACKENDS, "Backend of Dr.Jit.  [default: cuda if present]", True
     ),
-    "report": value("--report", "FILE", path, "Write all figures to a JSON file."),
+    "report": value("--report", "FILE", path, "Write all figures as JSON."),
     "quiet": click.option("--quiet", is_flag=True, help="Show no progress and no summary."),
 }
 """Options that become fields of a `Run`."""

@@ -23,12 +23,12 @@ Dr.Jit."""
 
 @click.command()
 @click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
-@options.output("File to write, or a folder.", "Y.egs|FOLDER")
-@options.value("--image", "IMAGE", options.image, "The original image, for measuring the loss.")
-@options.maps("The image of a map of a material; repeat the option for all maps.")
+@options.output("File or folder.", "Y.egs|FOLDER")
+@options.value("--image", "IMAGE", options.image, "The original image, to measure the loss.")
+@options.maps("The image of a map of a material; repeatable.")
 @options.encoding
 @options.value("--max-psnr-drop", "DB", float, "Allowed loss of PSNR.", BUDGET)
-@options.level_counts("Levels of the fit to keep, so that readers may stop after any level.")
+@options.level_counts("Levels of the fit; readers may stop after any.")
 @options.shared("backend", "report", "quiet")
 def pack(
     run: options.Run,
@@ -42,13 +42,12 @@ def pack(
 ) -> None:
     """Compress a fitted image or a material.
 
-    The parameters are quantised as coarsely as the allowed loss of PSNR permits. Every command that
+    Parameters are quantised as coarsely as the allowed loss of PSNR permits. Every command that
     reads the .npz file of an image reads .egs files too. Without --image, the fit counts as one of
-    40 dB. A material takes --map instead. A model of lights takes neither: its loss refers to the
-    PSNR of left-out lights.
+    40 dB. A material takes --map instead; a model of lights takes neither: its loss refers to
+    left-out lights.
 
-    Of a folder, all .npz files in it are packed. If one fails, the others still are, and the exit
-    code is 2.
+    Of a folder, all .npz files are packed. If one fails, the exit code is 2.
 
     \b
     Examples:

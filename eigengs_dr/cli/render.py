@@ -16,26 +16,26 @@ from .outputs import check_outputs, lock_outputs, name_outputs
 
 @click.command()
 @click.argument("file", type=options.FILE_OR_FOLDER, metavar="X.npz|FOLDER")
-@options.output("Picture to write, or a folder of PNG files.", "Y.png|FOLDER", False)
-@options.value("--light", "X,Y,Z", options.light, "Direction of the light of a model of lights.")
+@options.output("Picture, or folder of PNG files.", "Y.png|FOLDER", False)
+@options.value("--light", "X,Y,Z", options.light, "Light direction for a model of lights.")
 @click.option(
     "--planes",
     type=options.path,
     metavar="FOLDER",
-    help="Of a model of lights: write its planes for relight and OpenLIME, instead of a picture.",
+    help="Write the planes of a model of lights for relight and OpenLIME, instead of a picture.",
 )
-@click.option("--map", "name", metavar="NAME", help="The map of a material to render.")
+@click.option("--map", "name", metavar="NAME", help="Map of a material to render.")
 @options.value(
     "--region", "X,Y,W,H", options.region, "Region of the image: left, top, width, height."
 )
-@options.value("--scale", "S", options.scale, "Scale factor of the native size, such as 0.5.")
+@options.value("--scale", "S", options.scale, "Factor of the native size, such as 0.5.")
 @options.value(
     "--size",
     "W|WxH",
     options.width_or_size,
-    "Width in pixels, such as 1024, which keeps the aspect ratio; or width and height, 1024x768.",
+    "Width in pixels, such as 1024, or width and height, 1024x768.",
 )
-@options.number("--first", "Render only the first N Gaussians; for fits with --levels.", minimum=1)
+@options.number("--first", "Only the first N Gaussians, for fits with --levels.", minimum=1)
 @options.choice(
     "--bits",
     ["8", "16", "32"],
@@ -55,17 +55,15 @@ def render(
 ) -> None:
     """Render a fitted image at any size, or a region of it.
 
-    Without --scale and --size, the picture has the native size of the image or of the region. A
-    smaller picture is an average of the native one, not every n-th pixel.
-    Files of 8 and 16 bits hold clamped sRGB; files of floats (.exr, .hdr, .pfm, and .tif with
-    --bits 32) hold linear light. A fit of data is written unchanged; one channel gives a grey
-    picture. Large pictures are rendered in bands; a .tif file takes no more memory than a band.
+    By default the picture has the native size of the image or of the region. A smaller picture is
+    an average of the native one. Files of 8 and 16 bits hold clamped sRGB; files of floats (.exr,
+    .hdr, .pfm, and .tif with --bits 32) hold linear light. A fit of data is written unchanged; one
+    channel gives a grey picture. A .tif file takes only the memory of a band.
 
-    A model of lights, which 'eigengs-dr train --lights' writes, takes --light: a vector towards
-    the light, x to the right, y up, z towards the camera.
+    A model of lights ('eigengs-dr train --lights') takes --light: a vector towards the light, x to
+    the right, y up, z towards the camera.
 
-    Of a folder, all sets in it are rendered. If one fails, the others still are, and the exit code
-    is 2.
+    Of a folder, all sets are rendered. If one fails, the exit code is 2.
 
     \b
     Examples:

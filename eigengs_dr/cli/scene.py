@@ -84,7 +84,7 @@ definitions_option = click.option(
     "--camera", "ID|N|all", str, "Camera to render; all writes OUT-ID for each.  [default: 1]"
 )
 @options.value(
-    "--integrator", "TYPE[,KEY=VALUE...]", integrator, "Integrator to use instead of the scene's."
+    "--integrator", "TYPE[,KEY=VALUE...]", integrator, "Instead of the integrator of the scene."
 )
 @definitions_option
 @options.shared("quiet")
@@ -100,10 +100,9 @@ def scene(
 ) -> None:
     """Render Mitsuba scenes with Gaussian textures.
 
-    The mitsuba executable does not know plugins in Python, such as gaussian_texture; this command
-    does. For several scenes, -o names a folder, and the pictures are named after the scenes. An EXR
-    file has all AOVs and layers by name, a PNG file the colours. Textures whose prefilter is true
-    follow the camera.
+    The mitsuba executable does not know plugins in Python; this command does. For several scenes,
+    -o names a folder, and the pictures are named after the scenes. An EXR file has all AOVs and
+    layers, a PNG file the colours. Textures whose prefilter is true follow the camera.
 
     \b
     Examples:
@@ -244,7 +243,7 @@ def scene_errors(path: Path) -> Iterator[None]:
     default=40.0,
     help="PSNR of the renderings.",
 )
-@options.number("--iterations", "Optimisation steps for each number of Gaussians.", 400, 0)
+@options.number("--iterations", "Optimisation steps per number of Gaussians.", 400, 0)
 @options.number(
     "--spp", "Samples per pixel; 0 renders nothing.  [default: from the scene]", minimum=0
 )
@@ -263,14 +262,14 @@ def convert(
     variant: str | None,
     definitions: dict[str, str],
 ) -> None:
-    """Replace the bitmaps of a Mitsuba scene by as many Gaussians as its cameras resolve.
+    """Replace the bitmaps of a Mitsuba scene by Gaussians.
 
-    FOLDER gets scene.xml, a set for each image, and for each camera the renderings before and
-    after, and 8 times their difference. If a rendering misses the PSNR, the command reports it and
-    exits with code 1. A bitmap is kept if it takes less memory than its Gaussians, or if many of
-    them overlap, if the PSNR would be missed, if it has two values as masks do, or data outside of
-    0 to 1, or if no camera sees it; the command shows the reason. Other files are not moved, and
-    the new scene refers to them relative to FOLDER.
+    Each gets as many as cameras resolve. FOLDER gets scene.xml, a set per image, and per camera
+    the renderings before and after, and 8 times their difference. If a rendering misses the PSNR,
+    the exit code is 1. The command keeps a bitmap, and says why, if it takes less memory than its
+    Gaussians, if many of them overlap, if the PSNR would be missed, if it has two values as masks
+    do, or data outside of 0 to 1, or if no camera sees it. The new scene refers to other files
+    relative to FOLDER.
 
     \b
     Examples:

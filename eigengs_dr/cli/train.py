@@ -36,12 +36,10 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
     FREQUENCY_AWARE,
     "Reserve a tenth of the Gaussians for the first components.",
 )
-@options.choice("--preset", ["default", "eigengs"], "Solve for the weights, or train as the paper.")
-@options.number(
-    "--iterations", "Training steps of the preset eigengs.  [default: 15000]", minimum=1
-)
+@options.choice("--preset", ["default", "eigengs"], "Solve for weights, or train like the paper.")
+@options.number("--iterations", "Steps of the preset eigengs.  [default: 15000]", minimum=1)
 @options.choice("--space", ["ycbcr", "rgb"], "Colour space of the components.")
-@options.number("--seed", "Seed of the random numbers.", 0, minimum=0)
+@options.number("--seed", "Seed of random numbers.", 0, minimum=0)
 @options.value("--preview", "FILE", options.path, "Picture of the components.")
 @options.value(
     "--lights", "DIRS.lp", options.EXISTING, "The photos show one object under these lights."
@@ -55,18 +53,17 @@ def train(
     lights: Path | None,
     **choices: Any,
 ) -> None:
-    """Train a model on the images in a folder, or at its URL.
+    """Train a model on the images in a folder or at a URL.
 
     A model is one set of Gaussians that renders all principal components of the images. One image
-    in ten is held out and measured at the end. --energy refers to the variance of each channel of
-    the training images; --target-psnr to the PSNR of PCA, in --space, for the held-out images.
-    After Ctrl-C or a crash, the same command resumes from the folder MODEL.npz.checkpoint. All
-    processes of a --cluster need access to FOLDER and MODEL.npz.
+    in ten is held out and measured at the end. --energy refers to each channel of the training
+    images; --target-psnr to PCA, in --space, of the held-out images. After Ctrl-C or a crash, the
+    same command resumes from MODEL.npz.checkpoint. All processes of a --cluster need access to
+    FOLDER and MODEL.npz.
 
-    With --lights, the folder holds photos of one object from one camera. The list names each photo,
-    and the direction of its light. The model renders the object under any light; --components is
-    then the number of planes, by default as many as left-out lights need. 'eigengs-dr render' takes
-    the model with --light.
+    With --lights, the folder holds photos of one object from one camera; the list names each photo
+    and the direction of its light. The model renders the object under any light, see 'eigengs-dr
+    render'. --components is then the number of planes, by default as many as left-out lights need.
 
     \b
     Examples:

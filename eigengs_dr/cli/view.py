@@ -28,11 +28,11 @@ SUFFIXES = (".html", ".htm")
     "--image",
     "IMAGE",
     options.image,
-    "A photo to compare with; for a model, the photo to start from.",
+    "Photo to compare with, or for a model to start from.",
 )
 @options.encoding
-@click.option("--map", "name", metavar="NAME", help="The map of a material to show.")
-@options.level_counts("Levels of the fit, as in fit.  [default: the sections of an .egs file]")
+@click.option("--map", "name", metavar="NAME", help="Map of a material to show.")
+@options.level_counts("Levels, as in fit.  [default: sections of an .egs file]")
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @options.shared("backend", "quiet")
 def view(
@@ -48,10 +48,10 @@ def view(
     """Make a page for the browser that draws a fitted image or a model.
 
     NAME is a basis of the package, such as natural. The page is one file and needs no network. It
-    draws the same picture as "render", at any zoom. It can show outlines, only the first Gaussians,
-    and the parameters of the Gaussian under the pointer. With --image, a divider wipes between the
-    Gaussians and the photo. For a model, it has sliders for the first components, and draws random
-    images. For a model of lights, the light follows the pointer, and on a phone the finger.
+    draws the picture of "render" at any zoom, outlines, the first Gaussians, and the parameters of
+    the Gaussian under the pointer. With --image, a divider wipes to the photo. A model has sliders
+    for its first components, and draws random images; the light of a model of lights follows the
+    pointer or the finger.
 
     \b
     Examples:
@@ -71,7 +71,7 @@ def view(
     with prefix_errors(file):
         result = eg.view(source, photo, levels=counts, title=file.stem, encoding=encoding)
     result.save(page)
-    run.tell(f"{file}: wrote {page} ({len(result.html):,} bytes)")
+    run.tell(f"{file}: wrote {page} ({page.stat().st_size:,} bytes)")
     if opens:
         click.launch(str(page))
 

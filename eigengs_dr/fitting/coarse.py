@@ -149,7 +149,7 @@ COARSE_TO_FINE = replace(
     average=0.8,
 )
 """The method of a loss without an image: a pyramid of texels, then Gaussians that move little, for
-derivatives with the noise of a rendering. The rates were chosen on the scenes of ``bench inverse``
+derivatives with rendering noise. The rates were chosen on the scenes of ``bench inverse``
 with the photo "coffee"."""
 
 

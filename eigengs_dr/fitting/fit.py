@@ -142,7 +142,7 @@ def fit(
     size: tuple[int, int] | None = None,
     levels: int | None = None,
 ) -> Fit:
-    """Fit an image, or minimise a loss, with a number of Gaussians or the fewest for a target.
+    """Fit an image or minimise a loss, with so many Gaussians or the fewest that reach a target.
 
     Several maps of one size, such as those of a material, share the means and shapes of one set:
     ``result.gaussians["albedo"]`` is the set of one map.

@@ -45,7 +45,7 @@ Differentiate: TypeAlias = Callable[[list[Float], int], tuple[Float, list[Float]
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """What a fit minimises, if it is not the squared error of an image.
+    """What a fit minimises instead of the squared error of an image.
 
     Attributes
     ----------

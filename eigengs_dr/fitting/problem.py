@@ -55,7 +55,7 @@ large overflow single precision."""
 
 @dataclass(frozen=True)
 class Map:
-    """A map in a mapping of images that needs more than pixels.
+    """A map of a material with more than pixels: a space, a weight or a goal.
 
     Attributes
     ----------

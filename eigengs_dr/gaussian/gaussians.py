@@ -378,7 +378,7 @@ def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
 
 @door
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
-    """Concatenate sets and add their backgrounds: the rendering is the sum of those of the sets.
+    """Concatenate sets and add their backgrounds: the result renders the sum of their pictures.
 
     Parameters
     ----------

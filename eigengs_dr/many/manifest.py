@@ -33,7 +33,7 @@ from ..storage.settings import Settings, difference, to_json
 
 @dataclass(frozen=True)
 class ImageRow:
-    """What is known of an image of a run: the result of one of many, or the state of a large one.
+    """An image of a run: the result of one of many, or the state of a large one.
 
     Attributes
     ----------

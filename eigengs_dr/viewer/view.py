@@ -48,7 +48,7 @@ class Page:
     html: str
 
     def __repr__(self) -> str:
-        return f"Page({len(self.html):,} bytes)"
+        return f"Page({len(self.html.encode()):,} bytes)"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the page atomically as an ``.html`` file.

@@ -49,7 +49,7 @@ def check_gradient(loss, scene, name, backend):
 
 
 def tiled(scene, wrap, copies=3):
-    """The picture and copies of it on every side, at `FINE` samples a pixel.
+    """The picture and copies of it on every side, at `FINE` samples per pixel.
 
     A clamped one has the values of the outermost centres of pixels beyond them.
     """

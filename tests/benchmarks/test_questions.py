@@ -496,6 +496,31 @@ def test_inverse(monkeypatch, tmp_path):
     assert "ball, 2 cameras" in text and "at equal seconds" in text
 
 
+def test_gains_are_means_of_seeds():
+    from eigengs_bench import inverse
+
+    figures = {"seconds": 1.0, "color_constant": 20.0, "gaussians": 100, "parameters": 800}
+    rows = [
+        {
+            "job": {"scene": "ball", "cameras": 2, "spp": 4, "method": method, "steps": steps}
+            | {"seed": seed},
+            **figures,
+            "psnr_rgb": 30.0 + 2 * seed * (method == "fit"),
+            "color": 30.0,
+        }
+        for method in ("pyramid", "fit")
+        for steps, seeds in ((120, 2), (240, 1))
+        for seed in range(seeds)
+    ]
+    gains = inverse.summarize(rows).tables[0]
+    assert gains.frame.to_numpy().tolist() == [["ball, 2 cameras", "+1.0", "+0.0 (1)"]]
+    assert gains.caption.endswith("means of 2 seeds, or of as many as brackets say")
+    assert (
+        "seeds"
+        not in inverse.summarize([r for r in rows if not r["job"]["seed"]]).tables[0].caption
+    )
+
+
 def test_scenes_of_data_need_their_folder(tmp_path):
     command = "bench", "inverse", "--scene", "wall", "-o", tmp_path / "out"
     assert_refused(run(*command), "--scene wall needs DATA")

@@ -80,7 +80,7 @@ def test_train_options(trained, tmp_path):
     size = ["--size", "16x16", "--components", "6,5,4"]
     assert said("train", trained[0] / "photos", *outputs, *size, *options) == ""
     report = json.loads((tmp_path / "m.json").read_text())
-    expected |= {"gaussians": 256, "most_components": [6, 5, 4]}  # one Gaussian a pixel
+    expected |= {"gaussians": 256, "most_components": [6, 5, 4]}  # one Gaussian per pixel
     assert {key: report[key] for key in expected} == expected
     assert max(report["components"]) < 6
 

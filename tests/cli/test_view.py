@@ -1,6 +1,7 @@
 """The commands `view` and `pack`: files and names in, a page or few bytes out."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,7 +37,8 @@ def levels_of(page):
 def test_writes_a_page_here(photo, monkeypatch):
     opened = []
     monkeypatch.setattr("click.launch", opened.append)
-    assert "wrote photo.html" in said("view", photo, "--open")
+    told = said("view", photo, "--open")
+    assert f"wrote photo.html ({Path('photo.html').stat().st_size:,} bytes)" in told
     assert opened == ["photo.html"]
     assert "64 Gaussians, 32 x 24 pixels" in page_of(photo) and levels_of(page_of(photo)) == ""
 

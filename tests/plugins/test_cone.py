@@ -1,4 +1,4 @@
-"""The prefilter in Mitsuba: footprints of the camera, against many samples a pixel."""
+"""The prefilter in Mitsuba: footprints of the camera, against many samples per pixel."""
 
 import gc
 

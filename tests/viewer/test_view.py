@@ -39,6 +39,7 @@ def test_a_page_is_one_file(tmp_path):
     assert [link for link in links if "http" in link] == []
     assert "default-src 'none'" in page.html
     page.save(tmp_path / "a.html")
+    assert repr(page) == f"Page({(tmp_path / 'a.html').stat().st_size:,} bytes)"
     assert (tmp_path / "a.html").read_text(encoding="utf-8") == page.html
     with pytest.raises(ValueError, match="must end in"):
         page.save(tmp_path / "a.png")
@@ -169,13 +170,20 @@ def test_bases_and_models_show_components():
         assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.9
 
 
+def test_the_stored_outputs_of_the_notebook_are_small():
+    """Write them by ``python docs/run_notebook.py``."""
+    text = NOTEBOOK.read_text("utf-8")
+    cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+    assert sum(bool(cell["outputs"]) for cell in cells) == 8
+    assert len(text) < 200_000 and "<iframe" not in text and ".venv" not in text
+
+
 @pytest.mark.slow  # 'make docs' runs it, too
 def test_the_notebook_runs():
     nbformat = pytest.importorskip("nbformat", reason="no nbformat")
     client = pytest.importorskip("nbclient", reason="no nbclient")
     pytest.importorskip("ipykernel", reason="no kernel for notebooks")
     book = nbformat.read(NOTEBOOK, 4)
-    assert not any(cell.get("outputs") for cell in book.cells), "outputs are not stored"
     client.NotebookClient(book, timeout=200, startup_timeout=200, kernel_name="python3").execute()
     outputs = [output for cell in book.cells for output in cell.get("outputs", [])]
     shown = [output for output in outputs if "text/html" in output.get("data", {})]
