@@ -113,7 +113,7 @@ docs: $(DOCS_READY)
 
 pages: $(READY)
 	$(BIN)/eigengs-dr bench pages
-	$(BIN)/python docs/pages.py
+	$(BIN)/python tools/manual/pages.py
 
 # The wheel is built from the source distribution, so that this is known to be whole.
 dist: $(READY)

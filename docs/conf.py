@@ -11,7 +11,7 @@ from sphinx.util import logging
 
 import eigengs_dr as eg
 
-sys.path.insert(0, str(Path(__file__).parent))  # for what stands beside this file
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "manual"))
 import pages
 from check_pages import ROOT, missing, untraced
 

@@ -383,7 +383,7 @@ def test_getting_started_lists_all_extras():
 
 @pytest.fixture(scope="module")
 def check():
-    return runpy.run_path(str(FOLDER / "check_pages.py"))
+    return runpy.run_path(str(ROOT / "tools" / "manual" / "check_pages.py"))
 
 
 def test_names_are_where_the_manual_says(check):
@@ -394,7 +394,7 @@ def test_names_are_where_the_manual_says(check):
 
 
 def test_the_folders_are_those_of_the_layers():
-    """Write them anew by ``python docs/folders.py``."""
+    """Write them anew by ``python tools/manual/folders.py``."""
     assert runpy.run_path(str(FOLDER / "folders.py"))["outdated"]() == {}
 
 

@@ -43,8 +43,8 @@ def arrays_of(function: FunctionType) -> list[DrJitArray]:
     TypeError
         If it uses what may convert arrays of NumPy, see above.
     """
-    arrays, seen, found = list[DrJitArray](), set[int](), _used(function)
-    for name, value in found:  # it grows
+    arrays, seen, values = list[DrJitArray](), set[int](), _used(function)
+    for name, value in values:  # it grows
         if id(value) in seen or value is ssim:
             continue
         seen.add(id(value))
@@ -54,9 +54,9 @@ def arrays_of(function: FunctionType) -> list[DrJitArray]:
                 arrays.append(dr.detach(value.array if dr.is_tensor_v(value) else value))
         elif isinstance(value, (list, tuple, dict)):
             parts = value.values() if isinstance(value, dict) else value
-            found += [(name, part) for part in parts]
+            values += [(name, part) for part in parts]
         elif isinstance(value, FunctionType) and package != "eigengs_dr":
-            found += _used(value)
+            values += _used(value)
         elif value is not None and type(value) not in (*CONSTANTS, slice) and package not in KNOWN:
             raise TypeError(
                 f"loss: frozen=True, but its function uses {name} of {package}; make arrays of "
@@ -93,5 +93,5 @@ def _used(function: FunctionType) -> list[tuple[str, Any]]:
 
 def _package(value: object) -> str:
     """Return the name of the package that a value, or else its type, comes from."""
-    own = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
-    return str(own or type(value).__module__).split(".")[0]
+    name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
+    return str(name or type(value).__module__).split(".")[0]

@@ -389,7 +389,7 @@ class LossObjective(Pixels):
 
             def checked(pictures: list[Float], step: int) -> tuple[Float, list[Float]]:
                 try:
-                    found = replay(pictures, dr.opaque(self.types.UInt, step), used)
+                    replayed = replay(pictures, dr.opaque(self.types.UInt, step), used)
                 except Exception as error:
                     self.differentiate(pictures, step)  # it may raise the same
                     reason = str(error).partition("\n")[0]
@@ -398,8 +398,8 @@ class LossObjective(Pixels):
                         "the step as an array, make arrays outside, or drop frozen=True"
                     ) from error
                 if step & (step - 1) == 0 or step % CHECK_FROZEN == 0:
-                    _compare(found, self.differentiate(pictures, step), step)
-                return found
+                    _compare(replayed, self.differentiate(pictures, step), step)
+                return replayed
 
             yield checked
 
@@ -631,15 +631,15 @@ class _Name(str):
 
 
 def _compare(
-    found: tuple[Float, list[Float]], expected: tuple[Float, list[Float]], step: int
+    replayed: tuple[Float, list[Float]], called: tuple[Float, list[Float]], step: int
 ) -> None:
     """Raise ValueError if a frozen loss differs from its function by more than rounding."""
-    pairs = list(zip([found[0], *found[1]], [expected[0], *expected[1]], strict=True))
+    pairs = list(zip([replayed[0], *replayed[1]], [called[0], *called[1]], strict=True))
     difference = sum(dr.sum(dr.abs(a - b)) for a, b in pairs)
     if (difference > ROUNDING * sum(dr.sum(dr.abs(b)) for _, b in pairs))[0]:
         raise ValueError(
-            f"loss: frozen=True, but at step {step} its value is {found[0][0]:g}, and that of its "
-            f"function {expected[0][0]:g}: something that it uses changed after it was recorded; "
+            f"loss: frozen=True, but at step {step} its value is {replayed[0][0]:g}, and that of "
+            f"its function {called[0][0]:g}: something that it uses changed after it was recorded; "
             "drop frozen=True"
         )
 

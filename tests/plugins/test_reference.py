@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 @pytest.fixture(scope="module")
 def described():
     """Flags by the names of parameters."""
-    made = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "pages.py"))
+    made = runpy.run_path(str(Path(__file__).parents[2] / "tools" / "manual" / "pages.py"))
     lines = made["plugin_parameters"]("gaussian_texture").splitlines()
     rows = [line.strip("| ").split(" | ") for line in lines[2:]]
     assert all(row[1] and row[2] for row in rows)

@@ -171,7 +171,7 @@ def test_bases_and_models_show_components():
 
 
 def test_the_stored_outputs_of_the_notebook_are_small():
-    """Write them by ``python docs/run_notebook.py``."""
+    """Write them by ``python tools/manual/run_notebook.py``."""
     text = NOTEBOOK.read_text("utf-8")
     cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
     assert sum(bool(cell["outputs"]) for cell in cells) == 8

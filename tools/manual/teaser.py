@@ -1,4 +1,4 @@
-"""Compose the picture of README.md: ``python docs/teaser.py`` writes docs/images/teaser.jpg.
+"""Compose the picture of README.md, docs/images/teaser.jpg: ``python tools/manual/teaser.py``.
 
 From left to right: a photo; outlines of Gaussians over their rendering; the Gaussians as the
 texture of a poster in a Mitsuba scene; the texture that photos of this scene give back. Labels
@@ -18,7 +18,7 @@ from eigengs_dr.image.color import to_coded
 from eigengs_dr.plugins import photo_loss, texture_of
 from eigengs_dr.viewer.pictures import overlay
 
-TEASER = Path(__file__).parent / "images" / "teaser.jpg"
+TEASER = Path(__file__).parents[2] / "docs" / "images" / "teaser.jpg"
 CELL, GAP = 300, 6  # pixels: sides of a picture, and white between two
 LABEL, TEXT = 64, 25  # pixels: height of two lines below a picture, and of a letter
 CAMERAS = 6

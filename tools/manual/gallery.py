@@ -1,6 +1,6 @@
 """What sphinx-gallery calls: the order of the tutorials, and the pictures that they wrote.
 
-After ``make docs``, ``python docs/gallery.py`` writes the pictures of examples/README.md.
+After ``make docs``, ``python tools/manual/gallery.py`` writes the pictures of examples/README.md.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ ORDER = (
 SMALLEST = 256
 """Pictures narrower than this are shown at a multiple of their size."""
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 BUILD = ROOT / "build" / "docs" / "examples"
 
 HEIGHT, WIDTH, GAP = 160, 800, 4  # pixels: of a strip at most, and white between two pictures

@@ -1,6 +1,6 @@
-"""Compose pictures of how-to pages: ``python docs/pictures.py`` writes docs/images/how-to-*.jpg.
+"""Compose pictures of how-to pages, docs/images/how-to-*.jpg: ``python tools/manual/pictures.py``.
 
-``python docs/pictures.py view convert`` writes these alone. All of them show photos that
+``python tools/manual/pictures.py view convert`` writes these alone. All of them show photos that
 scikit-image ships. They take five minutes on two cores; "view" needs Chromium.
 """
 
@@ -24,7 +24,7 @@ from eigengs_dr.image.resize import resample
 from eigengs_dr.image.sheet import text_line
 from eigengs_dr.plugins import follow, keep_in_bounds, texture_of
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
 WIDTH, GAP = 840, 6  # pixels: of a whole picture, and white between two
 LETTERS = 22  # pixels: they can be read where the picture is shown half as wide

@@ -1,7 +1,7 @@
 """Pages of `eigengs_dr.view` in the manual, and the parts of the reference that the code writes.
 
-``python docs/pages.py`` writes these between their marks: public names, the help of commands, and
-the parameters of plugins.
+``python tools/manual/pages.py`` writes these between their marks: public names, the help of
+commands, and the parameters of plugins.
 """
 
 import ast
@@ -25,10 +25,10 @@ from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
 from eigengs_dr.image.space import DATA
 from eigengs_dr.relight.lights import LightTable
 
-FOLDER = Path(__file__).parent.parent / "build" / "docs" / "extra"
+FOLDER = Path(__file__).parents[2] / "build" / "docs" / "extra"
 """Sphinx copies what is in it beside the manual."""
 
-REFERENCE = Path(__file__).parent / "reference"
+REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 
 PLUGINS = ("texture", "environment")
 

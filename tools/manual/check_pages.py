@@ -1,4 +1,4 @@
-"""List what README.md and the manual say without a ground: ``python docs/check_pages.py``.
+"""List what README.md and the manual say without a ground: ``python tools/manual/check_pages.py``.
 
 These are names that the package does not have, links to files that are not there, and figures that
 nobody can trace: a number with a unit, in a sentence that neither names the commit that it was
@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md")), *sorted(ROOT.glob("docs/*/*.md"))]
 NAME = re.compile(r"`(eigengs_dr(?:\.\w+)+)`(?:, `(\w+)`$)?")
 UNIT = (

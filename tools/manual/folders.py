@@ -1,6 +1,6 @@
 """The table of the folders of `eigengs_dr/`, in CONTRIBUTING.md.
 
-``python docs/folders.py`` writes it between its marks: the order is that of the layers in
+``python tools/manual/folders.py`` writes it between its marks: the order is that of the layers in
 pyproject.toml, the text is the first line of each folder.
 """
 
@@ -8,7 +8,7 @@ import ast
 import re
 from pathlib import Path
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PAGES = (ROOT / "CONTRIBUTING.md",)
 LAYERS = re.compile(r"^layers = \[(.*?)^\]", re.S | re.M)
 MARKS = re.compile(r"(<!-- folders -->\n).*?(<!-- end -->)", re.S)

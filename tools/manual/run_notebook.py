@@ -1,4 +1,4 @@
-"""Run the notebook of the manual and store small outputs: ``python docs/run_notebook.py``.
+"""Run the notebook of the manual and store small outputs: ``python tools/manual/run_notebook.py``.
 
 Pictures become JPEG files, which any viewer of notebooks shows. A page of `eigengs_dr.view` needs a
 browser and is large: its text stays. The build of the manual runs the notebook again, and shows all
@@ -15,7 +15,7 @@ import numpy as np
 from nbclient import NotebookClient
 from PIL import Image
 
-NOTEBOOK = Path(__file__).parent / "notebook.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "notebook.ipynb"
 WIDTH, QUALITY = 960, 80  # pixels, at most; of JPEG
 PICTURE = re.compile(r"<img src=\"data:image/\w+;base64,([^\"]+)")
 
