@@ -65,7 +65,7 @@ def summarize(rows: Sequence[Row]) -> Section:
         *([_losses(balls, posters)] if balls and posters else []),
         *([_lights(lights)] if lights else []),
     ]
-    return Section(tables, figures=_figures(balls, posters))
+    return Section(tables, figures=_figures(balls, posters, lights))
 
 
 def _costs(balls: Sequence[Row]) -> list[Table]:
@@ -146,10 +146,12 @@ def _lights(lights: Sequence[Row]) -> Table:
 FIGURES = ("prefiltered", "step", "step_filtered")
 
 
-def _figures(balls: Sequence[Row], posters: Sequence[Row]) -> dict[str, str]:
-    """Return figures of the last row of a ball, and the memory of photos, for sentences."""
+def _figures(balls: Sequence[Row], posters: Sequence[Row], lights: Sequence[Row]) -> dict[str, str]:
+    """Return figures for sentences: of the last ball, memory of photos, and time of lights."""
     small = [row["ratio_small"] for row in posters if row["kind"] == "photo"]
+    ratios = [row["ratio"] for row in lights]
     figures = {"small": f"{median(small):.2f}"} if small else {}
+    figures |= {"lights": f"{min(ratios):.2f} to {max(ratios):.2f}"} if ratios else {}
     for row in balls[-1:]:
         held = [row[f"held_{count}"] for count in HELD]
         figures["held"] = f"{min(held):.1f} to {max(held):.1f}"
