@@ -395,7 +395,7 @@ def test_names_are_where_the_manual_says(check):
 
 def test_the_folders_are_those_of_the_layers():
     """Write them anew by ``python tools/manual/folders.py``."""
-    assert runpy.run_path(str(FOLDER / "folders.py"))["outdated"]() == {}
+    assert runpy.run_path(str(ROOT / "tools" / "manual" / "folders.py"))["outdated"]() == {}
 
 
 def test_figures_of_the_manual_can_be_traced(check):
@@ -474,7 +474,7 @@ def test_the_reference_is_what_the_code_says():
     """Public names, commands, and the parameters of plugins; ``make pages`` writes them anew."""
     pytest.importorskip("mitsuba")
     pytest.importorskip("eigengs_bench", reason="pip install ./benchmarks")
-    pages = runpy.run_path(str(FOLDER / "pages.py"))
+    pages = runpy.run_path(str(ROOT / "tools" / "manual" / "pages.py"))
     assert pages["outdated"]() == {}
 
 

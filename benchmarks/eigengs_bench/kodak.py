@@ -139,7 +139,7 @@ def _by_counts(both: pd.DataFrame) -> fr.Table:
 
 
 def _figures(ours: pd.DataFrame, others: pd.DataFrame) -> dict[str, str]:
-    """Write PSNR and seconds of fits of 1,000 steps, and the best published PSNR where it exists."""
+    """Write PSNR and seconds of fits of 1,000 steps, and the best published PSNR if any."""
     usual = ours[(ours.steps == 1000) & (ours.solve_steps == SOLVE_STEPS)].set_index("gaussians")
     best = (
         others[~others.method.str.contains("not Gaussians")].groupby("gaussians").psnr_float.max()
