@@ -64,10 +64,16 @@ def pytest_collection_finish():
     gc.freeze()
 
 
-def pytest_runtest_setup():
-    """Leave the other cores to the other processes of pytest-xdist: threads of Dr.Jit spin."""
+def pytest_runtest_setup(item):
+    """Leave the other cores to other processes, and let scenes have the programs of the last run.
+
+    Threads of Dr.Jit spin. Objects of Mitsuba have numbers in programs: as long as a cycle holds
+    those of the tests before, every order of tests compiles other programs, for ten times as long.
+    """
     if "PYTEST_XDIST_WORKER" in os.environ:
         dr.set_thread_count(1)
+    if item.get_closest_marker("mitsuba"):
+        gc.collect()
 
 
 @pytest.hookimpl(wrapper=True)
