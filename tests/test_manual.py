@@ -308,7 +308,8 @@ def few_steps(fit):
 def small(code):
     """Shrink numbers of Gaussians, pixels, steps and workers to a tiny image's, without a GPU."""
     code = code.replace("n_workers=4", "n_workers=1").replace(".Pool(4)", ".Pool(1)")
-    code = re.sub(r"\beg\.(fit|fit_large)\(", r"few_steps(eg.\1)(", code.replace('"cuda"', '"llvm"'))
+    code = code.replace('"cuda"', '"llvm"')
+    code = re.sub(r"\beg\.(fit|fit_large)\(", r"few_steps(eg.\1)(", code)
     return NUMBER.sub(lambda found: str(min(200, int(found[0].replace("_", "")) // 50)), code)
 
 
