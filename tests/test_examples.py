@@ -94,6 +94,7 @@ def test_numpy_and_torch(run, tmp_path):
     check_pictures(tmp_path, "rocket", "rocket_mirrored", "rocket_torch")
 
 
+@pytest.mark.mitsuba
 def test_texture(run, tmp_path):
     pytest.importorskip("mitsuba")
     out = run("texture.py", tmp_path)
@@ -113,6 +114,7 @@ def test_photos_of_a_ball(run, tmp_path):
     assert found.space == "linear" and len(found) == 1024
 
 
+@pytest.mark.slow
 def test_fit_for_scene(run, tmp_path):
     pytest.importorskip("mitsuba")
     out = run("fit_for_scene.py", tmp_path)

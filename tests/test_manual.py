@@ -296,14 +296,20 @@ def space(tmp_path, monkeypatch):
         "gaussians": result.gaussians,
         "files": ["a", "b"],
         "fit_one": fit_one,
+        "few_steps": few_steps,
     }
     return space
 
 
+def few_steps(fit):
+    return partial(fit, iterations=100)
+
+
 def small(code):
-    """Shrink numbers of Gaussians, pixels and workers to what a tiny image takes, without a GPU."""
+    """Shrink numbers of Gaussians, pixels, steps and workers to a tiny image's, without a GPU."""
     code = code.replace("n_workers=4", "n_workers=1").replace(".Pool(4)", ".Pool(1)")
     code = code.replace('"cuda"', '"llvm"')
+    code = re.sub(r"\beg\.(fit|fit_large)\(", r"few_steps(eg.\1)(", code)
     return NUMBER.sub(lambda found: str(min(200, int(found[0].replace("_", "")) // 50)), code)
 
 

@@ -563,10 +563,9 @@ LATER = directions(5, 0.5) @ np.diag([-1, 1, 1])
 def test_relight(lit, tmp_path, backend, monkeypatch):
     pytest.importorskip("mitsuba")
     eg.register_plugins()  # before the first row, which names the threads of Dr.Jit
-    monkeypatch.setattr(relight, "PLANES", (6,))
-    monkeypatch.setattr(relight, "QUALITIES", (30, 90))
-    monkeypatch.setattr(relight, "PIXELS", (16,))
-    monkeypatch.setattr(relight, "BUDGETS", (0.5,))
+    small = {"PLANES": (6,), "QUALITIES": (30, 90), "PIXELS": (16,), "BUDGETS": (0.5,)}
+    for name, value in (small | {"FOUND": 1, "STEPS": 2}).items():
+        monkeypatch.setattr(relight, name, value)
     rows, text = answered(tmp_path / "out", "relight", lit, "--iterations", 5, "--backend", backend)
     assert {row["job"]["set"] for row in rows} == {"a", "b"}
     assert {row["job"]["method"] for row in rows} == {relight.OURS, *relight.METHODS}

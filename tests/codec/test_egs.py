@@ -5,6 +5,7 @@ import os
 import struct
 import zlib
 from dataclasses import replace
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -104,11 +105,10 @@ def test_reading_stops_after_the_sections_that_are_asked_for(path):
         eg.Gaussians.load(other, sections=1)
 
 
-@pytest.mark.parametrize("cutoff", [3.0, 4.5])
-def test_the_cutoff_is_kept(path, cutoff):
-    gaussians = replace(random_scene().on("llvm", space="rgb"), cutoff=cutoff)
+def test_the_cutoff_is_kept(path):
+    gaussians = replace(random_scene().on("llvm", space="rgb"), cutoff=4.5)
     result = eg.pack(gaussians, path, max_psnr_drop=3.0)
-    assert eg.Gaussians.load(path).cutoff == result.gaussians.cutoff == cutoff
+    assert eg.Gaussians.load(path).cutoff == result.gaussians.cutoff == 4.5
 
 
 # --- Damaged and hostile files -----------------------------------------------------------------
@@ -132,17 +132,22 @@ def test_files_cut_off_anywhere(path):
 def test_files_with_damaged_bytes(tmp_path_factory, data):
     """The checksums find every change."""
     path = tmp_path_factory.mktemp("any") / "x.egs"
-    whole = bytearray(packed.egs_bytes(content()))
+    whole = bytearray(whole_file())
     for _ in range(40):
         damaged = whole.copy()
         damaged[data.draw(st.integers(0, len(whole) - 1))] ^= data.draw(st.integers(1, 255))
         check_refused(path, bytes(damaged))
 
 
+@cache
+def whole_file():
+    return packed.egs_bytes(content())
+
+
 def header(**changed):
     names = ["magic", "version", "space", "channels", "levels", "sections"]
     names += ["width", "height", "x", "y", *Steps._fields, "cutoff", "psnr"]
-    values = packed._HEADER.unpack(packed.egs_bytes(content())[: packed._HEADER.size])
+    values = packed._HEADER.unpack(whole_file()[: packed._HEADER.size])
     head = packed._HEADER.pack(*{**dict(zip(names, values, strict=True)), **changed}.values())
     channels = changed.get("channels", 3)
     head += np.zeros(channels, "<f4").tobytes()
@@ -150,8 +155,7 @@ def header(**changed):
 
 
 def body(splats=COUNT, data=None, length=None):
-    whole = packed.egs_bytes(content())
-    data = whole[len(header()) + packed.HEAD.size :] if data is None else data
+    data = whole_file()[len(header()) + packed.HEAD.size :] if data is None else data
     check = packed.section_check(splats, data)
     return packed.HEAD.pack(splats, len(data) if length is None else length, check) + data
 

@@ -397,7 +397,7 @@ def test_an_environment_map_is_recovered():
     photos, scene = views(lit(light)), lit(np.full((16, 32, 3), 0.5))
     before = np.mean([(a - b) ** 2 for a, b in zip(views(scene), photos, strict=True)])
     loss = photo_loss(scene, "sky", photos, bounds=None, spp=16)
-    found = eg.fit(loss=loss, size=(32, 16), gaussians=40, iterations=120, space="log")
+    found = eg.fit(loss=loss, size=(32, 16), gaussians=40, iterations=60, space="log")
     after = np.mean([(a - b) ** 2 for a, b in zip(views(scene), photos, strict=True)])
     assert after < 0.05 * before
     seen = eg.render(found.gaussians).numpy()

@@ -64,15 +64,16 @@ mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()
 scene = {"type": "scene", "sky": {"type": "constant"}}
 noise = np.random.default_rng(0).random((256, 256, 3)).astype(np.float32)
+gaussians = eg.fit(noise[:64, :64], 200, 0).gaussians
 for n in range(6):
     mi.Bitmap(noise).write(rf"FOLDER/{n}.exr")
-    eg.fit(noise[:64, :64], 200, 0).gaussians.save(rf"FOLDER/{n}.npz")
-    gaussians = {"type": "gaussian_texture", "filename": rf"FOLDER/{n}.npz", "prefilter": n / 100}
-    for kind in (gaussians, {"type": "bitmap", "filename": rf"FOLDER/{n}.exr"}):
+    gaussians.save(rf"FOLDER/{n}.npz")
+    smooth = {"type": "gaussian_texture", "filename": rf"FOLDER/{n}.npz", "prefilter": n / 100}
+    for kind in (smooth, {"type": "bitmap", "filename": rf"FOLDER/{n}.exr"}):
         paint = {"type": "roughplastic", "diffuse_reflectance": kind}  # it asks for the mean
         scene[f"{kind['type']}{n}"] = {"type": "sphere", "bsdf": paint}
 with eg.exclusive():
-    for _ in range(5):
+    for _ in range(3):
         loaded = mi.load_dict(scene)
 with eg.exclusive():  # nobody has kept the lock, or its absence
     print(len(loaded.shapes()), eg.fit(eg.sample("coffee")[:16, :16], 9, 1).gaussians)

@@ -60,12 +60,11 @@ def test_a_smooth_sky_takes_less_memory(sun, tmp_path):
     np.testing.assert_allclose(images[1], images[0], rtol=0.03)
 
 
-@pytest.mark.parametrize(("sun", "target_psnr"), [(5.0, 36), (200.0, 39)])
-def test_the_light_keeps_its_mean(sun, target_psnr, tmp_path):
-    """Fits of logarithms alone missed the blue of these two by -1.6 and 3.4 %."""
-    light = horizon(sun=sun)
+def test_the_light_keeps_its_mean(tmp_path):
+    """A fit of logarithms alone missed the blue of this light by -1.6 %."""
+    light = horizon(sun=5.0)
     given, wanted = scene(bitmap=mi.Bitmap(light)), mean_on_sphere(light)
-    eg.convert_scene(given, tmp_path / "new", target_psnr, iterations=30, spp=0)
+    eg.convert_scene(given, tmp_path / "new", 36, iterations=30, spp=0)
     found = eg.render(eg.Gaussians.load(tmp_path / "new" / "sky.npz"), 512, 256).numpy()
     np.testing.assert_allclose(mean_on_sphere(found), wanted, rtol=0.01)
 

@@ -134,7 +134,7 @@ class TestFit:
 
     def test_texels_beyond_what_cameras_resolve_change_nothing(self):
         more = np.kron(photo(), np.ones((4, 4, 1), np.float32))
-        cameras = [camera([0, 0, distance]) for distance in np.linspace(6, 7.5, 7)]
+        cameras = [camera([0, 0, distance]) for distance in np.linspace(6, 7.5, 4)]
         few, many = ([fitted(c, image=x) for c in cameras] for x in (photo(), more))
         assert {(found.gaussians.width, found.gaussians.height) for found in many} == {(192, 192)}
         # With few Gaussians a fit is a matter of rounding, so of several the mean counts.
