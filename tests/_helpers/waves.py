@@ -67,5 +67,6 @@ def check_sound(result, image):
     added = 0 if result.mean_image is None else result.mean_image
     np.testing.assert_array_equal(result.image, rendered + added)
     reached = min(psnr(image, result.image, space="ycbcr"), MAX_PSNR)
-    assert reached == pytest.approx(min(max(figures(result)), MAX_PSNR), abs=1e-3)
+    # At 90 dB, errors of 3e-5 have the rounding of floats, 6e-8, on them: 0.2 % of an MSE.
+    assert reached == pytest.approx(min(max(figures(result)), MAX_PSNR), abs=0.01)
     assert result.psnr_ycbcr >= result.trace[0]["psnr_ycbcr"]
