@@ -209,7 +209,6 @@ def check_data(image: object, copy: bool = True) -> NDArray[np.float32]:
     return to_floats(pixels, "image", keep_grey=True, copy=copy, encoding=said, known=(1, 2, 3))
 
 
-@takes_numbers
 def displayed(image: ArrayLike, space: Space, encoding: str | None = None) -> NDArray[np.float32]:
     """Return an image as display values, for sets of a space: sRGB, or data."""
     if space.is_color:
@@ -217,6 +216,7 @@ def displayed(image: ArrayLike, space: Space, encoding: str | None = None) -> ND
     return check_data(image, copy=False)
 
 
+@takes_numbers
 def save_image(
     path: str | Path, image: ArrayLike, encoding: str | None = None, bits: int | None = None
 ) -> None:
