@@ -111,7 +111,7 @@ def test_photos_of_a_ball(run, tmp_path):
     assert by_gaussians > max(by_texels, 36)
     check_pictures(tmp_path, "photos", "paint", "errors")
     found = eg.Gaussians.load(tmp_path / "paint.npz")
-    assert found.space == "linear" and len(found) == 1024
+    assert found.space == "linear" and len(found) == 4096
 
 
 @pytest.mark.slow

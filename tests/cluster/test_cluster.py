@@ -106,6 +106,7 @@ def test_a_worker_that_is_killed(client, photos, output, expected):
     assert_complete(output, expected)
 
 
+@pytest.mark.slow
 def test_an_image_that_kills_its_worker(client, photos, output, expected):
     """It fails alone; the same call fits it when the cause is gone."""
     client.register_plugin(DieInWrite("05.npz"), name="patch")  # also in workers to come
@@ -138,6 +139,7 @@ def test_ctrl_c_leaves_what_is_done(client, photos, output, expected):
     assert_complete(output, expected)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_goes_away(photos, output, expected, tmp_path, caplog):
     """The run ends with one line, and the same call continues without the cluster."""
     logger = logging.getLogger("distributed.client")  # a level of its own, and no parents
