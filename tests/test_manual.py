@@ -210,8 +210,8 @@ def test_textures_are_recovered_from_photos(tmp_path, monkeypatch):
 
 
 TEXTURE = re.compile(r'<texture name="\w+" (type="gaussian_texture">.*?</texture>)', re.S)
-COMMAND = re.compile(r"^ *(eigengs-dr [^\n#]*)|`(eigengs-dr \w[^`]*)`(?!, 20)", re.M)
-"""A command in a block or in a sentence, but not one that measured a table, at its day's commit."""
+COMMAND = re.compile(r"^ *(eigengs-dr [^\n#]*)|`(eigengs-dr \w[^`]*)`", re.M)
+"""A command in a block or in a sentence."""
 SHELL = re.compile(r"^ *```sh\n(.*?)^ *```", re.M | re.S)
 NUMBER = re.compile(r"\b\d[\d_]{3,}\b")
 
@@ -461,11 +461,14 @@ def test_a_page_and_a_chart_that_differ_from_their_rows_are_written_anew(tmp_pat
     rows = [row for row in read(ROOT / pages.ROWS) if row["bench"] == "stability"]
     record(tmp_path / pages.ROWS, rows)
     page, chart = tmp_path / "docs/results.md", tmp_path / pages.CHARTS / "stability.svg"
-    marks = "<!-- table: stability.ends -->\n<!-- end -->\n"
+    tables = ("stability.ends", "all.runs")
+    marks = "".join(f"<!-- table: {name} -->\n<!-- end -->\n" for name in tables)
     page.write_text(f"{marks}![cases](images/measured/stability.svg)\n")
     (tmp_path / "README.md").write_text("A page without a mark.\n")
     assert pages.write(tmp_path) == [page, chart]
     right = page.read_text(), chart.read_bytes()
+    assert " (`bench stability`).*" in right[0]
+    assert f"commit {rows[0]['run']['commit'][:9]}: `bench stability`\n" in right[0]
     page.write_text(re.sub(r"(\| *)(\d)", r"\g<1>1\2", right[0], count=1))
     chart.unlink()
     assert pages.write(tmp_path) == [page, chart]

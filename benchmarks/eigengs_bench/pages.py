@@ -11,6 +11,8 @@ page shows a chart as a picture in ``docs/images/measured/``.
 
 Rows of "once" hold tables that no current question produces: their caption, columns and lines.
 Where the commit of a run was not recorded, it is the one that brought the figures into a page.
+
+A caption ends with the benchmark; ``<!-- table: all.runs -->`` lists all runs, once for all pages.
 """
 
 import re
@@ -21,8 +23,8 @@ from pathlib import Path
 from matplotlib import __version__ as drawn_with
 
 from eigengs_bench import overview
-from eigengs_bench.report import QUESTIONS, Table, as_text, chart_file, sources_of, table
-from eigengs_bench.rows import Row, read
+from eigengs_bench.report import QUESTIONS, Table, as_text, chart_file, machine_of, table
+from eigengs_bench.rows import Row, code_name, read
 from eigengs_dr.storage.atomic import atomic_write
 
 ROWS = Path("docs/rows.jsonl")
@@ -30,6 +32,7 @@ CHARTS = Path("docs/images/measured")
 MARK = re.compile(r"(?<!`)<!-- ((\w+): [\w.-]+) -->(.*?)<!-- end -->", re.S)
 CHART = re.compile(r"images/measured/([\w-]+)\.svg")
 DRAWN_WITH = re.compile(rb"Matplotlib v([^,<]+)")
+BENCHMARK = re.compile(r"(`bench \w+).*(`)")
 
 
 def pages_of(checkout: Path) -> list[Path]:
@@ -98,13 +101,13 @@ def contents(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
     rows: dict[str, list[Row]] = {}
     for row in read(path):
         rows.setdefault(row["bench"], []).append(row)
-    parts = _tables_measured_once(rows.get("once", []))
+    parts = {"table: all.runs": _runs(read(path)), **_tables_measured_once(rows.get("once", []))}
     charts = {name: chart_file(figure) for name, figure in overview.charts(rows).items()}
     for bench in QUESTIONS:
         if measured := rows.get(bench):
             section = import_module(f"eigengs_bench.{bench}").summarize(measured)
             tables = [one for one in section.tables if not one.frame.empty]
-            parts |= {f"table: {bench}.{one.name}": _with_source(one, measured) for one in tables}
+            parts |= {f"table: {bench}.{one.name}": _captioned(one, measured) for one in tables}
             parts |= {f"figure: {bench}.{name}": text for name, text in section.figures.items()}
             charts |= {name: chart_file(figure) for name, figure in section.charts.items()}
     return parts, charts
@@ -116,7 +119,7 @@ def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
     for row in measured:
         groups.setdefault(row["job"]["table"], []).append(row)
     return {
-        f"table: once.{name}": _with_source(
+        f"table: once.{name}": _captioned(
             table(rows[0]["caption"], rows[0]["columns"], [ln for r in rows for ln in r["lines"]]),
             rows,
         )
@@ -124,15 +127,31 @@ def _tables_measured_once(measured: Sequence[Row]) -> dict[str, str]:
     }
 
 
-def _with_source(measured: Table, rows: Sequence[Row]) -> str:
-    """Lay out a table for a page: the caption below it, and its sources folded away."""
+def _captioned(measured: Table, rows: Sequence[Row]) -> str:
+    """Lay out a table for a page; the caption below it names the benchmarks that measured it."""
     cells = as_text(measured, "pipe").removeprefix(measured.caption).strip()
-    sources = sources_of(rows if measured.rows is None else measured.rows, versions=False)
-    if not sources:
-        return f"{cells}\n\n*{measured.caption}.*"
-    lines = "\n".join(f"- {line}" for line in sources)
-    return f"{cells}\n\n*{measured.caption}.*\n\n{_folded('How it was measured', lines)}"
+    names = dict.fromkeys(
+        BENCHMARK.sub(r"\1\2", _command(row))
+        for row in (rows if measured.rows is None else measured.rows)
+    )
+    ending = f" ({', '.join(names)})" if names else ""
+    return f"{cells}\n\n*{measured.caption}{ending}.*"
 
 
-def _folded(title: str, text: str) -> str:
-    return f"<details><summary>{title}</summary>\n\n{text}\n\n</details>"
+def _runs(rows: Sequence[Row]) -> str:
+    """List the commands that measured rows, by machine, day and commit."""
+    machines: dict[str, dict[str, dict[str, None]]] = {}
+    for row in rows:
+        run = row["run"]
+        code = f"{run['date'][:10]}, {code_name(run)}"
+        commands = machines.setdefault(machine_of(run), {}).setdefault(code, {})
+        commands[_command(row).replace(" --quiet", "")] = None
+    lines = []
+    for machine, codes in machines.items():
+        lines.append(f"- {machine}")
+        lines += [f"  - {code}: {', '.join(commands)}" for code, commands in codes.items()]
+    return "\n".join(lines)
+
+
+def _command(row: Row) -> str:
+    return f"`{row['run']['command'].removeprefix('eigengs-dr ')}`"

@@ -84,20 +84,21 @@ def write_report(folder: Path, output: Path) -> None:
         temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
-def sources_of(rows: Sequence[Row], versions: bool = True) -> list[str]:
-    """Describe how rows were measured: each command with its days and commit, and the machine.
-
-    The line of the machine ends with the versions of the software, unless `versions` is False.
-    """
+def sources_of(rows: Sequence[Row]) -> list[str]:
+    """Describe how rows were measured: each command with its day and commit, and the machine."""
     lines = []
     for run in (row["run"] for row in rows):
         lines.append(f"`{run['command']}`, {run['date'][:10]}, {code_name(run)}")
     for run in (row["run"] for row in rows):
-        line = f"{run['cpu']}, {run['threads']} threads, backend {run['backend']}"
         known = {k: v for k, v in run["versions"].items() if v and not k.endswith("_path")}
         named = ", ".join(f"{name} {version}" for name, version in known.items())
-        lines.append(f"{line}; {named}" if versions else line)
+        lines.append(f"{machine_of(run)}; {named}")
     return list(dict.fromkeys(lines))
+
+
+def machine_of(run: Row) -> str:
+    """Name the machine of a run."""
+    return f"{run['cpu']}, {run['threads']} threads, backend {run['backend']}"
 
 
 # ---------------------------------------------------------------------------------------------

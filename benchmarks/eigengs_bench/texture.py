@@ -99,18 +99,18 @@ HELD_BY_POSTERS = ("bitmap_bytes", "bytes", "filtered_bytes", "small_bytes")
 def _posters(posters: Sequence[Row]) -> Table:
     """Lay out the bitmaps and the Gaussians whose pictures of posters are equally good."""
     caption = (
-        "Memory of the smallest bitmap of 8 bits, and of the fewest Gaussians, with which a poster "
+        "kB of the smallest bitmap of 8 bits, and of the fewest Gaussians, with which a poster "
         f"of {poster.TEXELS:,} x {poster.TEXELS:,} texels, seen aslant on a film of "
         f"{poster.PIXELS} x {poster.PIXELS} pixels, keeps 40 dB; the text 30 dB"
     )
-    columns = ["poster", "bitmap, texels", "Gaussians", "bitmap", "points", "prefilter", "small"]
+    columns = ["poster", "side, texels", "Gaussians", "bitmap", "points", "prefilter", "small"]
     columns += ["points over bitmap", "small over bitmap"]
     lines = [
         (
             row["job"]["poster"],
-            f"{row['side']} x {row['side']}",
+            f"{row['side']}",
             f"{row['gaussians']:,}",
-            *(f"{row[k] / 1e3:.0f} kB" for k in HELD_BY_POSTERS),
+            *(f"{row[k] / 1e3:,.0f}" for k in HELD_BY_POSTERS),
             f"{row['ratio']:.2f}",
             f"{row['ratio_small']:.2f}",
         )

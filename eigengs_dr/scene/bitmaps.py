@@ -227,8 +227,8 @@ def _reason(props: mi.Properties, parents: list[str]) -> str:
         return "nothing uses it"
     if len(set(parents)) > 1 and (relief := {*parents} & {*RELIEF}):
         return f"{RELIEF[min(relief)]} that are something else too"
-    if str(props.get("filter_type", "bilinear")) != "bilinear":
-        return "its filter shows single texels"
+    if (kind := str(props.get("filter_type", "bilinear"))) != "bilinear":
+        return f"its filter is {kind}, not bilinear"
     return ""
 
 
