@@ -444,11 +444,14 @@ def test_files_of_the_architecture_exist():
 def test_pages_and_charts_have_what_their_rows_give():
     pytest.importorskip("eigengs_bench", reason="pip install ./benchmarks")
     from eigengs_bench import pages
+    from eigengs_bench.rows import read
 
     assert pages.outdated(ROOT) == {}
+    shown = "".join(page.read_text() for page in pages.pages_of(ROOT))
+    once = {f"table: once.{row['job']['table']} -->" for row in read(ROOT / pages.ROWS, "once")}
+    assert not [mark for mark in once if mark not in shown]
     charts = sorted((ROOT / pages.CHARTS).iterdir())
-    shown = {name for p in pages.pages_of(ROOT) for name in pages.CHART.findall(p.read_text())}
-    assert {chart.stem for chart in charts} == shown
+    assert {chart.stem for chart in charts} == {*pages.CHART.findall(shown)}
     assert max(chart.stat().st_size for chart in charts) < 60_000
 
 
