@@ -101,12 +101,11 @@ def scene(
     """Render Mitsuba scenes with Gaussian textures.
 
     The mitsuba executable does not know plugins in Python; this command does. For several scenes,
-    -o names a folder, and the pictures are named after the scenes. An EXR file has all AOVs and
-    layers, a PNG file the colours. Textures whose prefilter is true follow the camera.
+    -o names a folder, and pictures are named after scenes. An EXR file has all AOVs and layers, a
+    PNG file the colours. Textures whose prefilter is true follow the camera.
 
     \b
     Examples:
-      eigengs-dr scene scenes/plane.xml -o plane.png
       eigengs-dr scene scenes/plane.xml -o plane.png -D prefilter=0 --spp 64
       eigengs-dr scene scenes/*.xml -o build/scenes/
       eigengs-dr scene scenes/ball.xml -o ball.exr --variant llvm_ad_spectral
@@ -267,9 +266,9 @@ def convert(
     Each gets as many as cameras resolve. FOLDER gets scene.xml, a set per image, and per camera
     the renderings before and after, and 8 times their difference. If a rendering misses the PSNR,
     the exit code is 1. The command keeps a bitmap, and says why, if it takes less memory than its
-    Gaussians, if many of them overlap, if the PSNR would be missed, if it has two values as masks
-    do, or data outside of 0 to 1, or if no camera sees it. The new scene refers to other files
-    relative to FOLDER.
+    Gaussians, many of them overlap, the PSNR would be missed, no camera sees it, or it holds two
+    values, as masks do, or data outside of 0 to 1. The new scene refers to other files relative to
+    FOLDER.
 
     \b
     Examples:
