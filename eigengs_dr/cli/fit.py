@@ -114,7 +114,6 @@ def fit(
       eigengs-dr fit photos/ -o fits/ --report fits.json
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
       eigengs-dr fit sky.exr -o sky.npz --space log --gaussians 20000
-      eigengs-dr fit huge.tif -o huge.npz --blocks 1024
       eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
     recursive = choices["recursive"]

@@ -52,7 +52,6 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
 
     \b
     Examples:
-      eigengs-dr info photo.npz
       eigengs-dr info natural
       eigengs-dr info photo.npz --texture
       eigengs-dr info model.npz --preview components.png

@@ -63,7 +63,6 @@ def render(
     \b
     Examples:
       eigengs-dr render photo.npz -o photo.png
-      eigengs-dr render sky.npz -o sky.exr
       eigengs-dr render photo.npz -o icon.png --size 64x48 --first 500
       eigengs-dr render bark.npz -o roughness.png --map roughness
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2

@@ -108,7 +108,6 @@ def scene(
     Examples:
       eigengs-dr scene scenes/plane.xml -o plane.png -D prefilter=0 --spp 64
       eigengs-dr scene scenes/*.xml -o build/scenes/
-      eigengs-dr scene scenes/ball.xml -o ball.exr --variant llvm_ad_spectral
       eigengs-dr scene room.xml -o room.png --camera all       writes room-1.png, room-2.png, ...
       eigengs-dr scene room.xml -o room.exr --integrator aov,aovs=distance:depth
     """
@@ -272,8 +271,7 @@ def convert(
 
     \b
     Examples:
-      eigengs-dr convert room.xml -o room-gaussians/
-      eigengs-dr convert room.xml -o room-gaussians/ --target-psnr 36 --spp 64
+      eigengs-dr convert room.xml -o room-gaussians/ --target-psnr 36
       eigengs-dr scene room-gaussians/scene.xml -o room.png
     """
     check_outputs([run.report], [scene])

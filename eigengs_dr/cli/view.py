@@ -55,8 +55,7 @@ def view(
 
     \b
     Examples:
-      eigengs-dr view photo.npz --open
-      eigengs-dr view photo.npz --image photo.jpg -o photo.html
+      eigengs-dr view photo.npz --image photo.jpg --open
       eigengs-dr view levels.npz --levels 4
       eigengs-dr view natural --image photo.jpg -o natural.html
     """
