@@ -55,7 +55,7 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
 @options.value("--target-psnr", "DB", float, "Take the fewest Gaussians for this PSNR.")
 @options.choice("--target-space", ["rgb", "ycbcr"], "Colour space of --target-psnr.", True)
 @options.number("--max-gaussians", "Largest number of Gaussians for --target-psnr.")
-@options.value("--blocks", "SIZE", int, "Fit blocks of this side, in less memory.")
+@options.value("--blocks", "SIZE", int, "Fit by blocks of this side.")
 @options.level_counts("Number of levels of detail, each 4 times as large, or Gaussians up to each.")
 @options.number("--iterations", "Optimisation steps.", 1000)
 @options.choice("--init", INITS, "Initial placement.  [default: adaptive]", True)
@@ -98,8 +98,8 @@ def fit(
     Ctrl-C writes the best fit so far, or of several images stops after the last complete one, with
     exit code 130. If --target-psnr is out of reach, the best fit is written, with exit code 1.
 
-    An image too large for the memory of this machine is refused. --blocks 1024 fits it block by
-    block, by default with one Gaussian per 20 pixels; after Ctrl-C, the same command continues.
+    An image too large for memory is refused. --blocks 1024 fits it block by block, by default with
+    one Gaussian per 20 pixels; after Ctrl-C, the same command continues.
 
     With --map, maps of one size share one set of shapes, and -o names the file. Names such as
     albedo and color mean linear light, normal means normals, others data; --map height:data=FILE

@@ -29,11 +29,7 @@ from .scene import load_mitsuba, scene_errors
 @click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE|FOLDER")
 @options.as_json
 @options.value("--preview", "FILE", options.path, "Picture of the contents.")
-@click.option(
-    "--texture",
-    is_flag=True,
-    help="Also load the file as a Mitsuba texture, and show its memory.",
-)
+@click.option("--texture", is_flag=True, help="Also show the memory of a Mitsuba texture.")
 def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None:
     """Show the contents of a fitted image, a material or a model.
 

@@ -84,7 +84,7 @@ definitions_option = click.option(
     "--camera", "ID|N|all", str, "Camera to render; all writes OUT-ID for each.  [default: 1]"
 )
 @options.value(
-    "--integrator", "TYPE[,KEY=VALUE...]", integrator, "Instead of the integrator of the scene."
+    "--integrator", "TYPE[,KEY=VALUE...]", integrator, "Instead of the scene's integrator."
 )
 @definitions_option
 @options.shared("quiet")
