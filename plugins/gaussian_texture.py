@@ -63,7 +63,7 @@ def gaussian_texture() -> type:
         wrap_mode : string, default: repeat
             Outside of the image: ``repeat``, ``mirror`` or ``clamp``.
         raw : boolean, default: false
-            Whether sums stay as they are, neither decoded nor clamped.
+            Whether sums are neither decoded nor clamped.
         prefilter : float or boolean, default: 0
             Angle of a pixel in radians, below 1 (`pixel_angle`), over which lookups average; 0
             looks at points; ``true`` takes that of the sensor of `follow`.
