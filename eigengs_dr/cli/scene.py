@@ -264,9 +264,8 @@ def convert(
 
     Each gets as many as cameras resolve. FOLDER gets scene.xml, a set per image, and per camera
     the renderings before and after, and 8 times their difference. If a rendering misses the PSNR,
-    the exit code is 1. The command keeps a bitmap, and says why, if it takes less memory than its
-    Gaussians, many of them overlap, the PSNR would be missed, no camera sees it, or it holds two
-    values, as masks do, or data outside of 0 to 1. The new scene refers to other files relative to
+    the exit code is 1. The command keeps bitmaps that are better, such as masks, that would miss
+    the PSNR, or that no camera sees, and says why. The new scene refers to other files relative to
     FOLDER.
 
     \b
