@@ -56,7 +56,7 @@ def gaussian_environment() -> type:
         map : string
             Name of a map of `filename`.
         first : integer, default: all
-            Number of Gaussians of `filename` to use, for sets with levels.
+            Number of Gaussians of `filename`, for sets with levels.
         model : string
             A model that ``eigengs-dr train`` writes.
         coefficients : tensor (C, k), default: 0
@@ -79,7 +79,7 @@ def gaussian_environment() -> type:
             Factor of the light.
         prefilter : float or boolean, default: 0
             Angle of a pixel in radians, below 1 (`pixel_angle`), over which lookups average; 0
-            looks at points; ``true`` takes that of the sensor that `follow` names.
+            looks at points; ``true`` takes that of the sensor of `follow`.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         memory : string, default: normal, of arrays exact

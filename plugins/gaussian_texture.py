@@ -38,7 +38,7 @@ def gaussian_texture() -> type:
         map : string
             Name of a map of `filename`.
         first : integer, default: all
-            Number of Gaussians of `filename` to use, for sets with levels.
+            Number of Gaussians of `filename`, for sets with levels.
         model : string
             A model that ``eigengs-dr train`` writes.
         coefficients : tensor (C, k), default: 0
@@ -63,11 +63,10 @@ def gaussian_texture() -> type:
         wrap_mode : string, default: repeat
             Outside of the image: ``repeat``, ``mirror`` or ``clamp``.
         raw : boolean, default: false
-            Whether sums stay as they are, neither decoded nor clamped.
+            Whether sums are neither decoded nor clamped.
         prefilter : float or boolean, default: 0
             Angle of a pixel in radians, below 1 (`pixel_angle`), over which lookups average; 0
-            looks at points; ``true`` takes that of the sensor that `follow` names. Footprints that
-            rays carry (Mitsuba 3.10) take precedence.
+            looks at points; ``true`` takes that of the sensor of `follow`.
         cutoff : float, default: that of the set
             Standard deviations after which a Gaussian ends, above 0 and at most 12.
         memory : string, default: normal, of arrays exact

@@ -33,14 +33,13 @@ def doctor(
 ) -> None:
     """Show which backends work on this machine and what to install.
 
-    With --gpu, a small fit and a scene run on the GPU and on llvm, and a table shows their times
-    and differences, to be pasted into a report. The exit code is 1 if no backend works, or if the
-    results of the GPU differ.
+    With --gpu, a small fit and a scene run on the GPU and on llvm, and a table, for reports, shows
+    their times and differences. The exit code is 1 if no backend works, or if the results of the
+    GPU differ.
 
     \b
     Examples:
       eigengs-dr doctor
-      eigengs-dr doctor --json
       eigengs-dr doctor --gpu
     """
     if trial:

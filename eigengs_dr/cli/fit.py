@@ -52,15 +52,15 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
 @options.output(".npz file or folder.  [default: the current folder]", "OUT", required=False)
 @options.maps("A map of a material, instead of IMAGE; repeatable.")
 @options.number("--gaussians", "Number of Gaussians.  [default: 5000]")
-@options.value("--target-psnr", "DB", float, "Use the fewest Gaussians that reach this PSNR.")
+@options.value("--target-psnr", "DB", float, "Take the fewest Gaussians for this PSNR.")
 @options.choice("--target-space", ["rgb", "ycbcr"], "Colour space of --target-psnr.", True)
 @options.number("--max-gaussians", "Largest number of Gaussians for --target-psnr.")
-@options.value("--blocks", "SIZE", int, "Fit blocks of this side, in less memory.")
+@options.value("--blocks", "SIZE", int, "Fit by blocks of this side.")
 @options.level_counts("Number of levels of detail, each 4 times as large, or Gaussians up to each.")
 @options.number("--iterations", "Optimisation steps.", 1000)
 @options.choice("--init", INITS, "Initial placement.  [default: adaptive]", True)
 @options.value("--basis", "NAME|FILE", str, "Model to start from: natural, or a file.")
-@options.choice("--preset", PRESETS, "Our method, or the method of a paper.")
+@options.choice("--preset", PRESETS, "Our method, or that of a paper.")
 @options.choice(
     "--space",
     SPACES,
@@ -88,35 +88,32 @@ def fit(
     """Fit sums of Gaussians to images. Grey images become RGB; --space data keeps one channel.
 
     IMAGE may be a folder, a pattern in quotes, or a URL. For several images, -o and --preview name
-    folders, whose files are named after the images; manifest.jsonl has a row per image. If an image
-    fails, the rest is still fitted, and the exit code is 2.
+    folders, whose files are named after the images; manifest.jsonl has a row per image. If one
+    fails, the others are fitted, and the exit code is 2.
 
-    A single result is replaced if it exists. Of several images, those with results are skipped, so
-    that the same command continues a run; results of other options are an error. A file that is
-    not a set of Gaussians is never replaced.
+    A single result is replaced. Of several images, those with results are skipped, so the same
+    command continues a run; results of other options are an error. Files that are not sets of
+    Gaussians are never replaced.
 
     Ctrl-C writes the best fit so far, or of several images stops after the last complete one, with
     exit code 130. If --target-psnr is out of reach, the best fit is written, with exit code 1.
 
-    An image too large for the memory of this machine is refused. --blocks 1024 fits it block by
-    block, by default with one Gaussian per 20 pixels; after Ctrl-C, the same command continues.
+    An image too large for memory is refused. --blocks 1024 fits it block by block, by default with
+    one Gaussian per 20 pixels; after Ctrl-C, the same command continues.
 
-    With --map, maps of one size share one set of shapes, and -o names the file. Albedo and color
-    are fitted in linear light, normal as normals, and other names as data; --map height:data=FILE
+    With --map, maps of one size share one set of shapes, and -o names the file. Names such as
+    albedo and color mean linear light, normal means normals, others data; --map height:data=FILE
     sets a space. --target-psnr then applies to each map.
 
     \b
     Examples:
       eigengs-dr fit photo.jpg
-      eigengs-dr fit photo.jpg -o photo.npz --gaussians 20000 --report photo.json
       eigengs-dr fit photo.jpg -o photo.npz --target-psnr 38
-      eigengs-dr fit photo.jpg -o photo.npz --basis natural --iterations 100
+      eigengs-dr fit photo.jpg --basis natural --iterations 100
       eigengs-dr fit photo.jpg -o levels.npz --levels 5000,7000,9000
-      eigengs-dr fit photos/ -o fits/ --iterations 300 --report fits.json
+      eigengs-dr fit photos/ -o fits/ --report fits.json
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
-      eigengs-dr fit roughness.png -o roughness.npz --space data
       eigengs-dr fit sky.exr -o sky.npz --space log --gaussians 20000
-      eigengs-dr fit huge.tif -o huge.npz --blocks 1024
       eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
     recursive = choices["recursive"]

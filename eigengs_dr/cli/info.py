@@ -29,19 +29,15 @@ from .scene import load_mitsuba, scene_errors
 @click.argument("file", type=click.Path(path_type=Path), metavar="NAME|FILE|FOLDER")
 @options.as_json
 @options.value("--preview", "FILE", options.path, "Picture of the contents.")
-@click.option(
-    "--texture",
-    is_flag=True,
-    help="Also load the file as a Mitsuba texture, and show its memory.",
-)
+@click.option("--texture", is_flag=True, help="Also show the memory of a Mitsuba texture.")
 def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None:
     """Show the contents of a fitted image, a material or a model.
 
     NAME is a basis of the package, such as natural. PSNR, steps and source are those of the fit;
-    bpp is the size of the file in bits per pixel, for all maps of a material together.
+    bpp is the size of the file in bits per pixel, for all maps together.
 
-    For a model, a table shows the first components by variance: their share of it, and the PSNR of
-    PCA with them, for training and held-out images. For a model of lights, the command shows the
+    Of a model, a table shows the first components by variance: their share of it, and the PSNR of
+    PCA with them, for training and held-out images. Of a model of lights, the command shows the
     number of planes, and the PSNR of left-out lights.
 
     With --texture, texture_bytes is the memory of a gaussian_texture for lookups at points,
@@ -52,8 +48,6 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
 
     \b
     Examples:
-      eigengs-dr info photo.npz
-      eigengs-dr info photo.egs --json
       eigengs-dr info natural
       eigengs-dr info photo.npz --texture
       eigengs-dr info model.npz --preview components.png

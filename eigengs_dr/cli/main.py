@@ -57,12 +57,11 @@ def main() -> None:
 
     \b
     Examples, in the order to run them first:
-      eigengs-dr doctor                                     Check this machine.
-      eigengs-dr fit photo.jpg --preview fit.png            Write photo.npz.
-      eigengs-dr info photo.npz                             Show its contents.
-      eigengs-dr render photo.npz -o large.png --scale 2    Render it larger.
-      eigengs-dr pack photo.npz -o photo.egs                Compress it.
-      eigengs-dr view photo.npz --open                      Look at it in the browser.
+      eigengs-dr doctor
+      eigengs-dr fit photo.jpg -o photo.npz --preview fit.png
+      eigengs-dr render photo.npz -o large.png --scale 2
+      eigengs-dr pack photo.npz -o photo.egs
+      eigengs-dr view photo.npz --open
 
     "eigengs-dr COMMAND --help" describes a command.
     """

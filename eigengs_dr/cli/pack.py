@@ -42,17 +42,16 @@ def pack(
 ) -> None:
     """Compress a fitted image or a material.
 
-    Parameters are quantised as coarsely as the allowed loss of PSNR permits. Every command that
-    reads the .npz file of an image reads .egs files too. Without --image, the fit counts as one of
-    40 dB. A material takes --map instead; a model of lights takes neither: its loss refers to
-    left-out lights.
+    Parameters are quantised as coarsely as --max-psnr-drop permits. Commands that read the .npz
+    file of an image read .egs files too. Without --image, the fit counts as one of 40 dB. A
+    material takes --map instead; a model of lights takes neither: its loss refers to left-out
+    lights.
 
-    Of a folder, all .npz files are packed. If one fails, the exit code is 2.
+    Of a folder, all .npz files are packed; if one fails, the exit code is 2.
 
     \b
     Examples:
-      eigengs-dr pack photo.npz -o photo.egs --image photo.jpg
-      eigengs-dr pack photo.npz -o photo.egs --max-psnr-drop 0.1
+      eigengs-dr pack photo.npz -o photo.egs --image photo.jpg --max-psnr-drop 0.1
       eigengs-dr pack levels.npz -o levels.egs --levels 4
       eigengs-dr pack bark.npz -o bark.egs --map albedo=a.jpg --map normal=n.jpg
       eigengs-dr pack fits/ -o packed/

@@ -28,13 +28,8 @@ from .outputs import check_outputs, lock_outputs, name_outputs
 @options.value(
     "--region", "X,Y,W,H", options.region, "Region of the image: left, top, width, height."
 )
-@options.value("--scale", "S", options.scale, "Factor of the native size, such as 0.5.")
-@options.value(
-    "--size",
-    "W|WxH",
-    options.width_or_size,
-    "Width in pixels, such as 1024, or width and height, 1024x768.",
-)
+@options.value("--scale", "S", options.scale, "Factor of the native size.")
+@options.value("--size", "W|WxH", options.width_or_size, "Width, or width and height, in pixels.")
 @options.number("--first", "Only the first N Gaussians, for fits with --levels.", minimum=1)
 @options.choice(
     "--bits",
@@ -55,21 +50,19 @@ def render(
 ) -> None:
     """Render a fitted image at any size, or a region of it.
 
-    By default the picture has the native size of the image or of the region. A smaller picture is
-    an average of the native one. Files of 8 and 16 bits hold clamped sRGB; files of floats (.exr,
-    .hdr, .pfm, and .tif with --bits 32) hold linear light. A fit of data is written unchanged; one
-    channel gives a grey picture. A .tif file takes only the memory of a band.
+    By default the picture has the native size of the image or of the region; a smaller one is an
+    average. Files of 8 and 16 bits hold clamped sRGB, files of floats (.exr, .hdr, .pfm, and .tif
+    with --bits 32) linear light. Data are written unchanged, one channel as a grey picture. A .tif
+    file takes only the memory of a band.
 
     A model of lights ('eigengs-dr train --lights') takes --light: a vector towards the light, x to
     the right, y up, z towards the camera.
 
-    Of a folder, all sets are rendered. If one fails, the exit code is 2.
+    Of a folder, all sets are rendered; if one fails, the exit code is 2.
 
     \b
     Examples:
       eigengs-dr render photo.npz -o photo.png
-      eigengs-dr render photo.npz -o large.tif --scale 4
-      eigengs-dr render sky.npz -o sky.exr
       eigengs-dr render photo.npz -o icon.png --size 64x48 --first 500
       eigengs-dr render bark.npz -o roughness.png --map roughness
       eigengs-dr render huge.npz -o part.png --region 4000,2500,800,600 --scale 2

@@ -84,7 +84,7 @@ definitions_option = click.option(
     "--camera", "ID|N|all", str, "Camera to render; all writes OUT-ID for each.  [default: 1]"
 )
 @options.value(
-    "--integrator", "TYPE[,KEY=VALUE...]", integrator, "Instead of the integrator of the scene."
+    "--integrator", "TYPE[,KEY=VALUE...]", integrator, "Instead of the scene's integrator."
 )
 @definitions_option
 @options.shared("quiet")
@@ -101,15 +101,13 @@ def scene(
     """Render Mitsuba scenes with Gaussian textures.
 
     The mitsuba executable does not know plugins in Python; this command does. For several scenes,
-    -o names a folder, and the pictures are named after the scenes. An EXR file has all AOVs and
-    layers, a PNG file the colours. Textures whose prefilter is true follow the camera.
+    -o names a folder, and pictures are named after scenes. An EXR file has all AOVs and layers, a
+    PNG file the colours. Textures whose prefilter is true follow the camera.
 
     \b
     Examples:
-      eigengs-dr scene scenes/plane.xml -o plane.png
       eigengs-dr scene scenes/plane.xml -o plane.png -D prefilter=0 --spp 64
       eigengs-dr scene scenes/*.xml -o build/scenes/
-      eigengs-dr scene scenes/ball.xml -o ball.exr --variant llvm_ad_spectral
       eigengs-dr scene room.xml -o room.png --camera all       writes room-1.png, room-2.png, ...
       eigengs-dr scene room.xml -o room.exr --integrator aov,aovs=distance:depth
     """
@@ -266,15 +264,13 @@ def convert(
 
     Each gets as many as cameras resolve. FOLDER gets scene.xml, a set per image, and per camera
     the renderings before and after, and 8 times their difference. If a rendering misses the PSNR,
-    the exit code is 1. The command keeps a bitmap, and says why, if it takes less memory than its
-    Gaussians, if many of them overlap, if the PSNR would be missed, if it has two values as masks
-    do, or data outside of 0 to 1, or if no camera sees it. The new scene refers to other files
-    relative to FOLDER.
+    the exit code is 1. The command keeps bitmaps that are better, such as masks, that would miss
+    the PSNR, or that no camera sees, and says why. The new scene refers to other files relative to
+    FOLDER.
 
     \b
     Examples:
-      eigengs-dr convert room.xml -o room-gaussians/
-      eigengs-dr convert room.xml -o room-gaussians/ --target-psnr 36 --spp 64
+      eigengs-dr convert room.xml -o room-gaussians/ --target-psnr 36
       eigengs-dr scene room-gaussians/scene.xml -o room.png
     """
     check_outputs([run.report], [scene])

@@ -57,13 +57,13 @@ def train(
 
     A model is one set of Gaussians that renders all principal components of the images. One image
     in ten is held out and measured at the end. --energy refers to each channel of the training
-    images; --target-psnr to PCA, in --space, of the held-out images. After Ctrl-C or a crash, the
+    images, --target-psnr to PCA, in --space, of the held-out images. After Ctrl-C or a crash, the
     same command resumes from MODEL.npz.checkpoint. All processes of a --cluster need access to
     FOLDER and MODEL.npz.
 
     With --lights, the folder holds photos of one object from one camera; the list names each photo
-    and the direction of its light. The model renders the object under any light, see 'eigengs-dr
-    render'. --components is then the number of planes, by default as many as left-out lights need.
+    and the direction of its light. 'eigengs-dr render' shows the object under any light.
+    --components is then the number of planes, by default as many as left-out lights need.
 
     \b
     Examples:
@@ -71,7 +71,6 @@ def train(
       eigengs-dr train faces/ -o faces.npz --size 128x128 --components 90,30,30
       eigengs-dr train photos/ -o photos.npz --target-psnr 24
       eigengs-dr train /shared/faces/ -o /shared/faces.npz --cluster tcp://node1:8786
-      eigengs-dr fit photo.jpg --basis photos.npz
       eigengs-dr train coin/ -o coin.npz --lights coin/dirs.lp
     """
     if lights is not None:

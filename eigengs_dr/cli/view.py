@@ -49,18 +49,15 @@ def view(
 
     NAME is a basis of the package, such as natural. The page is one file and needs no network. It
     draws the picture of "render" at any zoom, outlines, the first Gaussians, and the parameters of
-    the Gaussian under the pointer. With --image, a divider wipes to the photo. A model has sliders
-    for its first components, and draws random images; the light of a model of lights follows the
-    pointer or the finger.
+    the one under the pointer. With --image, a divider wipes to the photo. A model has sliders for
+    its first components, and draws random images; the light of a model of lights follows the
+    pointer.
 
     \b
     Examples:
-      eigengs-dr view photo.npz --open
-      eigengs-dr view photo.npz --image photo.jpg -o photo.html
+      eigengs-dr view photo.npz --image photo.jpg --open
       eigengs-dr view levels.npz --levels 4
-      eigengs-dr view bark.npz --map roughness
       eigengs-dr view natural --image photo.jpg -o natural.html
-      eigengs-dr view coin.npz --open
     """
     [page] = name_outputs([file], output, SUFFIXES)
     check_outputs([page], [file, *([image] if image else [])])

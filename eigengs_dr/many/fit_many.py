@@ -46,7 +46,7 @@ def fit_many(
     client: Any = None,
     **options: Any,
 ) -> list[ImageRow]:
-    """Fit many images; an image that fails gets a row with its error, and the run continues.
+    """Fit many images; one that fails gets a row with its error, and the run continues.
 
     Threads decode files and write results while other images are fitted. With an output folder,
     memory does not grow with the number of images.
