@@ -57,7 +57,20 @@ html_extra_path = [str(pages.FOLDER)]
 
 # --- Reference -----------------------------------------------------------------------------------
 
-autosummary_generate = True
+
+def table_of(names: list[str], folder: str) -> str:
+    """Return a table of names, whose pages are in a folder."""
+    lines = "".join(f"   {name}\n" for name in names)
+    head = ".. currentmodule:: eigengs_dr\n\n.. autosummary::\n"
+    return f"{head}   :toctree: {folder}\n\n{lines}"
+
+
+# Autosummary finds the names of which it makes pages in files alone, and a page lists them once.
+REFERENCE = pages.REFERENCE / "python.md"
+LISTED = pages.LISTED.findall(REFERENCE.read_text("utf-8"))
+TABLE = ROOT / "build" / "docs" / "names.rst"
+TABLE.write_text(table_of(LISTED, f"{REFERENCE.parent}/generated"), "utf-8")
+autosummary_generate = ["../build/docs/names.rst"]
 autodoc_typehints = "none"  # the docstrings name types, shapes and units
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
@@ -81,8 +94,7 @@ def skip_tuple_fields(
 
 def check_pages(app: Any) -> None:
     """Warn of public names that the reference leaves out, and of what pages say without ground."""
-    listed = set((Path(__file__).parent / "reference" / "python.md").read_text().split())
-    for name in sorted(PUBLIC - listed):
+    for name in sorted(PUBLIC - {*LISTED}):
         LOGGER.warning("reference/python.md: the public name %s is not listed", name)
     for line in missing():
         LOGGER.warning("%s does not exist", line)
@@ -100,7 +112,7 @@ def read_page(app: Any, name: str, source: list[str]) -> None:
     """Make a page of a checkout one of the HTML.
 
     Pages of `OUTSIDE` are shown where they belong, links to examples lead to their tutorials, and
-    what only the HTML can show comes out of its comment, in place of the tables of names.
+    what only the HTML can show comes out of its comment. A list of names becomes a table.
     """
     text = source[0]
     for file, page in OUTSIDE.items():
@@ -112,8 +124,13 @@ def read_page(app: Any, name: str, source: list[str]) -> None:
         text = re.sub(rf"\]\((\.\./)+{file}\.md", f"](/{page}.md", text)
     text = re.sub(r"\]\((\.\./)+examples/README\.md", "](/tutorials/index.rst", text)
     text = re.sub(r"\]\((?:\.\./)+examples/(\w+)\.py", r"](/tutorials/\1.rst", text)
-    text = re.sub(r"<!-- names: .*?<!-- end -->", "", text, flags=re.S)
+    text = re.sub(r"<!-- names: .*?<!-- end -->", names_table, text, flags=re.S)
     source[0] = re.sub(r"<!-- manual:\n(.*?)-->", r"\1", text, flags=re.S)
+
+
+def names_table(names: re.Match[str]) -> str:
+    """Return the table that the HTML shows in place of a list of names."""
+    return f"```{{eval-rst}}\n{table_of(pages.LISTED.findall(names[0]), 'generated')}```"
 
 
 def link_names(app: Any, page: nodes.document) -> None:

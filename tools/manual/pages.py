@@ -19,7 +19,7 @@ import click
 import numpy as np
 
 import eigengs_dr as eg
-from eigengs_bench.pages import filled
+from eigengs_bench.pages import MARK, filled
 from eigengs_dr.cli.main import main
 from eigengs_dr.eigenbasis.eigengs import SHIPPED, EigenGS
 from eigengs_dr.image.space import DATA
@@ -53,8 +53,8 @@ ENTRY = re.compile(r"^(\w[\w, ]*) : (.+)\n((?: {4}.*\n?)+)", re.M)
 """A parameter in a docstring: its name, or several, its type with the default, and what it is."""
 
 
-NAMES = re.compile(r"((?:^   [\w.]+\n)+)```\n-->\n\n<!-- (names: [\w-]+) -->", re.M)
-"""The names that an autosummary lists, and the mark of their descriptions, which follow it."""
+LISTED = re.compile(r"^- `([\w.]+)", re.M)
+"""A name in a list of the reference; a line of a new one may end here."""
 
 HELP = re.compile(r"(\n\nOptions:(?=\n *--help))?\n *--help +Show this message and exit\.")
 """What the help of every command says of itself."""
@@ -68,7 +68,11 @@ def outdated() -> dict[Path, str]:
     found = {}
     for page in (REFERENCE / "python.md", REFERENCE / "commands.md", *plugin_pages().values()):
         there = page.read_text("utf-8")
-        parts = {mark: names_list(names.split()) for names, mark in NAMES.findall(there)}
+        parts = {
+            mark: names_list(LISTED.findall(lines))
+            for mark, kind, lines in MARK.findall(there)
+            if kind == "names"
+        }
         if "<!-- commands: all -->" in there:
             parts["commands: all"] = helps()
         plugins = [plugin for plugin, its_page in plugin_pages().items() if page == its_page]
