@@ -149,7 +149,7 @@ def _runs(rows: Sequence[Row]) -> str:
     lines = []
     for machine, codes in machines.items():
         lines.append(f"- {machine}")
-        lines += [f"  - {code}: {', '.join(commands)}" for code, commands in codes.items()]
+        lines += [f"  - {code}: {', '.join(codes[code])}" for code in sorted(codes)]
     return "\n".join(lines)
 
 

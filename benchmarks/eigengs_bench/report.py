@@ -18,7 +18,7 @@ from eigengs_bench.rows import FILE, Row, code_name, read
 from eigengs_dr.storage.atomic import atomic_write
 
 TAG = re.compile(rb"<[^>]+>")  # of an SVG file
-MISSING = "-"  # cell of a missing figure
+MISSING = ""  # cell of a missing figure
 
 # Colours that readers who confuse red and green can tell apart (Okabe and Ito, 2008).
 BLUE, RED, GREEN, ORANGE = "#0072b2", "#d55e00", "#009e73", "#e69f00"

@@ -160,11 +160,10 @@ def _figures(balls: Sequence[Row], posters: Sequence[Row], lights: Sequence[Row]
 
 
 def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
-    """Lay out where Gaussians lose to a bitmap, and what to use instead."""
+    """Lay out what Gaussians cost beside a bitmap."""
     row, kinds = balls[-1], ("photo", "material", "text")
     ratio = {k: [r["ratio"] for r in posters if r["kind"] == k] for k in kinds}
     small = [r["ratio_small"] for r in posters if r["kind"] != "text"]
-    bake, texels = "`eigengs-dr render`, then a bitmap", "a set drawn into a bitmap"
     memory = [
         ("memory, photos", ratio["photo"]),
         ("memory, materials", ratio["material"]),
@@ -172,31 +171,25 @@ def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
         ('memory, `memory="small"`, no text', small),
     ]
     lines = [
-        (what, f"{median(n):.2f}", f"{min(n):.2f} to {max(n):.2f}", _better(median(n)))
-        for what, n in memory
-        if n
+        (what, f"{median(n):.2f}", f"{min(n):.2f} to {max(n):.2f}") for what, n in memory if n
     ]
     lines += [
-        (what, f"{row[name]:.2f}", "", other)
-        for what, name, other in (
-            ("time of a picture", f"ratio_{SETTLED}", bake),
-            ("time of a picture, prefilter", f"ratio_filtered_{SETTLED}", bake),
-            (f"the same, {CHANGED[-1]:,} Gaussians", f"ratio_filtered_{CHANGED[-1]}", bake),
-            ("time of a step of `prb`", "ratio_step", texels),
-            ("time of a step of `prb`, prefilter", "ratio_step_filtered", texels),
-            ("the same, drawn into a bitmap", "ratio_step_drawn", ""),
+        (what, f"{row[name]:.2f}", "")
+        for what, name in (
+            ("time of a picture", f"ratio_{SETTLED}"),
+            ("time of a picture, prefilter", f"ratio_filtered_{SETTLED}"),
+            (f"the same, {CHANGED[-1]:,} Gaussians", f"ratio_filtered_{CHANGED[-1]}"),
+            ("time of a step of `prb`", "ratio_step"),
+            ("time of a step of `prb`, prefilter", "ratio_step_filtered"),
+            ("the same, drawn into a bitmap", "ratio_step_drawn"),
         )
     ]
     caption = (
         "Gaussians over bitmaps; memory for equally good pictures of posters, time with "
         f"{SETTLED:,} Gaussians"
     )
-    columns = ("figure", "Gaussians over a bitmap", "from poster to poster", "what is better")
+    columns = ("figure", "Gaussians over a bitmap", "from poster to poster")
     return table(caption, columns, lines, name="losses")._replace(rows=[*balls, *posters])
-
-
-def _better(ratio: float) -> str:
-    return "Gaussians" if ratio < 1 else "a bitmap of 8 bits"
 
 
 LOOKUPS = {

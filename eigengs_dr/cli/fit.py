@@ -69,7 +69,7 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
     True,
 )
 @options.encoding
-@options.number("--seed", "Seed of random numbers.", 0)
+@options.number("--seed", "Random seed.", 0)
 @options.value("--preview", "FILE", options.path, "Picture, or folder, of photo, fit and outlines.")
 @click.option("--recursive", is_flag=True, help="Also take images in subfolders.")
 @click.option("--overwrite", is_flag=True, help="Also fit images that have results.")

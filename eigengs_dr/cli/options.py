@@ -220,7 +220,7 @@ as_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 encoding = choice(
     "--encoding",
     ENCODINGS,
-    "Encoding of the pixels.  [default: linear for files of floats, else srgb]",
+    "Encoding of the pixels.  [default: linear for floats, else srgb]",
     True,
 )
 
@@ -235,7 +235,7 @@ SHARED: dict[str, Option] = {
         "--backend", BACKENDS, "Backend of Dr.Jit.  [default: cuda if present]", True
     ),
     "report": value("--report", "FILE", path, "Write all figures as JSON."),
-    "quiet": click.option("--quiet", is_flag=True, help="Show no progress and no summary."),
+    "quiet": click.option("--quiet", is_flag=True, help="Show no progress or summary."),
 }
 """Options that become fields of a `Run`."""
 

@@ -39,7 +39,7 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
 @options.choice("--preset", ["default", "eigengs"], "Solve for weights, or train like the paper.")
 @options.number("--iterations", "Steps of the preset eigengs.  [default: 15000]", minimum=1)
 @options.choice("--space", ["ycbcr", "rgb"], "Colour space of the components.")
-@options.number("--seed", "Seed of random numbers.", 0, minimum=0)
+@options.number("--seed", "Random seed.", 0, minimum=0)
 @options.value("--preview", "FILE", options.path, "Picture of the components.")
 @options.value(
     "--lights", "DIRS.lp", options.EXISTING, "The photos show one object under these lights."

@@ -144,11 +144,12 @@ def methods_of(found: object) -> list[str]:
 def helps() -> str:
     """Return what ``--help`` of the program and of each of its commands prints.
 
-    Only that of the program lists the option itself.
+    Only that of the program lists the option itself. Groups of commands are of other packages.
     """
     top = click.Context(main, info_name="eigengs-dr", show_default=True, terminal_width=80)
     texts = {"eigengs-dr": main.get_help(top)}
-    for name, command in main.commands.items():
+    commands = {k: v for k, v in main.commands.items() if not isinstance(v, click.Group)}
+    for name, command in commands.items():
         context = click.Context(command, top, name)  # as wide as that above
         texts[f"eigengs-dr {name}"] = HELP.sub("", command.get_help(context))
     parts = [f"## {name}\n\n```text\n{text}\n```" for name, text in texts.items()]
@@ -172,7 +173,7 @@ def plugin_parameters(plugin: str) -> str:
             continue
         kind, _, default = kind.partition(", default: ")
         said = " ".join(text.split()).replace("``", "`").removesuffix(".")
-        lines.append(f"| {shown} | {kind} | {said} | {default or '-'} | {flags.get(names, '')} |")
+        lines.append(f"| {shown} | {kind} | {said} | {default} | {flags.get(names, '')} |")
     if same:
         row = f"| {', '.join(same)} | | [as of a texture]({TEXTURE_PAGE}#parameters) | | |"
         lines.insert(2, row)
