@@ -42,10 +42,10 @@ REQUIREMENTS = ("splatthis==0.3.2", "torch==2.13.0")
 SPLATTHIS = {"170 steps": "70,50,33,17", "500 steps": "200,150,100,50"}
 CODED = {"JPEG": ("JPEG 4:2:0", "JPEG 4:4:4"), "AVIF": ("AVIF 4:4:4",)}
 BETTER = {
-    "splatthis": "writes SVG, CSS and PowerPoint that need no program of its own",
-    "JPEG": "any program shows it; encodes and decodes in milliseconds",
+    "splatthis": "writes SVG, CSS and PowerPoint",
+    "JPEG": "any program shows it; takes milliseconds",
     "AVIF": "fewer bytes at equal PSNR, in the mean of Kodak",
-    "texels": "higher MS-SSIM at equal memory; a lookup reads four texels, everywhere; no fit",
+    "texels": "higher MS-SSIM at equal memory; quick lookups; no fit",
 }
 
 
