@@ -170,9 +170,7 @@ def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
         ("memory, sharp text", ratio["text"]),
         ('memory, `memory="small"`, no text', small),
     ]
-    lines = [
-        (what, f"{median(n):.2f}", f"{min(n):.2f} to {max(n):.2f}") for what, n in memory if n
-    ]
+    lines = [(what, f"{median(n):.2f}", f"{min(n):.2f} to {max(n):.2f}") for what, n in memory if n]
     lines += [
         (what, f"{row[name]:.2f}", "")
         for what, name in (
