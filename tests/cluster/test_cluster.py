@@ -307,6 +307,7 @@ def test_errors_are_raised(executor):
         list(executor.map(clusters.fail, range(1)))
 
 
+@pytest.mark.slow
 def test_a_worker_that_starts_slowly_comes_back(tmp_path):
     """Dask must not give it up while its nanny restarts it."""
     with (
