@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, settings
+from threadpoolctl import threadpool_limits
 
 # No test depends on time: another program may use the machine, and a first example compiles.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -70,13 +71,16 @@ BESIDE_OTHERS = "PYTEST_XDIST_WORKER" in os.environ
 
 
 @pytest.fixture(scope="session", autouse=True)
-def plugins_take_no_thread():
-    """Let `register_plugins`, which takes two threads of Dr.Jit for EXR files, take none.
+def one_thread():
+    """Let BLAS, and `register_plugins`, which takes two threads for EXR files, start none.
 
-    The second one spins for 20 ms after each program: beside other processes, for nothing.
+    Beside other processes they spin for nothing, those of Dr.Jit for 20 ms after each program.
     """
-    with pytest.MonkeyPatch.context() as patch:
-        if BESIDE_OTHERS and find_spec("mitsuba"):
+    if not BESIDE_OTHERS:
+        yield
+        return
+    with threadpool_limits(1), pytest.MonkeyPatch.context() as patch:
+        if find_spec("mitsuba"):
             from eigengs_dr.plugins import registration
 
             two = SimpleNamespace(**vars(dr) | {"thread_count": lambda: 2})
