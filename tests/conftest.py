@@ -4,9 +4,12 @@ import gc
 import os
 import signal
 from functools import cache
+from importlib.util import find_spec
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, settings
+from threadpoolctl import threadpool_limits
 
 # No test depends on time: another program may use the machine, and a first example compiles.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -64,14 +67,35 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+BESIDE_OTHERS = "PYTEST_XDIST_WORKER" in os.environ
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """Let BLAS, and `register_plugins`, which takes two threads for EXR files, start none.
+
+    Beside other processes they spin for nothing, those of Dr.Jit for 20 ms after each program.
+    """
+    if not BESIDE_OTHERS:
+        yield
+        return
+    with threadpool_limits(1), pytest.MonkeyPatch.context() as patch:
+        if find_spec("mitsuba"):
+            from eigengs_dr.plugins import registration
+
+            two = SimpleNamespace(**vars(dr) | {"thread_count": lambda: 2})
+            patch.setattr(registration, "dr", two)
+        yield
+
+
 def pytest_runtest_setup(item):
     """Leave the other cores to other processes, and let scenes have the programs of the last run.
 
     Threads of Dr.Jit spin. Objects of Mitsuba have numbers in programs: as long as a cycle holds
     those of the tests before, every order of tests compiles other programs, for ten times as long.
     """
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        dr.set_thread_count(1)
+    if BESIDE_OTHERS:
+        dr.set_thread_count(2 if item.get_closest_marker("exr") else 1)
     if item.get_closest_marker("mitsuba"):
         gc.collect()
 

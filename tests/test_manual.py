@@ -4,6 +4,7 @@ import itertools
 import re
 import runpy
 import shlex
+import shutil
 import warnings
 from functools import partial
 from importlib.util import find_spec
@@ -17,6 +18,7 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.families import small_model
+from _helpers.packed import few_groups
 from eigengs_dr.cli.main import main
 from eigengs_dr.image.color import to_linear
 
@@ -135,7 +137,7 @@ def test_getting_started_runs_without_a_warning(tmp_path, monkeypatch):
 # --- A page about photos of a ball ---
 
 GREY = """<texture name="{0}" type="bitmap"><boolean name="raw" value="true"/>
-  <string name="filename" value="{1}.exr"/></texture>"""
+  <string name="filename" value="{1}.pfm"/></texture>"""
 FAMILY = """<texture name="base_color" type="gaussian_texture">
   <string name="model" value="cats.npz"/></texture>"""
 CAMERA = """<sensor type="perspective"><float name="fov" value="36"/>
@@ -165,19 +167,19 @@ def write_balls(mi, paint):
         ("grey", np.full((8, 8, 3), 0.2, np.float32)),
         ("half", np.full((8, 8, 1), 0.5, np.float32)),
     ):
-        mi.Bitmap(pixels).write(f"{name}.exr")
+        mi.Bitmap(pixels).write(f"{name}.pfm")
     roughness, base = GREY.format("roughness", "half"), partial(GREY.format, "base_color")
     for name, color in (("known", base("paint")), ("ball", base("grey")), ("family", FAMILY)):
         Path(f"{name}.xml").write_text(
             BALL.format(color=color, roughness=roughness, cameras=cameras)
         )
     text, room = Path("known.xml").read_text(), '<emitter type="envmap" id="room">'
-    sky = f'{room}<string name="filename" value="grey.exr"/></emitter>'
+    sky = f'{room}<string name="filename" value="grey.pfm"/></emitter>'
     Path("indoors.xml").write_text(re.sub('<emitter type="constant">.*</emitter>', sky, text))
     scene = mi.load_file("known.xml")
     Path("photos").mkdir()
     for k in range(8):
-        mi.Bitmap(mi.render(scene, sensor=k, spp=64, seed=100 + k)).write(f"photos/{k}.exr")
+        mi.Bitmap(mi.render(scene, sensor=k, spp=64, seed=100 + k)).write(f"photos/{k}.pfm")
 
 
 @pytest.mark.mitsuba
@@ -191,6 +193,7 @@ def test_textures_are_recovered_from_photos(tmp_path, monkeypatch):
     write_balls(mi, to_linear(paint).astype(np.float32))
 
     def smaller(code):
+        code = code.replace(".exr", ".pfm")  # for which Mitsuba needs no second thread
         return code.replace("256", "32").replace("240", "80").replace("160", "40")
 
     made = run_blocks(FOLDER / "how-to/recover.md", {"__name__": "page"}, smaller)
@@ -254,32 +257,39 @@ def fit_one(file):
     return file
 
 
-@pytest.fixture
-def space(tmp_path, monkeypatch):
-    """A folder with the files that pages name, and the variables that they use."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A folder with the files that pages name, and the images in them."""
+    path = tmp_path_factory.mktemp("pages") / "files"
+    for folder in ("photos", "states", "coin"):
+        (path / folder).mkdir(parents=True)
     image = eg.sample("coffee")[100:124, 200:224]
     images = [np.roll(image, 5 * k, axis=1) for k in range(5)]
-    for folder in ("photos", "states", "coin"):
-        (tmp_path / folder).mkdir()
     for k, other in enumerate(images):
-        eg.save_image(f"photos/{k}.png", other)
-    for k, other in enumerate(images):
-        eg.save_image(f"coin/image{k:02}.png", other)
+        eg.save_image(path / f"photos/{k}.png", other)
+        eg.save_image(path / f"coin/image{k:02}.png", other)
     lights = [f"image{k:02}.png {k / 5} 0.2 1" for k in range(5)]
-    (tmp_path / "coin" / "dirs.lp").write_text("\n".join(["5", *lights]))
+    (path / "coin" / "dirs.lp").write_text("\n".join(["5", *lights]))
     for name in ("photo.jpg", "wood.jpg", "huge.tif"):
-        eg.save_image(name, np.tile(image, (3, 3, 1)) if name == "huge.tif" else image)
-    eg.save_image("roughness.png", image[..., :1])
-    Image.fromarray(np.uint8(255 * image[..., [0, 1, 2, 0]])).save("leaf.png")
-    eg.save_image("sky.exr", 20 * image, encoding="linear")
-    result = eg.fit(image, 50, iterations=2)
+        eg.save_image(path / name, np.tile(image, (3, 3, 1)) if name == "huge.tif" else image)
+    eg.save_image(path / "roughness.png", image[..., :1])
+    Image.fromarray(np.uint8(255 * image[..., [0, 1, 2, 0]])).save(path / "leaf.png")
+    eg.save_image(path / "sky.exr", 20 * image, encoding="linear")
     light = eg.fit(image, 50, iterations=2, space="linear").gaussians
     for name in ("wood", "lamp", "sky", "photo"):
-        light.save(f"{name}.npz")
-    model = small_model("llvm")
-    model.save("cats.npz")
-    (tmp_path / "room.xml").write_text(ROOM)
+        light.save(path / f"{name}.npz")
+    small_model("llvm").save(path / "cats.npz")
+    (path / "room.xml").write_text(ROOM)
+    return path, images
+
+
+@pytest.fixture
+def space(files, tmp_path, monkeypatch):
+    """A folder with these files, and the variables that pages use."""
+    folder, images = files[0], [image.copy() for image in files[1]]
+    monkeypatch.chdir(shutil.copytree(folder, tmp_path / "files"))
+    image, model = images[0], small_model("llvm")
+    result = eg.fit(image, 50, iterations=2)
     n = np.full((24, 24, 3), (0.5, 0.5, 1.0))
     space = {
         "__name__": "__main__",
@@ -302,18 +312,21 @@ def space(tmp_path, monkeypatch):
 
 
 def few_steps(fit):
-    return partial(fit, iterations=100)
+    return partial(fit, iterations=40)
 
 
 def small(code):
     """Shrink numbers of Gaussians, pixels, steps and workers to a tiny image's, without a GPU."""
-    code = code.replace("n_workers=4", "n_workers=1").replace(".Pool(4)", ".Pool(1)")
+    code = code.replace("n_workers=4", "n_workers=1, processes=False").replace(
+        ".Pool(4)", ".Pool(1)"
+    )
     code = code.replace('"cuda"', '"llvm"')
     code = re.sub(r"\beg\.(fit|fit_large)\(", r"few_steps(eg.\1)(", code)
     return NUMBER.sub(lambda found: str(min(200, int(found[0].replace("_", "")) // 50)), code)
 
 
 @pytest.mark.parametrize("page", list(cases()))
+@few_groups()
 def test_python_of_a_page_runs(page, space):
     if is_mitsuba(page):
         mi = pytest.importorskip("mitsuba")
@@ -441,12 +454,15 @@ def test_files_of_the_architecture_exist():
     assert not [path for path in paths if not any((top / path).exists() for top in tops)]
 
 
-def test_pages_and_charts_have_what_their_rows_give():
+@pytest.mark.parametrize("drawn", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_pages_and_charts_have_what_their_rows_give(drawn):
+    """To draw a chart takes half a second, so tables, figures and names of charts go first."""
     pytest.importorskip("eigengs_bench", reason="pip install ./benchmarks")
     from eigengs_bench import pages
     from eigengs_bench.rows import read
 
-    assert pages.outdated(ROOT) == {}
+    draw = pages.chart_file if drawn else lambda figure: b""
+    assert {path for path in pages.outdated(ROOT, draw) if drawn or path.suffix == ".md"} == set()
     shown = "".join(page.read_text() for page in pages.pages_of(ROOT))
     once = {f"table: once.{row['job']['table']} -->" for row in read(ROOT / pages.ROWS, "once")}
     assert not [mark for mark in once if mark not in shown]

@@ -14,7 +14,7 @@ from _helpers.scene_sets import save_halves
 
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
-pytestmark = pytest.mark.mitsuba
+pytestmark = [pytest.mark.mitsuba, pytest.mark.exr]
 
 SCENES = Path(__file__).parent.parent / "scenes"
 SMALL = ["-D", "resolution=32", "--spp", "16", "--variant", "llvm_ad_rgb", "--quiet"]

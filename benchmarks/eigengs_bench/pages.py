@@ -16,11 +16,12 @@ A caption ends with the benchmark; ``<!-- table: all.runs -->`` lists all runs, 
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 
 from matplotlib import __version__ as drawn_with
+from matplotlib.figure import Figure
 
 from eigengs_bench import overview
 from eigengs_bench.report import QUESTIONS, Table, as_text, chart_file, machine_of, table
@@ -41,13 +42,13 @@ def pages_of(checkout: Path) -> list[Path]:
     return [checkout / "README.md", *sorted(docs.glob("*.md")), *sorted(docs.glob("*/*.md"))]
 
 
-def outdated(checkout: Path) -> dict[Path, bytes]:
+def outdated(checkout: Path, draw: Callable[[Figure], bytes] = chart_file) -> dict[Path, bytes]:
     """Return the pages and charts that are out of date, with what they should hold.
 
-    A chart drawn by another version of matplotlib counts as up to date. `ValueError` if a page
+    `draw` makes the file of a chart. A chart drawn by another version of matplotlib counts as up to date. `ValueError` if a page
     names a table, a figure or a chart that no row holds.
     """
-    parts, charts = contents(checkout / ROWS)
+    parts, charts = contents(checkout / ROWS, draw)
     right, used = dict[Path, bytes](), set[str]()
     for page in pages_of(checkout):
         text = page.read_text("utf-8")
@@ -96,20 +97,22 @@ def filled(text: str, parts: Mapping[str, str], name: str) -> str:
     return MARK.sub(part, text)
 
 
-def contents(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
+def contents(
+    path: Path, draw: Callable[[Figure], bytes] = chart_file
+) -> tuple[dict[str, str], dict[str, bytes]]:
     """Return the Markdown for each mark that a page can hold, and the charts by their names."""
     rows: dict[str, list[Row]] = {}
     for row in read(path):
         rows.setdefault(row["bench"], []).append(row)
     parts = {"table: all.runs": _runs(read(path)), **_tables_measured_once(rows.get("once", []))}
-    charts = {name: chart_file(figure) for name, figure in overview.charts(rows).items()}
+    charts = {name: draw(figure) for name, figure in overview.charts(rows).items()}
     for bench in QUESTIONS:
         if measured := rows.get(bench):
             section = import_module(f"eigengs_bench.{bench}").summarize(measured)
             tables = [one for one in section.tables if not one.frame.empty]
             parts |= {f"table: {bench}.{one.name}": _captioned(one, measured) for one in tables}
             parts |= {f"figure: {bench}.{name}": text for name, text in section.figures.items()}
-            charts |= {name: chart_file(figure) for name, figure in section.charts.items()}
+            charts |= {name: draw(figure) for name, figure in section.charts.items()}
     return parts, charts
 
 

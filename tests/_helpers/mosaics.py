@@ -1,5 +1,7 @@
 """Pictures with unlike parts, settings to fit them by blocks, and executors of other ways."""
 
+from functools import cache
+
 import numpy as np
 
 import eigengs_dr as eg
@@ -9,8 +11,9 @@ FEW = {"gaussians": 700, "iterations": 10, "block": 64, "backend": "llvm"}
 """Settings of a fit of 128x128 pixels in four blocks."""
 
 
+@cache
 def mosaic(side=256):
-    """Parts of photos, whose borders are none of blocks of 64 or 96 pixels; uint8."""
+    """Parts of photos, whose borders are none of blocks of 64 or 96 pixels; uint8, to be read."""
     parts = [
         eg.sample("coffee")[60:180, 100:220],
         eg.sample("astronaut")[20:140, 180:300],
@@ -21,7 +24,9 @@ def mosaic(side=256):
         np.concatenate([parts[(row + column) % 3] for column in range(tiles)], axis=1)
         for row in range(tiles)
     ]
-    return np.rint(255 * np.concatenate(rows)[:side, :side]).astype(np.uint8)
+    pixels = np.rint(255 * np.concatenate(rows)[:side, :side]).astype(np.uint8)
+    pixels.setflags(write=False)
+    return pixels
 
 
 class Sliced:

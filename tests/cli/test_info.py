@@ -10,6 +10,7 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
+from _helpers.packed import few_groups
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
 
 
@@ -17,11 +18,17 @@ def facts_of(*arguments):
     return json.loads(said("info", *arguments, "--json"))
 
 
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """A fit of a file."""
+    photo = tmp_path_factory.mktemp("fitted") / "photo.png"
+    eg.save_image(photo, eg.sample("coffee")[:32, :32])
+    return eg.fit(photo, 40, iterations=10)
+
+
 @pytest.fixture
-def set_file(tmp_path):
-    """A fit, and its file."""
-    eg.save_image(tmp_path / "photo.png", eg.sample("coffee")[:32, :32])
-    result = eg.fit(tmp_path / "photo.png", 40, iterations=10)
+def set_file(result, tmp_path):
+    """A fit, and a file of it, which tests may change."""
     result.save(tmp_path / "a.npz")
     return result, tmp_path / "a.npz"
 
@@ -39,6 +46,7 @@ def test_info_of_a_fit(set_file):
     assert "gaussians   40" in text and "photo.png" in text and "bpp" in text
 
 
+@few_groups()
 def test_sets_in_a_folder(set_file, trained, tmp_path):
     """All are shown, rendered and packed; one that cannot be is an error, with exit code 2."""
     fits = tmp_path / "fits"
@@ -61,7 +69,7 @@ def test_sets_in_a_folder(set_file, trained, tmp_path):
     assert figures["bytes"] == (tmp_path / "packed" / "a.egs").stat().st_size
     shown = run("info", fits)
     assert shown.exit_code == 2 and shown.stdout.count("kind ") == 1
-    image = run("pack", fits, "-o", tmp_path / "x", "--image", tmp_path / "photo.png")
+    image = run("pack", fits, "-o", tmp_path / "x", "--image", "photo.png")
     assert_refused(image, "--image and --map belong to one set")
     assert_refused(run("render", fits, "-o", tmp_path / "x.png"), "need a folder")
 

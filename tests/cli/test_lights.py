@@ -8,6 +8,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
+from _helpers.packed import few_groups
 
 LIGHTS = directions(16)
 
@@ -37,6 +38,7 @@ def test_train_with_lights_writes_a_model_and_its_figures(folder):
     assert report["planes"] == 5 and report["lights"] == 16
 
 
+@few_groups()
 def test_render_takes_a_light(folder, tmp_path):
     for name in ("model.npz", "model.egs"):
         if name.endswith("egs"):

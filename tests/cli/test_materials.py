@@ -8,6 +8,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said, succeeded
 from _helpers.materials import images
+from _helpers.packed import few_groups
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,7 @@ def test_info(fitted, tmp_path):
     assert "roughness" in text and "weight" in text and "prefilter_bytes" in text
 
 
+@few_groups()
 def test_pack(fitted, folder, tmp_path):
     target = tmp_path / "m.egs"
     assert "roughness" in said("pack", fitted, "-o", target, *maps(folder), "--max-psnr-drop", 3)

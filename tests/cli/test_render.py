@@ -8,6 +8,7 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, previewed, run, said, smooth_pixels, succeeded
+from _helpers.packed import few_groups
 from eigengs_dr.gaussian.file import read_set
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.io import load_image, save_image
@@ -121,6 +122,7 @@ def sky(tmp_path_factory):
     return folder, light
 
 
+@few_groups()
 def test_fit_of_light(sky, tmp_path):
     folder, _ = sky
     figures = json.loads((folder / "r.json").read_text())

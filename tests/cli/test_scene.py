@@ -70,6 +70,7 @@ def test_several_scenes_into_a_folder(scene, tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
 
 
+@pytest.mark.exr
 def test_passes_make_one_picture(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("eigengs_dr.scene.rendering.SAMPLES_PER_PASS", 8 * 6 * 2)
     told = said("scene", scene(), "-o", tmp_path / "x.exr", "--spp", 5)
@@ -98,6 +99,7 @@ def channels_of(path):
     return [field.name for field in mi.Bitmap(str(path)).struct_()]
 
 
+@pytest.mark.exr
 def test_layers_have_their_names_and_a_depth_is_no_alpha(scene, tmp_path):
     path = scene(text=CAMERAS)
     name = str(tmp_path / "x.exr")
@@ -113,6 +115,7 @@ def test_layers_have_their_names_and_a_depth_is_no_alpha(scene, tmp_path):
     assert mi.Bitmap(str(tmp_path / "x.png")).pixel_format() == mi.Bitmap.PixelFormat.RGB
 
 
+@pytest.mark.exr
 def test_another_integrator(scene, tmp_path):
     """Of AOVs alone, which may be one or four; or of colours, whose parameters count."""
     path = scene(text=CAMERAS)
@@ -133,6 +136,7 @@ def test_another_integrator(scene, tmp_path):
         assert_refused(run(*command), words)
 
 
+@pytest.mark.exr
 def test_cameras(scene, tmp_path):
     path = scene(text=CAMERAS.replace('value="6"', 'value="5"', 1))
     sizes = {}
@@ -150,6 +154,7 @@ def test_cameras(scene, tmp_path):
     )
 
 
+@pytest.mark.exr
 def test_a_texture_follows_each_camera(scene, tmp_path):
     """And a prefilter that is a number for another film does not blur in silence."""
     name = save_halves(tmp_path) / "roughness.npz"

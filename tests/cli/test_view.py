@@ -10,7 +10,7 @@ import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
 from _helpers.families import small_model
 from _helpers.materials import material
-from _helpers.packed import small_fit
+from _helpers.packed import few_groups, small_fit
 from _helpers.sets import random_scene
 from eigengs_dr.cli import pack as cli_pack
 from eigengs_dr.codec import egs, packing
@@ -104,6 +104,7 @@ def test_refuses_bad_input(photo, tmp_path):
     assert not list(tmp_path.glob("*.html"))
 
 
+@few_groups()
 def test_pack(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     gaussians, image = small_fit()

@@ -12,11 +12,13 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 
 import dask
+import drjit as dr
 import numpy as np
 import pytest
 import tifffile
 from distributed import Client, LocalCluster
 from PIL import Image
+from threadpoolctl import threadpool_limits
 
 import eigengs_dr as eg
 from _helpers import clusters
@@ -307,6 +309,7 @@ def test_errors_are_raised(executor):
         list(executor.map(clusters.fail, range(1)))
 
 
+@pytest.mark.slow
 def test_a_worker_that_starts_slowly_comes_back(tmp_path):
     """Dask must not give it up while its nanny restarts it."""
     with (
@@ -391,7 +394,8 @@ def test_workers_of_this_machine_are_set_up(client):
 @pytest.mark.parametrize("task", [clusters.state, clusters.fail])
 def test_a_cluster_of_others_is_as_it_was(task):
     """After a run, and after an error; their numbers of threads count during a task alone."""
-    with user_cluster() as (_, client):
+    with threadpool_limits(2), user_cluster() as (_, client):
+        dr.set_thread_count(2)
         executor = executor_for(client)
         before = client.run(clusters.worker_state)
         scheduler = client.cluster.scheduler

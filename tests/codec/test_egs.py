@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import eigengs_dr as eg
 from _helpers.errors import file_refused
-from _helpers.packed import STEPS, peak
+from _helpers.packed import STEPS, few_groups, peak
 from _helpers.sets import COUNT, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec.gaussian_model import MIN_RICH_COUNT
@@ -105,6 +105,7 @@ def test_reading_stops_after_the_sections_that_are_asked_for(path):
         eg.Gaussians.load(other, sections=1)
 
 
+@few_groups()
 def test_the_cutoff_is_kept(path):
     gaussians = replace(random_scene().on("llvm", space="rgb"), cutoff=4.5)
     result = eg.pack(gaussians, path, max_psnr_drop=3.0)

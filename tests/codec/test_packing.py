@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.packed import SPACES, small_fit
+from _helpers.packed import SPACES, few_groups, small_fit
 from _helpers.sets import COUNT, SIZE, random_scene
 from eigengs_dr.codec import egs as packed
 from eigengs_dr.codec import packing, rounding
@@ -63,6 +63,7 @@ def test_a_caller_whose_numpy_raises(path):
     assert path.read_bytes() == before
 
 
+@few_groups()
 def test_without_an_image_the_rendering_is_kept(path):
     gaussians, _ = small_fit()
     receipt = eg.pack(gaussians, path)
@@ -73,6 +74,7 @@ def test_without_an_image_the_rendering_is_kept(path):
     assert math.isnan(packed.read_egs(path).psnr)
 
 
+@few_groups()
 def test_light_is_compared_as_it_is_shown(path):
     image = small_fit()[1] ** 3  # dark
     gaussians = eg.fit(image, 60, iterations=40, space="linear", backend="llvm").gaussians
@@ -92,6 +94,7 @@ def test_sections_hold_the_splats_in_their_order(path):
 
 
 @pytest.mark.parametrize(("space", "channels"), SPACES)
+@few_groups()
 def test_all_spaces_and_channels(backend, path, space, channels):
     gaussians = random_scene(3, channels=channels).on(backend, space=space)
     receipt = eg.pack(gaussians, path)
@@ -117,6 +120,7 @@ def edge_cases():
 
 
 @pytest.mark.parametrize("name", edge_cases())
+@few_groups()
 def test_edge_cases(backend, path, name):
     gaussians = edge_cases()[name].on(backend)
     receipt = eg.pack(gaussians, path)
@@ -126,6 +130,7 @@ def test_edge_cases(backend, path, name):
     assert len(receipt.gaussians) == len(gaussians)
 
 
+@few_groups()
 def test_mistakes_leave_the_old_file(path):
     gaussians, image = small_fit()
     path.write_text("old")

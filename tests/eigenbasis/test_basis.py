@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sklearn.decomposition import PCA
 
 from _helpers.errors import one_line
 from _helpers.low_rank import HEIGHT, PIXELS, SIZE, WIDTH, basis_of, family, planes
@@ -19,6 +18,8 @@ from eigengs_dr.image.resize import resample
 
 def exact(images, space="ycbcr"):
     """PCA by scikit-learn in double precision, one for each channel."""
+    from sklearn.decomposition import PCA  # here, because it takes a second
+
     data = planes(images, space).astype(np.float64)
     return [PCA(svd_solver="full").fit(data[:, c]) for c in range(3)]
 

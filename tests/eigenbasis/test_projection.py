@@ -16,7 +16,7 @@ def shown(model, coefficients):
 @pytest.mark.parametrize("target", [21, 23])
 def test_encode_meets_a_bound_with_the_fewest(backend, others, split, target):
     model = small_model(backend, split)
-    for image in others:
+    for image in others[:3]:
         found = model.project(image, target)
         assert eg.psnr(image, shown(model, found), "ycbcr") >= target - 1e-3
         counts = [len(w) for w in found]

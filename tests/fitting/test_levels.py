@@ -7,6 +7,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.halves import objective_of
+from _helpers.packed import few_groups
 from _helpers.photos import coffee
 from _helpers.waves import METHODS
 from eigengs_dr.codec.packing import MSE_WITHOUT_IMAGE
@@ -115,6 +116,7 @@ def test_other_colours(image, color):
     assert np.isfinite(picture_of(found.gaussians[:16])).all()
 
 
+@few_groups()
 def test_packed_levels_are_read_one_by_one(image, result, tmp_path):
     counts = level_counts(256, 3)
     sections = np.diff(counts, prepend=0).tolist()

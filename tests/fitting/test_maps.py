@@ -5,6 +5,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.materials import images
+from _helpers.packed import few_groups
 from eigengs_dr.image.pixels import ImageError
 from eigengs_dr.paper.eigengs import EIGENGS
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
@@ -66,6 +67,7 @@ def test_levels_are_materials_too():
     assert eg.psnr(level["albedo"], images()["albedo"]) > 22
 
 
+@few_groups()
 def test_packing(tmp_path):
     result = eg.fit(images(), 12, iterations=100)
     before = figures(result)

@@ -31,10 +31,9 @@ def check(photo, side, gaussians, steps, seeds=1):
         assert high > low - SLACK, f"{photo}: {few} steps {low:.2f} dB, {many} steps {high:.2f} dB"
 
 
-@pytest.mark.parametrize("photo", ["coffee", "astronaut"])
-def test_more_steps_are_never_worse(photo):
+def test_more_steps_are_never_worse():
     """Up to the 1,000 of the default."""
-    check(photo, 48, 100, (60, 120, 250, 1000))
+    check("coffee", 48, 100, (60, 120, 250, 1000))
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.errors import one_line
 from _helpers.families import small_model
+from _helpers.packed import few_groups
 from _helpers.waves import SPLATS, check_sound, figures, methods, picture
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.fitting.problem import pixels_in
@@ -154,6 +155,7 @@ def test_by_blocks(light, color):
 
 
 @pytest.mark.parametrize("color", ["linear", "log"])
+@few_groups()
 def test_pack(tmp_path, light, color):
     gaussians = eg.fit(light, space=color, encoding="linear", **SMALL).gaussians
     packed = eg.pack(gaussians, tmp_path / "a.egs", light, max_psnr_drop=0.5, encoding="linear")

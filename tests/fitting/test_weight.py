@@ -41,7 +41,7 @@ def test_psnrs_are_weighted(image, disc, space, layers):
     weight = disc
     if layers:
         weight = disc[..., None] * np.array([1, 2, 0])[:layers]
-    found = eg.fit(image, space=space, weight=5 * weight, **QUICK)
+    found = eg.fit(image, 80, 30, space=space, weight=5 * weight)
     mean = weight if weight.ndim == 2 else weight.mean(axis=2)
     first = "rgb" if space == "data" else "ycbcr"
     best = max(found.trace, key=lambda row: row["psnr_ycbcr"])

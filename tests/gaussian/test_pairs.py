@@ -17,6 +17,7 @@ import eigengs_dr as eg
 from _helpers.families import family, small_model
 from _helpers.sets import random_scene
 
+dr.set_thread_count(1)  # others would spin
 SIDE = 32
 image = family(1, side=SIDE)[0]
 folder = Path(tempfile.mkdtemp())
@@ -95,6 +96,7 @@ except ImportError:
 else:
     mi.set_variant("llvm_ad_rgb")
     eg.register_plugins()
+    dr.set_thread_count(1)
     from eigengs_dr.plugins import texture_of
     from _helpers.texture import at
 

@@ -45,17 +45,23 @@ SPACES = {
 """What `psnr` compares, by the space."""
 
 
+@pytest.fixture
+def small_strips(monkeypatch):
+    """70 rows of 90 pixels make two strips."""
+    monkeypatch.setattr("eigengs_dr.image.strips.STRIP_PIXELS", 1 << 12)
+
+
 @pytest.mark.parametrize("layers", [0, 1, 3])
 @pytest.mark.parametrize("space", SPACES)
-def test_psnr_weighs_squared_errors_in_its_space(rng, space, layers):
-    a, b = rng.random((2, 610, 900, 3))  # of several strips
-    weight = rng.uniform(0, 7, (610, 900, layers) if layers else (610, 900))
-    weight[200:] *= rng.random(410)[(slice(None),) + (None,) * (weight.ndim - 1)] > 0.5
+def test_psnr_weighs_squared_errors_in_its_space(rng, small_strips, space, layers):
+    a, b = rng.random((2, 70, 90, 3))
+    weight = rng.uniform(0, 7, (70, 90, layers) if layers else (70, 90))
+    weight[20:] *= rng.random(50)[(slice(None),) + (None,) * (weight.ndim - 1)] > 0.5
     squares = np.square(SPACES[space](a) - SPACES[space](b))
     factors = np.broadcast_to(np.atleast_3d(weight), squares.shape)
     expected = -10 * math.log10(np.average(squares, weights=factors))
     assert psnr(a, b, space, weight) == pytest.approx(expected, abs=1e-5)
-    a[~weight.reshape(610, 900, -1).any(axis=2)] = np.nan
+    a[~weight.reshape(70, 90, -1).any(axis=2)] = np.nan
     assert psnr(a, b, space, weight) == pytest.approx(expected, abs=1e-5)
 
 
@@ -111,8 +117,8 @@ def test_psnr_equals_scikit_image(rng):
     assert psnr(*beyond, "data") == pytest.approx(expected, abs=1e-12)
 
 
-def test_sums_of_several_strips_equal_scikit_image(rng):
-    a = picture(rng, 610, 900).astype(np.float32)
+def test_sums_of_several_strips_equal_scikit_image(rng, small_strips):
+    a = picture(rng, 70, 90).astype(np.float32)
     b = np.clip(noisy(rng, a, 0.05), 0, 1).astype(np.float32)
     settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     expected = metrics.structural_similarity(a, b, data_range=1, channel_axis=2, **settings)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.packed import few_groups
 from _helpers.sets import random_scene
 from eigengs_dr.backend.selection import select
 from eigengs_dr.image.pixels import ImageError
@@ -61,6 +62,7 @@ def test_derivatives_of_the_length(backend, mode):
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@few_groups()
 def test_a_fit_has_unit_normals_and_its_file_too(tmp_path):
     result = eg.fit(bumps(), 60, iterations=10, space="normal")
     np.testing.assert_allclose(lengths(result.image), 1, atol=1e-5)

@@ -19,6 +19,7 @@ import eigengs_dr as eg
 from _helpers.command import assert_refused, run, succeeded
 from _helpers.errors import refused
 from _helpers.families import small_model
+from _helpers.packed import few_groups
 from eigengs_dr.image import remote
 
 pytest.importorskip("fsspec")
@@ -187,6 +188,7 @@ def test_images_of_a_basis_and_a_model(place, photos, tmp_path):
     np.testing.assert_allclose(result.image, eg.picture_of(model.encode(each[0])), atol=1e-4)
 
 
+@few_groups()
 def test_commands_take_urls(photos, tmp_path):
     url, out = f"file://{photos}/3.png", tmp_path / "a.npz"
     few = ("--size", "16x16", "--gaussians", 50, "--components", 2)
@@ -217,6 +219,7 @@ def test_an_output_that_is_a_url_is_refused(photos):
             write(url)
 
 
+@few_groups()
 def test_a_fit_works_where_a_set_does(photos, tmp_path):
     result = eg.fit(photos / "0.png", **QUICK)
     want = eg.render(result.gaussians).numpy()

@@ -115,12 +115,12 @@ def test_reverse_mode_equals_finite_differences(double, shape, weighted):
     dr.enable_grad(leaves)
     dr.backward(-2 * eg.ssim(*leaves, weight))
     for number, leaf in enumerate(leaves):
-        expected = np.empty(shape)
-        for place in np.ndindex(shape):
+        found = dr.grad(leaf).numpy()
+        for place in [*np.ndindex(shape)][::5]:
             moves = np.zeros((2, *shape))
             moves[(number, *place)] = 1
-            expected[place] = slope(lambda u, v: -2 * eg.ssim(a + u, b + v, weight), *moves)
-        np.testing.assert_allclose(dr.grad(leaf).numpy(), expected, atol=1e-8, rtol=1e-6)
+            expected = slope(lambda u, v: -2 * eg.ssim(a + u, b + v, weight), *moves)
+            assert found[place] == pytest.approx(expected, abs=1e-8, rel=1e-6)
 
 
 @pytest.mark.parametrize("wanted", [(1, 0), (0, 1), (1, 1)])

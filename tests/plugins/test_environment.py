@@ -73,7 +73,7 @@ class TestPicture:
                 bake_environment(g, 32, rows)
 
     @in_all
-    @pytest.mark.parametrize("name", TURNS)
+    @pytest.mark.parametrize("name", ["as it is", "about all"])
     def test_is_that_of_an_envmap(self, variant, name):
         """At texels; spectra differ, and so do their pictures by a little."""
         g, placed = sky(), {"to_world": turn(name), "scale": 1.5}
@@ -386,8 +386,13 @@ class TestDerivatives:
         expected = (values[0] - values[1]) / 0.4
         assert (gradient * along).sum() == pytest.approx(expected, rel=0.05)
 
-    @pytest.mark.parametrize("integrator", ["direct", "prb"])
-    @pytest.mark.parametrize("name", ["mean", "factor", "color", "background", "scale"])
+    @pytest.mark.parametrize(
+        ("integrator", "name"),
+        [
+            *(("direct", name) for name in ("mean", "factor", "color", "background", "scale")),
+            *(("prb", name) for name in ("mean", "color")),
+        ],
+    )
     def test_forward_mode_is_backward_mode(self, integrator, name):
         found = []
         for mode in ("forward", "backward"):
@@ -452,21 +457,21 @@ class TestChanges:
         frozen.clear()
 
     @pytest.mark.parametrize("name", ["mean", "factor", "color", "background"])
-    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -5.0, 1e30])
-    def test_broken_parameters_leave_finite_light(self, name, value):
+    def test_broken_parameters_leave_finite_light(self, name):
         emitter = mi.load_dict(environment_of(sky(count=8, size=(32, 16))))
         parameters = mi.traverse(emitter)
-        broken = np.array(parameters[name])
-        broken[: max(1, len(broken) // 4)] = value
-        parameters[name] = mi.TensorXf(broken)
-        parameters.update()
-        found = seen(emitter, texels(32, 16))
-        ds, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f, 50), uniform(50))
-        if value != 1e30:
-            assert np.isfinite(found).all()
-        assert not np.isnan(found).any()
-        assert np.isfinite(np.array(ds.d)).all()
-        assert found.min() >= 0
+        start = np.array(parameters[name])
+        for value in (np.nan, np.inf, -np.inf, 0.0, -5.0, 1e30):
+            broken = start.copy()
+            broken[: max(1, len(broken) // 4)] = value
+            parameters[name] = mi.TensorXf(broken)
+            parameters.update()
+            found = seen(emitter, texels(32, 16))
+            ds, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f, 50), uniform(50))
+            assert np.isfinite(found).all() or value == 1e30, value
+            assert not np.isnan(found).any(), value
+            assert np.isfinite(np.array(ds.d)).all(), value
+            assert found.min() >= 0, value
 
 
 class TestMemory:

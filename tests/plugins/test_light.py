@@ -7,6 +7,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.chi_square import assert_density
 from _helpers.lit_spheres import directions, photos
+from _helpers.packed import few_groups
 from _helpers.texture import backend, mi, picture, small_scene, texel_centres
 from eigengs_dr.image.color import to_linear
 
@@ -44,6 +45,7 @@ def test_a_texture_shows_the_model_under_its_light(saved):
         np.testing.assert_allclose(found, to_linear(expected), atol=1e-3)
 
 
+@few_groups()
 def test_packed_models_are_read(saved, tmp_path):
     eg.pack(eg.Relightable.load(saved, backend()), tmp_path / "m.egs", max_psnr_drop=0.1)
     packed = mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "m.egs")})

@@ -364,6 +364,7 @@ def plain(mi, folder, texture, **others):
     return {**room(mi, folder), "integrator": {"type": "path"}, "cube": wall, **others}
 
 
+@pytest.mark.exr
 @pytest.mark.parametrize("kind", ["tensor", "bitmap"])
 def test_pixels_in_memory(folder, tmp_path, kind):
     """They become sets; those that stay become files; and the scene of the caller still works."""
@@ -399,6 +400,7 @@ def test_a_dictionary_with_an_integrator_in_python(folder, tmp_path):
             eg.fit_for_scene(given, "cube.bsdf.reflectance", folder / "photo.png")
 
 
+@pytest.mark.exr
 def test_a_lamp_above_1_also_lights_by_what_is_hidden(folder, tmp_path):
     light = 6 * eg.sample("coffee")[:384:4, :384:4] ** 2
     mi.Bitmap(light).write(str(folder / "lamp.exr"))
@@ -435,6 +437,7 @@ def test_a_soft_mask_and_what_shows_through_it(folder, tmp_path):
     assert min(found.psnr) > 31
 
 
+@pytest.mark.exr
 def test_meshes_in_memory_are_refused(folder, tmp_path):
     scene = room(mi, folder)
     scene["cube"] = mi.load_dict({"type": "ply", "filename": str(folder / "cube.ply")})

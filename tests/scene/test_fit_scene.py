@@ -1,6 +1,7 @@
 """No more Gaussians than cameras resolve: the target, the search, and what a renderer then sees."""
 
 import signal
+from functools import cache
 
 import numpy as np
 import pytest
@@ -103,6 +104,12 @@ def fitted(*cameras, image=None, space="linear", **others):
     return eg.fit_for_scene(scene_of(*cameras, **others), NAME, image, **settings)
 
 
+@cache
+def seen_from(distance):
+    """A fit of the poster for one camera in front of it."""
+    return fitted(camera([0, 0, distance]))
+
+
 class TestFit:
     def test_few_gaussians_for_a_large_smooth_target(self):
         large = gaussian_filter(np.kron(photo(), np.ones((4, 4, 1)))[:189, :187], (8, 8, 0))
@@ -116,20 +123,20 @@ class TestFit:
     @pytest.mark.parametrize("distance", [1.0, 2.7])
     def test_a_renderer_sees_what_was_asked_for(self, distance):
         # The poster fills the picture, or nearly: what is around it is the same for both.
-        found = fitted(camera([0, 0, distance]))
+        found = seen_from(distance)
         assert min(found.psnr) >= BOUND
         assert seen_by_a_renderer(found, [0, 0, distance], photo()) > BOUND - 1
         assert (found.gaussians.width, found.gaussians.height) == (48, 48)
         assert found.gaussians.space == "linear"
 
     def test_the_fewest_that_are_enough_are_taken(self):
-        found = fitted(camera([0, 0, 2.7]))
+        found = seen_from(2.7)
         enough = [count for count, psnr in found.tried if psnr >= BOUND]
         assert len(found.gaussians) <= min(enough)  # without those that no camera sees
         assert any(psnr < BOUND for _, psnr in found.tried) and len(found.tried) < 30
 
     def test_far_away_fewer_are_enough(self):
-        counts = [len(fitted(camera([0, 0, z])).gaussians) for z in (2.7, 7.0, 20.0)]
+        counts = [len(seen_from(distance).gaussians) for distance in (2.7, 7.0, 20.0)]
         assert counts[0] > 2 * counts[1] > 4 * counts[2]
 
     def test_texels_beyond_what_cameras_resolve_change_nothing(self):
@@ -146,7 +153,7 @@ class TestFit:
         assert counts[1] == pytest.approx(counts[0], rel=0.15)
 
     def test_none_is_spent_on_what_is_hidden(self):
-        whole = fitted(camera([0, 0, 5.0]))
+        whole = seen_from(5.0)
         half = fitted(camera([0, 0, 5.0]), board=board(0.0, 1.5))
         assert len(half.gaussians) < 0.75 * len(whole.gaussians)
         assert half.gaussians.to_arrays()["mean"][:, 0].max() < 30
