@@ -45,8 +45,8 @@ def pages_of(checkout: Path) -> list[Path]:
 def outdated(checkout: Path, draw: Callable[[Figure], bytes] = chart_file) -> dict[Path, bytes]:
     """Return the pages and charts that are out of date, with what they should hold.
 
-    `draw` makes the file of a chart. A chart drawn by another version of matplotlib counts as up to date. `ValueError` if a page
-    names a table, a figure or a chart that no row holds.
+    `draw` makes the file of a chart. A chart drawn by another version of matplotlib counts as up to
+    date. `ValueError` if a page names a table, a figure or a chart that no row holds.
     """
     parts, charts = contents(checkout / ROWS, draw)
     right, used = dict[Path, bytes](), set[str]()
