@@ -4,6 +4,7 @@ Needs the package to be installed, as ``make setup`` does.
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -45,6 +46,14 @@ def copy_of_the_source(folder):
     return shutil.copytree(ROOT, folder / "source", ignore=hidden)
 
 
+def test_all_folders_are_packages():
+    """Others would be missing in a wheel."""
+    listed = re.findall(r'^    "(eigengs_dr[\w.]*)",$', (ROOT / "pyproject.toml").read_text(), re.M)
+    made = {path.parent.relative_to(ROOT) for path in ROOT.glob("eigengs_dr/**/*.py")}
+    assert {".".join(folder.parts) for folder in made} | {"eigengs_dr.plugins"} == {*listed}
+
+
+@pytest.mark.slow
 def test_wheel(tmp_path):
     source = copy_of_the_source(tmp_path)
     build = ["pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", str(tmp_path)]

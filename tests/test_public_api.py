@@ -79,6 +79,7 @@ if sys.platform == "linux":
     assert set(process.stdout.splitlines()) == {"[]"}
 
 
+@pytest.mark.slow
 def test_libllvm_is_chosen_before_names_are_imported_at_once():
     """With EAGER_IMPORT, `lazy_loader` imports all names, and so Dr.Jit, with the package."""
     code = """

@@ -69,7 +69,7 @@ def test_sets_in_a_folder(set_file, trained, tmp_path):
     assert figures["bytes"] == (tmp_path / "packed" / "a.egs").stat().st_size
     shown = run("info", fits)
     assert shown.exit_code == 2 and shown.stdout.count("kind ") == 1
-    image = run("pack", fits, "-o", tmp_path / "x", "--image", "photo.png")
+    image = run("pack", fits, "-o", tmp_path / "x", "--image", set_file[1])
     assert_refused(image, "--image and --map belong to one set")
     assert_refused(run("render", fits, "-o", tmp_path / "x.png"), "need a folder")
 

@@ -18,7 +18,6 @@ import pytest
 import tifffile
 from distributed import Client, LocalCluster
 from PIL import Image
-from threadpoolctl import threadpool_limits
 
 import eigengs_dr as eg
 from _helpers import clusters
@@ -394,7 +393,7 @@ def test_workers_of_this_machine_are_set_up(client):
 @pytest.mark.parametrize("task", [clusters.state, clusters.fail])
 def test_a_cluster_of_others_is_as_it_was(task):
     """After a run, and after an error; their numbers of threads count during a task alone."""
-    with threadpool_limits(2), user_cluster() as (_, client):
+    with user_cluster() as (_, client):
         dr.set_thread_count(2)
         executor = executor_for(client)
         before = client.run(clusters.worker_state)

@@ -303,4 +303,4 @@ def test_an_interrupt_after_the_last_round_keeps_the_best_set_before_it():
 
 @pytest.mark.parametrize("count", [1, 9])
 def test_sets_too_small_for_a_share_keep_their_gaussians(count):
-    assert len(eg.fit(eg.sample("coffee")[:32, :32], count).gaussians) == count
+    assert len(eg.fit(eg.sample("coffee")[:32, :32], count, 200).gaussians) == count

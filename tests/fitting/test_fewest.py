@@ -193,8 +193,7 @@ def searched_at_rest(measure):
     return result, steps
 
 
-@pytest.mark.parametrize("octave", [2.0, 4.0, 9.0])
-@pytest.mark.parametrize("needed", [60, 150])
+@pytest.mark.parametrize(("octave", "needed"), [(2.0, 60), (9.0, 60), (4.0, 150)])
 def test_a_search_tries_more_than_once_and_fits_once(octave, needed):
     """Where only their number counts, of which the search begins with 60."""
     _, steps = searched_at_rest(lambda g, _: octave * np.log2(len(g) / needed))

@@ -39,7 +39,7 @@ def test_the_squared_error_is_that_of_a_fit():
         def loss(picture, step, image=image):
             return dr.mean(dr.square(picture - type(picture)(image)), axis=None)
 
-        fit, found = (eg.fit(image, 200, 300, space="rgb", loss=f) for f in (None, loss))
+        fit, found = (eg.fit(image, 200, 500, space="rgb", loss=f) for f in (None, loss))
         differences.append(found.psnr_rgb - fit.psnr_rgb)
     assert np.mean(differences) == pytest.approx(0, abs=0.1)
     assert found.loss == pytest.approx(float(np.mean((found.image - IMAGE) ** 2)), rel=1e-3)
@@ -48,8 +48,8 @@ def test_the_squared_error_is_that_of_a_fit():
 
 
 def test_another_loss_is_lower_than_after_a_fit():
-    fit = eg.fit(IMAGE, 200, 400, space="rgb")
-    found = eg.fit(IMAGE, 200, 400, space="rgb", loss=absolute)
+    fit = eg.fit(IMAGE, 200, 200, space="rgb")
+    found = eg.fit(IMAGE, 200, 200, space="rgb", loss=absolute)
     assert found.loss < np.abs(fit.image - IMAGE).mean() < found.trace[0]["loss"]
 
 

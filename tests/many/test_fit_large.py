@@ -35,6 +35,15 @@ def long():
     return eg.fit_large(mosaic(128), **LONG)
 
 
+HOLED = FEW | {"gaussians": 200, "block": 32, "iterations": 32}
+
+
+@pytest.fixture(scope="module")
+def small():
+    """One of four small blocks."""
+    return eg.fit_large(mosaic(64), **HOLED)
+
+
 def near_borders(side, block, distance):
     """Which pixels of a square lie near a border of blocks."""
     number = -(-side // block)
@@ -304,12 +313,10 @@ def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
 
 
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
-def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
+def test_a_round_with_a_hole_is_taken_again(tmp_path, part, small):
     """In any round, a run goes on from the last one that is complete, with the same bits."""
-    settings = FEW | {"gaussians": 200, "block": 32, "iterations": 32}
-    whole = eg.fit_large(mosaic(64), **settings)
     output, rows = tmp_path / "a.npz", []
-    stop_after(output, mosaic(64), "fit", part, settings)
+    stop_after(output, mosaic(64), "fit", part, HOLED)
     for path in (tmp_path / "a.npz.checkpoint").glob("fit?-2.npz"):
         path.unlink()
 
@@ -317,7 +324,7 @@ def test_a_round_with_a_hole_is_taken_again(tmp_path, part):
         if row.status == "fit":
             rows.append(done)
 
-    assert_same_bits(whole, eg.fit_large(mosaic(64), output, progress=note, **settings))
+    assert_same_bits(small, eg.fit_large(mosaic(64), output, progress=note, **HOLED))
     assert rows == sorted(rows) and rows[-1] == 4 * 32
 
 

@@ -65,11 +65,11 @@ def test_a_texture_is_recovered():
     scene, photos = wall(GREY), photos_of(wall(true_texture()))
     loss = photo_loss(scene, NAME, photos)
     assert len(repr(loss)) < 300 and "\n" not in repr(loss)
-    found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=120)
+    found = eg.fit(loss=loss, size=(32, 32), gaussians=60, iterations=60)
     inner = np.s_[4:-4, 4:-4]
     error = np.mean((found.image[inner] - eg.image.color.to_coded(true_texture())[inner]) ** 2)
     assert error < 1e-3
-    assert found.gaussians.space == "linear" and found.iterations == 120
+    assert found.gaussians.space == "linear" and found.iterations == 60
 
 
 def test_a_map_of_normals_starts_flat():
@@ -102,7 +102,7 @@ def test_held_out_pixels_choose_the_number():
 
     scene, photos = wall(GREY), photos_of(wall(true_texture()))
     loss = photo_loss(scene, NAME, photos, held_out=0.2)
-    found = eg.fit(loss=loss, size=(32, 32), iterations=60, space="linear")
+    found = eg.fit(loss=loss, size=(32, 32), iterations=30, space="linear")
     texels, *rows = found.trace
     same = [row for row in rows if row["iteration"] == texels["iteration"]]
     tried = {row["gaussians"]: row["loss"] for row in same}

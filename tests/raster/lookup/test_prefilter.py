@@ -59,7 +59,7 @@ class TestSumFiltered:
     @pytest.mark.parametrize("k", range(len(FOOTPRINTS)))
     def test_sees_what_brute_force_sees(self, backend, wrap, k):
         """Exact but for the tails of footprints, and near corners: see `inside_share`."""
-        scene, points = random_scene(1, 60), around(some_points(24), wrap)
+        scene, points = random_scene(1, 60), around(some_points(), wrap)
         scene = scene._replace(mean=0.2 * np.array(SIZE) + 0.6 * scene.mean)
         corner = np.abs(points - np.round(points / SIZE) * SIZE).max(axis=1) < 3
         exact = brute_force(scene, wrap, points, FOOTPRINTS[k])
