@@ -102,9 +102,9 @@ def contents(
 ) -> tuple[dict[str, str], dict[str, bytes]]:
     """Return the Markdown for each mark that a page can hold, and the charts by their names."""
     rows: dict[str, list[Row]] = {}
-    for row in read(path):
+    for row in (every := read(path)):
         rows.setdefault(row["bench"], []).append(row)
-    parts = {"table: all.runs": _runs(read(path)), **_tables_measured_once(rows.get("once", []))}
+    parts = {"table: all.runs": _runs(every), **_tables_measured_once(rows.get("once", []))}
     charts = {name: draw(figure) for name, figure in overview.charts(rows).items()}
     for bench in QUESTIONS:
         if measured := rows.get(bench):

@@ -44,9 +44,9 @@ def test_noise_is_out_of_reach():
 @pytest.mark.parametrize("space", ["ycbcr", "rgb"])
 def test_the_target_is_met_in_its_space(space):
     image = coffee(SIDE)
-    plain = fit(image, 100, 300)
+    plain = fit(image, gaussians=100)
     reached = plain.trace[-1][f"psnr_{space}"]
-    found = fit(image, target_psnr=Goal(reached, space), iterations=300)
+    found = fit(image, target_psnr=Goal(reached, space))
     assert found.stopped == "met"
     assert eg.psnr(image, found.image, space=space) >= reached
     assert len(found.gaussians) <= 115
