@@ -186,6 +186,11 @@ def slope_of(texture: Texture, value: Float) -> Float:
     return dr.select(within, type(value)(texture.space.slope(value)), 0)
 
 
+def unpolarized(light: mi.UnpolarizedSpectrum) -> mi.Spectrum:
+    """Return unpolarized light as the spectrum of the variant."""
+    return mi.depolarizer(light) if mi.is_polarized else light
+
+
 def luminance(color: list) -> Float:
     """Return the luminance of three channels, or the single channel."""
     return color[0] if len(color) == 1 else mi.luminance(mi.Color3f(*color))

@@ -20,7 +20,7 @@ from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.raster.lookup.points import axes_of, fold
 
 from . import properties
-from .color import luminance, upsample
+from .color import luminance, unpolarized, upsample
 from .cone import PIXEL, no_metric
 from .emission import Spacing, light_at, make_survey
 from .importance import SIDE, importance_of
@@ -144,13 +144,13 @@ def gaussian_environment() -> type:
 
         @collector_off()
         def eval(self, si: mi.SurfaceInteraction3f, active: Mask = True) -> mi.Spectrum:
-            return _emitted(self._light(self._uv(-si.wi), si.wavelengths, active))
+            return unpolarized(self._light(self._uv(-si.wi), si.wavelengths, active))
 
         @collector_off()
         def eval_direction(
             self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Mask = True
         ) -> mi.Spectrum:
-            return _emitted(self._light(self._uv(ds.d), it.wavelengths, active))
+            return unpolarized(self._light(self._uv(ds.d), it.wavelengths, active))
 
         def _uv(self, d: mi.Vector3f) -> mi.Point2f:
             """Return the point of the picture that lies in a direction of the world."""
@@ -225,7 +225,7 @@ def gaussian_environment() -> type:
             ds.delta, ds.emitter, ds.d, ds.dist = False, mi.EmitterPtr(self), d, far
             active = active & (ds.pdf > 0)
             light = self._light(uv, it.wavelengths, active)
-            return ds, _emitted(light * dr.select(active, 1 / ds.pdf, 0))
+            return ds, unpolarized(light * dr.select(active, 1 / ds.pdf, 0))
 
         @collector_off()
         def pdf_direction(
@@ -262,13 +262,13 @@ def gaussian_environment() -> type:
             self, si: mi.SurfaceInteraction3f, sample: Float, active: Mask = True
         ) -> tuple:
             if not mi.is_spectral:
-                return mi.Color0f(), _emitted(self._light(si.uv, si.wavelengths, active))
+                return mi.Color0f(), unpolarized(self._light(si.uv, si.wavelengths, active))
             count = dr.size_v(mi.UnpolarizedSpectrum)
             shifted = [sample + k / count for k in range(count)]
             shifted = type(si.wavelengths)([dr.select(s >= 1, s - 1, s) for s in shifted])
             wavelengths, weight = self.daylight.sample_spectrum(si, shifted, active)
             light = self._light(si.uv, wavelengths, active, white=False)
-            return wavelengths, _emitted(light * weight)
+            return wavelengths, unpolarized(light * weight)
 
         def sample_position(self, time: Float, sample: mi.Point2f, active: Mask = True) -> tuple:
             return dr.zeros(mi.PositionSample3f), mi.Float(math.nan)  # as an envmap: it has none
@@ -296,8 +296,3 @@ def gaussian_environment() -> type:
             )
 
     return GaussianEnvironment
-
-
-def _emitted(light: mi.UnpolarizedSpectrum) -> mi.Spectrum:
-    """Return unpolarized light as the spectrum of the variant."""
-    return mi.depolarizer(light) if mi.is_polarized else light

@@ -17,7 +17,7 @@ from eigengs_dr.relight.model import Relightable
 from eigengs_dr.relight.planes import directions
 
 from . import properties
-from .color import luminance, upload_table, upsample
+from .color import luminance, unpolarized, upload_table, upsample
 from .gaussian_texture import gaussian_texture
 
 RESOLUTION = 32
@@ -96,12 +96,13 @@ def gaussian_relightable() -> type:
             active: Mask = True,
         ) -> mi.Spectrum:
             active = active & self._seen(ctx, si, wo)
-            planes = [*self.planes.values(si, active), mi.Float(1)]
+            values = self.planes.values(si, active)[: self.planes.channels]  # two get a third
+            planes = [*values, mi.Float(1)]
             table = self.factors.eval(place_of(light_of(si, wo)), active)
             factors = [table[c * len(planes) : (c + 1) * len(planes)] for c in range(3)]
             codes = [sum(f * p for f, p in zip(fs, planes, strict=True)) for fs in factors]
             light = mi.Color3f(*RGB.to_lights(codes)) * (self.scale / math.pi)
-            return dr.select(active, self._spectrum(light, si), 0)
+            return unpolarized(dr.select(active, self._spectrum(light, si), 0))
 
         @collector_off()
         def pdf(
@@ -131,18 +132,20 @@ def gaussian_relightable() -> type:
             bs.pdf, bs.eta = density(bs.wo), 1.0
             bs.sampled_type, bs.sampled_component = mi.UInt32(+self.m_components[0]), 0
             active = active & self._seen(ctx, si, bs.wo) & (bs.pdf > 0)
-            value = self.eval(ctx, si, bs.wo, active) / bs.pdf
-            return bs, dr.select(active, value, 0)
+            weight = dr.select(active, 1 / bs.pdf, 0)
+            return bs, self.eval(ctx, si, bs.wo, active) * weight
 
         def _seen(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> Mask:
             """Return whether both directions are above the surface."""
             above = (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
             return above & ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
 
-        def _spectrum(self, light: mi.Color3f, si: mi.SurfaceInteraction3f) -> mi.Spectrum:
+        def _spectrum(
+            self, light: mi.Color3f, si: mi.SurfaceInteraction3f
+        ) -> mi.UnpolarizedSpectrum:
             if self.spectra is not None:
                 return upsample(light, si.wavelengths, self.spectra)
-            return luminance([*light]) if mi.is_monochromatic else light
+            return mi.UnpolarizedSpectrum(luminance([*light]) if mi.is_monochromatic else light)
 
         # --- Description ---------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ import eigengs_dr as eg
 
 from ..backend.selection import select
 from ..backend.types import Record
+from ..image.color import exposed
 from ..image.io import displayed
 from ..image.space import SPACES, YCBCR, space_of
 from . import options
@@ -214,7 +215,7 @@ def _settings(choices: dict[str, Any], basis: str | None, backend: str | None) -
         iterations=choices["iterations"],
         target_psnr=goal,
         start=start,
-        space=choices["space"],
+        space=choices["space"] or (start.gaussians.space if start else None),
         method=method,
         seed=choices["seed"],
         backend=backend,
@@ -316,7 +317,8 @@ def _similarity(image: Any, result: eg.Fit) -> Record:
     image = displayed(image, space)
     if not space.has_codes(image):
         return {}
-    pair = image, result.image
+    exposure = space.exposure(image)
+    pair = exposed(image, exposure), exposed(result.image, exposure)
     ms_ssim = eg.ms_ssim(*pair, space="ycbcr" if space.is_color else "data")
     return {"ssim": eg.ssim(*pair), "ms_ssim": ms_ssim}
 
@@ -328,7 +330,9 @@ def _comparison(image: Any, gaussians: eg.Gaussians, drawn: Any) -> Any:
     from ..viewer.pictures import comparison
 
     if not gaussians.maps:
-        return comparison(displayed(image, gaussians.space), drawn, gaussians)
+        original = displayed(image, gaussians.space)
+        exposure = gaussians.space.exposure(original)
+        return comparison(exposed(original, exposure), exposed(drawn, exposure), gaussians)
     rows = []
     for m in gaussians.maps:
         original = displayed(image[m.name], m.space)[..., : m.channels]
@@ -386,14 +390,14 @@ def _exit_code(records: list[Record], expected: int, settings: FitOptions) -> in
     for record in records:
         if record["stopped"] != "out of reach":
             continue
-        spaces = record.get("maps") or [{"space": settings.space} | record]
-        psnrs = [(*_target_figure(m, settings), m.get("name")) for m in spaces]
+        maps = record.get("maps")
+        psnrs = [(*_target_figure(m, settings), m.get("name")) for m in maps or [record]]
         figure, value, name = min(psnrs, key=lambda entry: entry[1])
         assert settings.goal
         print_message(
-            f"{record['output' if name else 'input']}: {figure} of {settings.goal.psnr:g} dB is "
+            f"{record['output' if maps else 'input']}: {figure} of {settings.goal.psnr:g} dB is "
             f"out of reach: {record['gaussians']} Gaussians reach {value:.2f}"
-            + (f" in {name}" if name else "")
+            + (f" in {name}" if maps else "")
             + "; lower --target-psnr, or raise --max-gaussians or --iterations"
         )
     return MISSED if "out of reach" in stops else 0
@@ -440,7 +444,7 @@ def _fit_several(
         print_message(f"interrupted; {done}; repeat the command to fit the others")
     space, seconds = settings.space or "ycbcr", time.perf_counter() - started
     known = [{k: v for k, v in vars(row).items() if v not in (None, "")} for row in rows]
-    records = [{"stopped": record["status"]} | record for record in known]
+    records = [{"stopped": record["status"], "space": space} | record for record in known]
     return records, _summary_of_all(rows, folder, seconds, space)
 
 

@@ -296,7 +296,7 @@ class EigenGS:
         check_coding(colors, mean, target_psnr)
         work = partial(_encode_all, model=self, options=(colors, mean, target_psnr))
         options = {"colors": colors, "mean": mean, "target_psnr": target_psnr}
-        options |= {"model": fingerprint(self.gaussians)}
+        options |= {"model": fingerprint(self)}
         job = Job(work, options=options, given=list(options))
         return run_images(images, output, overwrite, job, progress, client)
 

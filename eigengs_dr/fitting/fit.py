@@ -193,7 +193,7 @@ def fit(
         has those of the papers.
     seed : int, optional
         Seed of all random numbers: of the noise by which means and shapes are perturbed, and of
-        where Gaussians are placed. Seeds that are equal modulo 2^32 are equal.
+        where Gaussians are placed.
     backend : {"llvm", "cuda"}, optional
         By default "cuda" if there is a GPU.
     progress : bool or callable, optional

@@ -22,7 +22,7 @@ from ..backend.arrays import ArrayTypes, types_of, upload
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.channels import TextureMap
 from ..gaussian.gaussians import Gaussians, whole
-from ..image.color import to_coded, to_linear
+from ..image.color import exposed
 from ..image.space import DATA, Affine, Extent, Space
 from ..raster.binning.lists import TileLists
 from ..raster.binning.tiles import Grid
@@ -265,8 +265,7 @@ class Channels(NamedTuple):
             if not codes:
                 units = [Affine(1 / self.factor, u.offset / u.scale) for u in units]
         else:
-            lit = zip(images, exposures, strict=True)
-            images = [p if e == 1 else to_coded(to_linear(p) * np.float32(e)) for p, e in lit]
+            images = [exposed(*pair) for pair in zip(images, exposures, strict=True)]
             shown = np.stack(images) if len(images) > 1 else images[0]
         weights = None
         if weight is not None:

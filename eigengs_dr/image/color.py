@@ -139,6 +139,11 @@ def to_coded(linear: Samples) -> Samples:
     return select(linear <= 0.0031308, linear * 12.92, curved)
 
 
+def exposed(pixels: FloatImage, exposure: float) -> FloatImage:
+    """Multiply the light of sRGB pixels."""
+    return pixels if exposure == 1 else to_coded(to_linear(pixels) * np.float32(exposure))
+
+
 def slope_to_linear(coded: Samples) -> Samples:
     """Return the derivative of `to_linear`, elementwise."""
     select, maximum, power = _functions(coded)

@@ -96,6 +96,11 @@ with relative errors (0.1 and 0.01 added to I), and at 27.0 dB with the slope of
 let bright spots vanish, which costs at most 1 per pixel, rather than spill on dark pixels."""
 
 
+def exposure_of(mean: float) -> float:
+    """Return the factor that brings light of a mean into the range of a display."""
+    return 1.0 if mean <= 0 or 1 / VISIBLE <= mean / GREY <= VISIBLE else GREY / mean
+
+
 class Space(str):
     """The space of the channels of a set; the text is its name. This one is gamma-encoded RGB.
 
@@ -258,10 +263,7 @@ class Space(str):
 
         It is 1 unless light may exceed 1 and its mean is far from `GREY`, see `VISIBLE`.
         """
-        if self.bounded:
-            return 1.0
-        mean = float(color.to_linear(pixels).mean(dtype=np.float64))
-        return 1.0 if mean <= 0 or 1 / VISIBLE <= mean / GREY <= VISIBLE else GREY / mean
+        return 1.0 if self.bounded else exposure_of(Extent.of(color.to_linear(pixels)).mean)
 
     def comparable(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
         """Convert values to those whose squared errors a packed file keeps small."""

@@ -46,6 +46,7 @@ from ..fitting.solve import solve
 from ..fitting.state import State, begin
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
+from ..image.color import to_linear
 from ..image.pixels import ImageError
 from ..image.space import DATA, YCBCR, Affine, Extent, Space
 from ..raster.render import to_tensor
@@ -68,6 +69,8 @@ class BlockSettings(NamedTuple):
         The unit of the fit.
     is_of_codes : bool
         Whether data is in [0, 1]. Otherwise the peak is the range, and psnr_rgb is NaN.
+    exposure : float
+        Factor of light in comparisons, see `Space.exposure`.
     background : tuple of float
         Value of every pixel before the Gaussians are added, in the unit of the fit.
     """
@@ -77,6 +80,7 @@ class BlockSettings(NamedTuple):
     spacing: float
     affine: Affine = Affine()
     is_of_codes: bool = True
+    exposure: float = 1.0
     background: tuple[float, ...] = ()
 
     @property
@@ -122,15 +126,16 @@ class BlockTask(NamedTuple):
     part: range = range(0)
 
 
-def measure_extent(task: BlockTask, settings: BlockSettings) -> Extent:
-    """Return the extent of the values of a block, and reject invalid pixels."""
+def measure_extents(task: BlockTask, settings: BlockSettings) -> tuple[Extent, Extent]:
+    """Return the extents of the values and of the light of a block, and reject invalid pixels."""
     pixels, space = task.window.read()[task.block.core], settings.space
     bright = space.above_white
     if bright is not space and task.window.encoding == "linear" and pixels.max() > WHITE:
         raise ImageError(f"{task.window.name}: light above 1; give the space {bright!r}")
     if not space.is_color:
         space.check(pixels)  # no other range makes normals
-    return Extent.of(space.values_of(pixels))
+    values = Extent.of(space.values_of(pixels))
+    return values, values if space.bounded else Extent.of(to_linear(pixels))
 
 
 def survey(task: BlockTask, settings: BlockSettings) -> NDArray[np.float64]:

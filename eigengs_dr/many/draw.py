@@ -13,6 +13,7 @@ from ..backend.types import Values
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.region import crop
+from ..image.color import exposed
 from ..image.formats import TIFF_SUFFIXES
 from ..image.io import bits_of, dtype_of, to_file, write_pixels
 from ..image.metrics import squared_error
@@ -158,6 +159,7 @@ def block_errors(task: BlockTask, settings: BlockSettings) -> tuple[float, float
         scaled = {name: data.arrays[name] * np.float32(affine.scale) for name in COLORS}
         scaled["background"] += np.float32(affine.offset)
         rendered = draw(data._replace(arrays=data.arrays | scaled), backend)
+        rendered, pixels = (exposed(shown, settings.exposure) for shown in (rendered, pixels))
         floats = squared_error(rendered, pixels, data.space.figure)
         return floats, squared_error(rendered, pixels, "rgb")
     # Comparing in the unit of the fit avoids cancellation.

@@ -27,7 +27,7 @@ from ..gaussian.file import SetData, check_suffix, write_set
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.region import crop
 from ..image.metrics import psnr_from_mse
-from ..image.space import Extent, space_of
+from ..image.space import Extent, exposure_of, space_of
 from ..storage.atomic import require_writable
 from ..storage.checkpoint import Checkpoint, open_checkpoint
 from .block import (
@@ -36,7 +36,7 @@ from .block import (
     exchange_rounds,
     find_density,
     fit_block,
-    measure_extent,
+    measure_extents,
     place_in_block,
     survey,
 )
@@ -332,9 +332,12 @@ class LargeRun:
         The image is read twice, because the unit depends on all blocks.
         """
         self._begin("survey", 2 * len(self.blocks))
-        extent = reduce(Extent.joined, self._each(measure_extent, self._task))
+        extents, space = self._each(measure_extents, self._task), self.settings.space
+        values, light = (reduce(Extent.joined, part) for part in zip(*extents, strict=True))
         self.settings = self.settings._replace(
-            affine=self.settings.space.unit(extent), is_of_codes=extent.is_of_codes
+            affine=space.unit(values),
+            is_of_codes=values.is_of_codes,
+            exposure=1.0 if space.bounded else exposure_of(light.mean),
         )
         figures = np.array(self._each(survey, self._task))
         if self.checkpoint is not None:

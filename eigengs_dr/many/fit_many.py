@@ -154,7 +154,7 @@ def _settings_of(settings: FitOptions) -> dict[str, Any]:
         options["gaussians"] = list(settings.gaussians)
     if settings.start is not None:
         start: Any = settings.start
-        options["start"] = fingerprint(set_in(start))
+        options["start"] = fingerprint(start)
     return options
 
 

@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..backend.types import Record
+from ..fitting.method import Model
+from ..fitting.start import set_in
 from ..gaussian.file import read_figures, read_head
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import list_images
@@ -377,9 +379,9 @@ def read_manifest(path: Path) -> tuple[dict[str, Record], bool]:
     return rows, not rest
 
 
-def fingerprint(gaussians: Gaussians) -> str:
-    """Return a hash that identifies a set among options."""
-    arrays = gaussians.to_arrays().values()
+def fingerprint(start: Gaussians | Model) -> str:
+    """Return a hash that identifies a set or a model among options."""
+    arrays = *set_in(start).to_arrays().values(), *getattr(start, "weights", ())
     data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     return hashlib.sha256(data).hexdigest()[:16]
 

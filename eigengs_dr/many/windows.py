@@ -170,10 +170,10 @@ def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixe
     absolute = os.path.abspath(path)
     if path.suffix.lower() == ".npy":
         try:
-            shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
+            stored = np.load(path, mmap_mode="r", allow_pickle=False)
         except (ValueError, EOFError, OSError) as error:
             raise ImageError(f"{path}: not a readable .npy file ({error})") from None
-        return shape, absolute, "srgb"
+        return stored.shape, absolute, "linear" if stored.dtype.kind == "f" else "srgb"
     header = read_header(path)
     shape = header.height, header.width, header.channels
     _check_sides(str(path), shape)

@@ -11,6 +11,7 @@ Photos count in sRGB codes. Of six sets of real photos, planes of codes show lef
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ from ..fitting.fit import Fit, fit_problem
 from ..fitting.objective import Channels, Target
 from ..fitting.options import FitOptions
 from ..fitting.problem import Problem
+from ..image.color import MAX_CHANNELS
 from ..image.io import check_image
 from ..image.metrics import psnr_from_mse
 from ..image.pixels import ImageError
@@ -40,6 +42,9 @@ MIN_LIGHTS = 4
 
 FOLDS = 8
 """Number of parts of the lights, each left out once."""
+
+ROUNDING = 1e-10
+"""Mean squared error that rounding in single precision hides."""
 
 TABLES = (("thin_plate", 1e-3), ("thin_plate", 1e-2), ("thin_plate", 0.1), ("hsh", 0.1))
 """Tables that are tried, with their smoothing."""
@@ -145,11 +150,13 @@ def find_planes(photos: Photos, planes: int | None = None) -> Planes:
     mean = rows.mean(axis=1, dtype=np.float64)
     rows -= mean.astype(np.float32)[:, None]
     gram = product(rows, rows) / rows.shape[1]
-    limit = min(planes or MAX_PLANES, len(rows))
+    limit = planes or min(MAX_PLANES, most_planes(len(lights)))
     psnrs = {choice: left_out(gram, mean, lights, *choice, limit) for choice in TABLES}
     count = planes or fewest_planes(max(psnrs.values(), key=lambda values: values.max()))
-    kind, smoothing = max(psnrs, key=lambda choice: psnrs[choice][min(count, limit) - 1])
+    kind, smoothing = max(psnrs, key=lambda choice: psnrs[choice][count - 1])
     _, weights = largest_eigenpairs(gram.copy(), count, 0.0)
+    if not weights.size:
+        raise ImageError("every photo is of one colour; a model needs photos of an object")
     unit = orient((weights / np.linalg.norm(weights, axis=0)).T.astype(np.float32))
     scale = np.sqrt(len(rows))
     images = (unit @ rows / np.float32(scale)).T.reshape(*photos.size[::-1], len(unit))
@@ -158,6 +165,11 @@ def find_planes(photos: Photos, planes: int | None = None) -> Planes:
     table = LightTable(lights, values, kind, smoothing)
     held_out = float(psnrs[kind, smoothing][len(unit) - 1])
     return Planes(np.ascontiguousarray(images), table, held_out)
+
+
+def most_planes(photos: int) -> int:
+    """Return the largest number of planes: as many as rows are left without one of the parts."""
+    return min(MAX_CHANNELS, 3 * (photos - math.ceil(photos / FOLDS)))
 
 
 def left_out(
@@ -178,6 +190,7 @@ def left_out(
     kind, smoothing
         See `LightTable`.
     limit : int
+        At most `most_planes`.
     """
     part = np.arange(len(lights)) % min(FOLDS, len(lights))
     found = []
@@ -194,10 +207,9 @@ def left_out(
         change = values * weights**2 - 2 * weights * (gram[np.ix_(left, rest)] @ vectors)
         errors = np.diag(gram)[left] + (mean[left] - factors[:, -1]) ** 2
         errors = errors[:, None] + np.cumsum(change, axis=1)
-        found.append(errors.reshape(-1, 3, weights.shape[1]).mean(axis=1))
-    shortest = min(errors.shape[1] for errors in found)
-    joined = np.concatenate([errors[:, :shortest] for errors in found])
-    psnrs = [[psnr_from_mse(e) for e in row] for row in joined.tolist()]
+        errors = errors.reshape(-1, 3, weights.shape[1]).mean(axis=1)
+        found.append(np.maximum(errors, ROUNDING))
+    psnrs = [[psnr_from_mse(e) for e in row] for row in np.concatenate(found).tolist()]
     return np.asarray(np.mean(psnrs, axis=0))
 
 
@@ -218,7 +230,7 @@ def fit_planes(
     started = time.perf_counter()
     height, width, count = images.shape
     options = FitOptions(
-        gaussians=gaussians or max(1, height * width // PIXELS_PER_GAUSSIAN),
+        gaussians=max(1, height * width // PIXELS_PER_GAUSSIAN) if gaussians is None else gaussians,
         iterations=iterations,
         space=DATA,
         seed=seed,

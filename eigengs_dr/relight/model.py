@@ -31,7 +31,7 @@ from ..image.space import DATA, LINEAR, RGB
 from ..raster.render import render
 from ..storage import npz
 from ..storage.npz import BadValue, Field
-from .fit import find_planes, fit_planes, read_photos
+from .fit import find_planes, fit_planes, most_planes, read_photos
 from .lights import KINDS, MAX_LIGHTS, LightTable, check_lights, check_table
 
 FORMAT, VERSION = "eigengs_dr.relightable", 1
@@ -120,8 +120,9 @@ class Relightable:
             best set so far.
         """
         read = read_photos(photos, lights)
-        if planes is not None and not 1 <= planes <= min(64, len(read.rows)):
-            raise ValueError(f"planes is {planes}; {len(read.lights)} photos have 1 to 64")
+        most = most_planes(len(read.lights))
+        if planes is not None and not 1 <= planes <= most:
+            raise ValueError(f"planes is {planes}; {len(read.lights)} photos have 1 to {most}")
         found = find_planes(read, planes)
         del read  # the photos take more memory than the fit
         result = fit_planes(found.images, gaussians, iterations, seed, backend, progress)
@@ -164,6 +165,8 @@ class Relightable:
             If numbers are no direction above the horizon. A vector of Dr.Jit is not checked: an
             optimiser may pass below the horizon for a step.
         """
+        if dr.is_tensor_v(light) and light.ndim > 1:
+            light = light.numpy()
         is_path = isinstance(light, (str, os.PathLike))
         if is_path or (not dr.is_array_v(light) and np.ndim(light) > 1):
             return self._under(light)

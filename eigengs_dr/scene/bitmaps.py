@@ -30,7 +30,7 @@ KEPT = ("to_uv", "wrap_mode")
 SKY_KEPT = ("to_world", "scale", "sampling_weight")
 """Properties of an ``envmap`` that a ``gaussian_environment`` has too."""
 
-GAUSSIANS, SKY = "gaussian_texture", "gaussian_environment"
+GAUSSIANS, SKY, RELIT = "gaussian_texture", "gaussian_environment", "gaussian_relightable"
 """Names of the plugins in scenes."""
 
 RELIEF = {"bumpmap": "heights of a bump map", "normalmap": "vectors of a normal map"}
@@ -121,7 +121,7 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
         for node in state.nodes:
             _make_absolute(node.props)
     for node in state.nodes:
-        kinds = {GAUSSIANS: texture_kind(), SKY: mi.ObjectType.Emitter}
+        kinds = {GAUSSIANS: texture_kind(), SKY: mi.ObjectType.Emitter, RELIT: mi.ObjectType.BSDF}
         if kind := kinds.get(node.props.plugin_name()):  # Mitsuba does not know plugins in Python
             node.type = kind
     return Parsed(config, state)
@@ -154,7 +154,7 @@ def _make_absolute(props: mi.Properties) -> None:
 
 def file_keys(props: mi.Properties) -> list[str]:
     """Return the properties that name files."""
-    has_model = props.plugin_name() in (GAUSSIANS, SKY)
+    has_model = props.plugin_name() in (GAUSSIANS, SKY, RELIT)
     named = ("filename", "model") if has_model else ("filename",)
     return [key for key in props.keys() if key in named or key.endswith("_filename")]  # noqa: SIM118
 

@@ -216,6 +216,8 @@ def convert_scene(
     if isinstance(scene, mi.Scene):
         raise TypeError("convert_scene: scene is loaded; give its XML file or its dictionary")
     check_asked(target_psnr, iterations)
+    if spp is not None and spp < 0:
+        raise ValueError(f"spp is {spp}; it must be at least 0")
     refuse_url(output)
     target = Path(os.path.realpath(output))  # of a link, the folder that it names
     if target.exists() and (not target.is_dir() or any(target.iterdir())):

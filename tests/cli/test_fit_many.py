@@ -32,6 +32,15 @@ def test_images_of_any_size_into_folders(photo, photos, tmp_path):
     assert [row["width"] for row in report["images"]] == [32, 32, 32, 20] and report["versions"]
 
 
+def test_targets_out_of_reach_are_told_for_each_image(photos, tmp_path):
+    settings = ("--target-psnr", 90, "--max-gaussians", 20, "--iterations", 5)
+    result = run("fit", photos, "-o", tmp_path / "fits", *settings)
+    assert result.exit_code == 1
+    lines = [line for line in result.stderr.splitlines() if "out of reach" in line]
+    for line, name in zip(lines, ("00", "01", "02"), strict=True):
+        assert f"{photos / name}.png: psnr_rgb of 90 dB is out of reach: 20 " in line
+
+
 def test_images_in_subfolders(photos, tmp_path):
     (photos / "1999").mkdir()
     (photos / "02.png").rename(photos / "1999" / "02.png")

@@ -1,5 +1,7 @@
 """Many images encoded by one model, as `encode` encodes one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,6 +41,15 @@ def test_light_is_encoded_as_srgb(backend, tmp_path):
     [alone] = model.encode_many([image])
     a, b = (r.result.to_arrays()["color"] for r in (row, alone))
     np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_sets_of_a_model_of_other_weights_are_no_results(backend, tmp_path):
+    model = small_model(backend)
+    save_image(tmp_path / "a.png", family(1, seed=3)[0])
+    model.encode_many(tmp_path, tmp_path / "sets", colors="projected")
+    other = replace(model, weights=tuple(w * 2 for w in model.weights))
+    with pytest.raises(ValueError, match="holds results with model "):
+        other.encode_many(tmp_path, tmp_path / "sets", colors="projected")
 
 
 def test_files_a_bad_one_and_resuming(backend, tmp_path):

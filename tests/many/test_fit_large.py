@@ -126,6 +126,24 @@ def test_data_of_any_range():
     )
 
 
+@pytest.mark.parametrize("color", ["log", "radiance"])
+def test_light_that_no_display_shows(color):
+    """As `fit`, whose PSNRs are those of light that is exposed: else all would be equal."""
+    light = 200 + 2000 * eg.sample("coffee")[:96, :96]
+    settings = {"gaussians": 500, "iterations": 10, "space": color, "encoding": "linear"}
+    found, whole = eg.fit_large(light, block=48, **settings), eg.fit(light, **settings)
+    assert found.psnr_ycbcr == pytest.approx(whole.psnr_ycbcr, abs=1.5)
+    assert found.psnr_rgb == pytest.approx(whole.psnr_rgb, abs=1.5)
+
+
+def test_floats_in_files_are_light(tmp_path):
+    light = eg.sample("coffee")[:96, :96] ** 2.2
+    np.save(tmp_path / "a.npy", light)
+    tifffile.imwrite(tmp_path / "a.tif", light, photometric="rgb", tile=(32, 32))
+    found, same = (eg.fit_large(tmp_path / name, **FEW) for name in ("a.npy", "a.tif"))
+    assert_same_bits(found, same)
+
+
 def test_flat_image():
     result = eg.fit_large(np.full((96, 96), 100, np.uint8), block=48, iterations=10)
     assert result.psnr_rgb > 60

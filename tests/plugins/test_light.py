@@ -9,6 +9,7 @@ from _helpers.chi_square import assert_density
 from _helpers.lit_spheres import directions, photos
 from _helpers.packed import few_groups
 from _helpers.texture import backend, mi, picture, small_scene, texel_centres
+from _helpers.variants import in_variants
 from eigengs_dr.image.color import to_linear
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -146,13 +147,19 @@ def directional(light):
 
 def values_of(bsdf, light, size=SIZE, mirrored=False):
     """What a material reflects of a light in the axes of photos, at the centres of texels."""
+    return picture(spectra_of(bsdf, light, size, mirrored), size)
+
+
+def spectra_of(bsdf, light, size=SIZE, mirrored=False):
     si = texel_centres(size)
     si.sh_frame, si.wi = mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Vector3f(0, 0.6, 0.8)
     si.sh_frame.s, si.sh_frame.t = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, -1 if mirrored else 1, 0)
     x, y, z = (np.array(light) / np.linalg.norm(light)).tolist()
     wo = mi.Vector3f(x, y if mirrored else -y, z)
-    return picture(bsdf.eval(mi.BSDFContext(), si, wo), size)
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(550)
+    return bsdf.eval(mi.BSDFContext(), si, wo)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -165,12 +172,38 @@ def test_a_material_has_the_values_of_the_model(saved, light, mirrored):
     np.testing.assert_allclose(found, 2 / np.pi * to_linear(expected), atol=5e-3)
 
 
+@pytest.mark.parametrize("planes", [1, 2, 3])
+def test_few_planes_are_planes(planes, tmp_path):
+    """Two channels of another texture would be those of normals, and get a third."""
+    lights = directions(8)
+    model = eg.Relightable.fit(photos(lights), lights, gaussians=40, planes=planes, iterations=0)
+    model.save(tmp_path / "m.npz")
+    found = values_of(mi.load_dict(material(str(tmp_path / "m.npz"))), LIGHT)
+    expected = eg.picture_of(model.relight(LIGHT)).clip(0, 1)
+    np.testing.assert_allclose(found, to_linear(expected) / np.pi, atol=5e-3)
+
+
 def test_a_wall_under_a_lamp_looks_like_a_photo(saved):
     scene = lit_scene(saved, "direct", SIDE)
     shown = mi.render(scene, spp=64).numpy()[::-1]  # row 0 lies at v = 0, the bottom of the wall
     model = eg.Relightable.load(saved, backend())
     expected = to_linear(eg.picture_of(model.relight(LIGHT)).clip(0, 1))
     assert eg.psnr(shown.clip(0, 1), expected) > 30
+
+
+@in_variants(["llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"])
+def test_a_material_depolarizes(saved):
+    """The matrix of Mueller has one entry that is not 0."""
+    bsdf = mi.load_dict(material(saved))
+    matrix = np.array(spectra_of(bsdf, LIGHT))
+    assert matrix[0, 0].min() > 0
+    matrix[0, 0] = 0
+    assert matrix.shape[:2] == (4, 4) and not matrix.any()
+    stokes = mi.load_dict({"type": "stokes", "inner": {"type": "direct"}})
+    seen = mi.render(lit_scene(saved, "direct", 8), integrator=stokes, spp=16, seed=1).numpy()
+    shown, total, others = np.split(seen, [-12, -9], axis=2)  # three channels per parameter
+    assert shown.mean() > 0.01 and not others.any()
+    np.testing.assert_allclose(total, np.broadcast_to(shown, total.shape), rtol=1e-3, atol=1e-4)
 
 
 def test_samples_of_a_material_have_their_density(saved):

@@ -128,8 +128,27 @@ def test_what_cannot_be_a_model_is_refused(tmp_path):
     for arguments, message in refused:
         with pytest.raises(ValueError, match=message):
             eg.Relightable.fit(*arguments, progress=False)
-    with pytest.raises(ValueError, match="planes is 65"):
-        eg.Relightable.fit(images, LIGHTS, planes=65, progress=False)
+    with pytest.raises(ValueError, match="gaussians is 0"):
+        eg.Relightable.fit(images, LIGHTS, gaussians=0, progress=False)
+    with pytest.raises(ValueError, match="every photo is of one colour"):
+        eg.Relightable.fit(np.full((8, 16, 16, 3), 0.5), LIGHTS[:8], progress=False)
+    for number, planes, most in ((30, 65, 64), (8, 22, 21)):
+        with pytest.raises(ValueError, match=f"planes is {planes}; {number} photos .* to {most}"):
+            eg.Relightable.fit(images[:number], LIGHTS[:number], planes=planes, progress=False)
+
+
+def test_photos_that_do_not_depend_on_the_light():
+    same = np.repeat(photos(LIGHTS)[:1], 8, axis=0)
+    model = eg.Relightable.fit(same, LIGHTS[:8], gaussians=80, iterations=20, progress=False)
+    assert model.planes.channels <= 3 and 90 < model.psnr_held_out <= 100
+    assert eg.psnr(same[0], picture(model, LIGHTS[20])) > 25
+
+
+def test_as_many_planes_as_the_rest_of_the_photos_has_rows():
+    model = eg.Relightable.fit(
+        photos(LIGHTS)[:8], LIGHTS[:8], planes=21, gaussians=40, iterations=0, progress=False
+    )
+    assert 1 <= model.planes.channels <= 21 and np.isfinite(model.psnr_held_out)
 
 
 @pytest.mark.parametrize("light", [(0, 0, 0), (0.5, 0, -0.5), (np.nan, 0, 1), (1, 0)])
@@ -158,7 +177,8 @@ def test_an_environment_with_one_bright_side_lights_from_there(model):
     sky = np.zeros((16, 32, 3), np.float32)
     sky[8, 11:13] = 20
     x = np.sin(2 * np.pi * 12 / 32)
-    lit = eg.picture_of(model.relight(sky)).mean(axis=2)
+    rendered = type(eg.render(model.planes))(sky)  # a tensor, as of Mitsuba
+    lit = eg.picture_of(model.relight(rendered)).mean(axis=2)
     side = picture(model, [x, -0.1, 0.75]).mean(axis=2)
     other = picture(model, [-x, -0.1, 0.75]).mean(axis=2)
     alike = [np.corrcoef(lit.ravel(), image.ravel())[0, 1] for image in (side, other)]

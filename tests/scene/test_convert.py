@@ -10,6 +10,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.bitmap_scenes import cornell, room, save_images, sky, wall
+from _helpers.lit_spheres import directions, photos
 from _helpers.poster import mi
 from _helpers.texture import gaussians
 from eigengs_dr.eigenbasis.eigengs import SHIPPED
@@ -345,9 +346,30 @@ def test_two_runs_into_one_folder(folder, tmp_path):
         eg.convert_scene(wall(folder), tmp_path / "new", spp=0, **QUICK)
 
 
+@pytest.mark.parametrize("kind", ["file", "dictionary"])
+def test_a_material_of_lights_stays(folder, tmp_path, monkeypatch, kind):
+    """Its model is found beside the scene, and from the new folder."""
+    lights, model = directions(8), folder / "m.npz"
+    eg.Relightable.fit(photos(lights), lights, gaussians=20, planes=2, iterations=0).save(model)
+    shape = '<shape type="rectangle"><bsdf type="gaussian_relightable">'
+    shape += '<string name="model" value="m.npz"/></bsdf></shape></scene>'
+    scene = wall(folder)
+    scene.write_text(scene.read_text().replace("</scene>", shape))
+    if kind == "dictionary":
+        material = {"type": "gaussian_relightable", "model": str(model)}
+        scene = room(mi, folder) | {"wall": {"type": "rectangle", "bsdf": material}}
+    monkeypatch.chdir(tmp_path)
+    found = eg.convert_scene(scene, "new", spp=0, **QUICKEST)
+    monkeypatch.chdir("/")
+    assert "gaussian_relightable" in (tmp_path / found.scene).read_text()
+    assert np.array(mi.render(mi.load_file(str(tmp_path / found.scene)), spp=1)).mean() > 0
+
+
 def test_an_error_is_no_reason_to_leave_a_bitmap(folder, tmp_path):
     with pytest.raises(ValueError, match="iterations is -1"):
         eg.convert_scene(wall(folder), tmp_path / "new", iterations=-1)
+    with pytest.raises(ValueError, match="spp is -1"):
+        eg.convert_scene(wall(folder), tmp_path / "new", spp=-1)
     assert list(tmp_path.iterdir()) == []
 
 
