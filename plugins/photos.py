@@ -45,7 +45,7 @@ def photo_loss(
     integrator: mi.Integrator | None = None,
     spp: int = 4,
     held_out: float = 0.0,
-    bounds: tuple[float, float] | None = (0.0, 1.0),
+    bounds: tuple[float, float] | str | None = "auto",
     parameters: Any = None,
     seed: int = 0,
     encoding: str | None = None,
@@ -67,8 +67,7 @@ def photo_loss(
         are those of the set. Bitmaps need ``raw: true``, and those of files of 8 bits also
         ``format: "variant"``, to hold floats. Their texels are then light or data, so the ``space``
         of a fit is by default "linear" for three channels, "normal" for a map with the name
-        "normal", and "data" for one channel. An ``envmap`` counts as a bitmap, of the space "log";
-        its light has no `bounds`.
+        "normal", and "data" for one channel. An ``envmap`` counts as a bitmap, of the space "log".
     photos : sequence of array_like or tensor, shape (H, W, 3), path-like, PIL or mitsuba.Bitmap
         Of the size of the film of its sensor each; grey is replicated. Numbers of a list, an array
         or a tensor of Dr.Jit or PyTorch are linear light if they are floats, as those of
@@ -78,15 +77,15 @@ def photo_loss(
     integrator : mitsuba.Integrator, optional
         By default that of the scene.
     spp : int, optional
-        Samples a pixel of a step.
+        Samples per pixel of a step.
     held_out : float, optional
         Share of the pixels of four photos that no step sees, in [0, 1). Their error is then the
         ``loss`` of the trace, and the number of Gaussians doubles while it falls; by default there
         is one for 4 texels, or for 3 pixels of all photos if these are fewer. It takes many photos:
         with few, a held-out pixel leaves a hole in the texture that no other photo sees, and the
         number that suits holes is far too small.
-    bounds : (float, float), optional
-        See `eigengs_dr.Loss`.
+    bounds : "auto", (float, float) or None, optional
+        See `eigengs_dr.Loss`; "auto" is (0, 1), and None for an ``envmap``.
     parameters : optimiser, optional
         Of other parameters of the scene, by their names there, see `eigengs_dr.Loss`. A
         `mitsuba.ad.Adam` with the key ``"lamp.emitter.radiance.value"`` looks for a light, say.
@@ -105,7 +104,8 @@ def photo_loss(
     ValueError
         If a name is unknown, a bitmap holds no floats, has fewer than 2x2 texels or, in a spectral
         variant, holds colours; if photos and sensors do not fit together, a photo cannot be read,
-        or an argument is out of range. In the fit, if its size is below 2x2.
+        an argument is out of range, or bounds would hold for bitmaps and an ``envmap``. In the fit,
+        if its size is below 2x2.
     TypeError
         If the scene, a sensor or the integrator is none.
 
@@ -174,6 +174,7 @@ def photo_loss(
     taken = _Photos(*drawn, targets, hidden, judged, parameters, _first_of(seed))
     spaces = {name: _space_for(known, name, key) for name, key in keys.items()}
     space = spaces if isinstance(pictures, Mapping) else spaces[""]
+    bounds = _bounds_for({*spaces.values()}) if bounds == "auto" else bounds
     judge = taken.judge if held_out else None
     pixels = sum(mask.size - int(mask.sum()) for mask in masks)
     loss = Loss(taken.loss, bounds, parameters, judge, space=space, pixels=pixels)
@@ -227,10 +228,14 @@ class _Photos:
         seed = (self.first + step) % SEEDS
         if self.parameters is None and dr.grad_enabled(picture):
             return dr.custom(_Frozen, partial(self.slopes, number, seed), texels)
+        self.show(texels)
+        return _mean(dr.square(self.difference(number, seed, self.spp)), 1 - self.hidden[number])
+
+    def show(self, texels: dict) -> None:
+        """Put texels and the parameters of the user into the scene."""
         self.known.update(texels)
         if self.parameters is not None:
             self.known.update(self.parameters)
-        return _mean(dr.square(self.difference(number, seed, self.spp)), 1 - self.hidden[number])
 
     def slopes(self, number: int, seed: int, texels: dict) -> tuple[Any, dict]:
         """Return the squared error of a photo, and its derivatives by texels; replayed."""
@@ -256,7 +261,7 @@ class _Photos:
 
     def judge(self, picture: Any) -> Any:
         """Return the squared error of held-out pixels, see `JUDGE_SAMPLES`."""
-        self.known.update(self.texels(picture))
+        self.show(self.texels(picture))
         samples = JUDGE_SAMPLES * self.spp
         means = [
             _mean(
@@ -418,6 +423,18 @@ def _space_for(known: mi.SceneParameters, name: str, key: str) -> str:
     if known[key].shape[2] != 3:
         return "data"
     return "normal" if usual_space(name) == "normal" else "linear"
+
+
+def _bounds_for(spaces: set[str]) -> tuple[float, float] | None:
+    """Return the bounds of maps of some spaces: those of textures, and none for an ``envmap``."""
+    if "log" not in spaces:
+        return 0.0, 1.0
+    if len(spaces) > 1:
+        raise ValueError(
+            "photo_loss: bounds hold for all maps, and light of an envmap has none; give "
+            "bounds=None, or recover them one after another"
+        )
+    return None
 
 
 def _check_photo(number: int, photo: Any, size: Sequence[int], encoding: str | None) -> mi.TensorXf:

@@ -132,8 +132,9 @@ def _first_cause(error: BaseException) -> BaseException:
     """Return what was raised in a function that Dr.Jit called, which it makes a `RuntimeError`.
 
     It may be Ctrl-C, or come from an alarm, from another thread or from a function of the user.
+    Messages of Dr.Jit refer to it by "(see above)"; other errors with a cause stay as they are.
     """
-    while type(error) is RuntimeError and error.__cause__ is not None:
+    while type(error) is RuntimeError and error.__cause__ and "(see above)" in str(error):
         error = error.__cause__
     return error
 

@@ -45,6 +45,8 @@ def doctor(
     if trial:
         click.echo(json.dumps(_run_trial(trial, backend or "llvm")))
         return
+    if backend and not gpu:
+        raise click.UsageError("--backend needs --gpu")
     facts = machine.report()
     works = any(facts[name]["works"] for name in BACKENDS)
     device = backend or "cuda"

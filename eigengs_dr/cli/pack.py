@@ -59,6 +59,8 @@ def pack(
     files, in_folder = options.sets_in(file, (".npz",)), file.is_dir()
     if in_folder and (image or maps):
         raise ValueError("--image and --map belong to one set; leave them out for a folder")
+    if encoding and not (image or maps):
+        raise ValueError("--encoding needs --image or --map")
     targets = name_outputs(files, output, [SUFFIX], in_folder)
     inputs = [*files, *([image] if image else []), *(m.path for m in maps.values())]
     check_outputs([*targets, run.report], inputs)

@@ -142,12 +142,15 @@ def _train_on_lights(
     """Fit a model to photos of one object under known lights, and write it."""
     import eigengs_dr as eg
 
+    from ..image.remote import is_url
     from ..relight.lights import read_lights
 
     for name in FOR_FAMILIES:
         if run.context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE:
             option = name.replace("_", "-")
             raise click.UsageError(f"--{option} and --lights exclude each other; give one of them")
+    if is_url(folder):
+        raise click.UsageError("--lights takes a folder of this machine")
     planes = None
     if run.context.get_parameter_source("components") == click.core.ParameterSource.COMMANDLINE:
         planes = choices["components"]

@@ -59,6 +59,8 @@ def view(
       eigengs-dr view levels.npz --levels 4
       eigengs-dr view natural --image photo.jpg -o natural.html
     """
+    if encoding and not image:
+        raise ValueError("--encoding needs --image")
     [page] = name_outputs([file], output, SUFFIXES)
     check_outputs([page], [file, *([image] if image else [])])
     lock_outputs(page)

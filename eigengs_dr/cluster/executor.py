@@ -7,6 +7,7 @@ A cluster is not changed: neither its plugins and its configuration nor the limi
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import re
 import threading
@@ -97,12 +98,25 @@ def connect(cluster: str) -> Iterator[Client]:
                     f"cluster {cluster!r} is unknown; use local, local:N, tcp://HOST:PORT, or the "
                     "file of a scheduler"
                 )
+            if not is_address:
+                _check_scheduler_file(cluster)
             location = {"address" if is_address else "scheduler_file": cluster}
             try:
                 client = stack.enter_context(Client(**location, timeout=CONNECT_SECONDS))
             except OSError as error:
                 raise ClusterError(f"{cluster}: no scheduler answers; start it first") from error
         yield client
+
+
+def _check_scheduler_file(path: str) -> None:
+    """Raise ValueError unless a file names an address; Dask would connect to None."""
+    try:
+        str(json.loads(Path(path).read_bytes())["address"])
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(
+            f"cluster {path!r} is not the file of a scheduler, as 'dask scheduler "
+            "--scheduler-file FILE' writes it"
+        ) from None
 
 
 @contextmanager

@@ -213,7 +213,7 @@ class Gaussians:
         Raises
         ------
         IndexError
-            If the index is out of range or has another type.
+            If the index is out of range, or has another type or more axes.
         ValueError
             If the selection is empty.
         KeyError
@@ -222,6 +222,8 @@ class Gaussians:
         if isinstance(selection, str):
             return self._map(selection)
         kept = np.atleast_1d(np.arange(len(self), dtype=np.uint32)[selection])
+        if kept.ndim > 1:
+            raise IndexError(f"Gaussians: the index has shape {kept.shape}; give one axis")
         if not kept.size:
             raise ValueError("Gaussians: the selection is empty; select at least one Gaussian")
         return take(self, upload(types_of(self.mean).UInt, kept))
@@ -378,7 +380,10 @@ def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
 
 @door
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
-    """Concatenate sets and add their backgrounds: the result renders the sum of their pictures.
+    """Concatenate sets and add their backgrounds.
+
+    In the spaces "rgb", "linear", "radiance" and "data", the picture of the result is the sum of
+    theirs; the others decode sums, and not by a linear function.
 
     Parameters
     ----------
@@ -541,15 +546,16 @@ def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     >>> brighter = eg.from_tensors({"color": 2 * eg.to_tensors(g)["color"]}, like=g)
     """
     given = {name: tensors[name] for name in FIELDS if name in tensors}
-    counts = [given[name].shape[0] for name in ("mean", "factor", "color") if name in given]
-    # The number of Gaussians may differ from `like` only if all parameters of Gaussians are given.
-    count = max(counts) if len(counts) == 3 else len(like)
     for name, tensor in given.items():
         if not dr.is_tensor_v(tensor):
             raise TypeError(
                 f"{name} is a {type(tensor).__module__}.{type(tensor).__name__}, expected a Dr.Jit "
                 "tensor; drjit.wrap converts those of PyTorch and JAX functions"
             )
+    counts = [given[name].shape[0] for name in ("mean", "factor", "color") if name in given]
+    # The number of Gaussians may differ from `like` only if all parameters of Gaussians are given.
+    count = max(counts) if len(counts) == 3 else len(like)
+    for name, tensor in given.items():
         columns = FIELDS[name] or like.channels
         expected = (columns,) if name == "background" else (count, columns)
         if tuple(tensor.shape) != expected or not count:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..backend.messages import warn
 from ..backend.types import PathLike, Record, Values
 from .formats import READ_SUFFIXES, UNREAD_SUFFIXES
-from .io import check_image, load_image
+from .io import check_image
 from .pixels import ImageError, check_size
 from .remote import is_url, list_urls
 from .resize import center_crop
@@ -330,7 +330,7 @@ def _prepare(numbered: tuple[int, Any], size: tuple[int, int], space: str) -> Pr
     place, item = numbered
     loaded = _is_file(item)
     try:
-        image = check_image(load_image(item) if loaded else item, copy=not loaded)
+        image = check_image(item, copy=not loaded)
     except (ImageError, OSError) as error:
         if not loaded:
             raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None

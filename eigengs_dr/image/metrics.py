@@ -82,6 +82,7 @@ def squared_error(a: ArrayLike, b: ArrayLike, space: str, weight: ArrayLike | No
     """
     if space not in COMPARED:
         raise ValueError(f"space {space!r} is unknown; use one of {', '.join(COMPARED)}")
+    a, b = pixels_of(a), pixels_of(b)
     x, y = _pair(a, b)
     factors = _weight_of(np.shape(a), weight)
 
@@ -215,6 +216,7 @@ def ssim(a: Any, b: Any, weight: Any = None) -> Any:
         x, y = (v if is_tensor(v) else _scaled(np.asarray(pixels_of(v))) for v in (a, b))
         _check_shapes(x.shape, y.shape)
         return similarity(x, y, _weight_of_windows(x.shape, weight), _window(x.shape))
+    a, b = pixels_of(a), pixels_of(b)
     x, y = _pair(a, b)
     factors = _weight_of_windows(np.shape(a), weight)
     return float(_similarity(x, y, lambda rows: np.clip(rows, 0, 1), factors)[0].mean())

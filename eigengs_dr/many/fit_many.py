@@ -147,7 +147,7 @@ def fit_many(
 def _settings_of(settings: FitOptions) -> dict[str, Any]:
     """Return the options on which results depend; a start is replaced by its fingerprint."""
     options = {name: value for name, value in vars(settings).items() if name != "backend"}
-    options["method"] = repr(settings.method)
+    options |= {"method": repr(settings.method), "space": settings.space or YCBCR}
     if settings.goal:
         options["target_psnr"] = vars(settings.goal)
     if isinstance(settings.gaussians, tuple):

@@ -216,6 +216,8 @@ def convert_scene(
     if isinstance(scene, mi.Scene):
         raise TypeError("convert_scene: scene is loaded; give its XML file or its dictionary")
     check_asked(target_psnr, iterations)
+    if parameters and isinstance(scene, Mapping):
+        raise ValueError("parameters are those of an XML file, and the scene is a dictionary")
     if spp is not None and spp < 0:
         raise ValueError(f"spp is {spp}; it must be at least 0")
     refuse_url(output)
@@ -358,12 +360,13 @@ def _convert_sky(
     sky = original.scene.environment()
     try:
         check_rotation(sky.world_transform())
+    except ValueError:
+        return "an environment map that its to_world scales or shears"
+    try:
         asked = settings.target_psnr, settings.iterations, resident_bytes(sky)
         g, seen = fit_environment(original.scene, pixels, *asked, tell)
     except (Unsuitable, ImageError) as error:
         return str(error)
-    except ValueError:
-        return "an environment map that its to_world scales or shears"
     g.save(file)
     held = list(map(resident_bytes, (sky, mi.load_dict({"type": SKY, "filename": str(file)}))))
     return _chosen((name,), file, g, seen, held, settings)

@@ -94,9 +94,8 @@ def fit_environment(
     spaces = (LOG, RADIANCE) if target.max() > 1 + 1e-3 else (LINEAR,)
     max_count, reached = max(1, max_bytes // BYTES), list[str]()
     for space, more in product(spaces, CLOSER):
-        goal = Goal(
-            min(target_psnr + more, 99.0), max_gaussians=min(max_count, target[..., 0].size)
-        )
+        asked = min(max(target_psnr + more, 1.0), 99.0)
+        goal = Goal(asked, max_gaussians=min(max_count, target[..., 0].size))
         result = fit(
             target,
             target_psnr=goal,

@@ -112,19 +112,22 @@ def render_in_passes(
         if hasattr(emitter, "importance"):  # of this package: Mitsuba 3.9 tells it no bounds
             emitter.set_scene(scene)
     width, height = sensor.film().crop_size()
-    total = spp or sensor.sampler().sample_count()
+    usual = sensor.sampler().sample_count()
+    total, done = spp or usual, 0
     max_count = max(1, SAMPLES_PER_PASS // (width * height))
     pixels: NDArray[np.float64] = np.zeros(())
-    done = 0
-    while done < total:
-        count = min(max_count, total - done)
-        with collector_off():  # also between the lookups, whose doors make objects
-            part = mi.render(
-                scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done
-            )
-        pixels = pixels + count * np.array(part, np.float64)
-        done += count
-        show(done, total)
+    try:
+        while done < total:
+            count = min(max_count, total - done)
+            with collector_off():  # also between the lookups, whose doors make objects
+                part = mi.render(
+                    scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done
+                )
+            pixels = pixels + count * np.array(part, np.float64)
+            done += count
+            show(done, total)
+    finally:
+        sensor.sampler().set_sample_count(usual)  # integrators in C++ leave that of the last pass
     names = _channels(sensor.film(), integrator or scene.integrator(), pixels.shape[-1])
     return Rendering((pixels / total).astype(np.float32), tuple(names), total)
 

@@ -92,6 +92,9 @@ def _resumed(folder: Path, settings: Settings) -> Checkpoint | None:
             raise ValueError(f"{folder}: not a readable checkpoint; move it away") from None
         remove_folder(folder)
         return None
+    if all(path.name == HEAD for path in folder.iterdir()):
+        remove_folder(folder)
+        return None
     if changes := difference(stored, settings):
         raise ValueError(
             f"{folder}: holds an interrupted run with {changes}; use its settings, or delete "

@@ -165,6 +165,8 @@ def test_errors_keep_their_type(backend):
         door(lambda: dr.while_loop((x,), lambda x: x < 3, late))()
     with pytest.raises(RuntimeError, match="of mine"), exclusive():
         raise RuntimeError("of mine")
+    with pytest.raises(RuntimeError, match="with a cause"), exclusive():
+        raise RuntimeError("with a cause") from ValueError("the cause")
 
 
 def test_what_is_kept_of_calls_is_limited(backend):

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from _helpers.command import run, said
+from _helpers.command import assert_refused, run, said
 from eigengs_dr.backend.doctor import ALLOWED
 
 
@@ -23,3 +23,7 @@ def test_a_gpu_that_is_not_there():
     ended = run("doctor", "--gpu", "--backend", "metal")
     assert ended.exit_code == 2
     assert ended.stderr.count("\n") == 1 and "metal does not work: no Metal GPU" in ended.stderr
+
+
+def test_a_backend_is_compared_by_gpu_alone():
+    assert_refused(run("doctor", "--backend", "metal"), "--backend needs --gpu")

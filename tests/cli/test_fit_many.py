@@ -123,6 +123,7 @@ MISTAKES = {
     "cluster": (["photos", "-o", "x", "--preview", "p", "--cluster", "local"], "no --preview"),
     "a word": (["photos", "-o", "x", "--cluster", "nowhere"], "is unknown; use"),
     "none": (["photos", "-o", "x", "--cluster", "local:0"], "is unknown"),
+    "a photo": (["photos", "-o", "x", "--cluster", "photos/00.png"], "not the file of a scheduler"),
 }
 
 

@@ -78,3 +78,8 @@ def test_wrong_commands_are_refused_in_one_line(
     paths = [folder / word if (folder / word).is_file() else word for word in options]
     output = tmp_path / ("x.png" if command == "render" else "x.npz")
     assert_refused(run(command, folder / source, "-o", output, *paths), message)
+
+
+def test_photos_at_a_url_are_refused(folder, tmp_path):
+    lights = ["--lights", folder / "dirs.lp", "-o", tmp_path / "x.npz"]
+    assert_refused(run("train", "https://host.example/photos", *lights), "a folder of this machine")

@@ -70,6 +70,20 @@ def test_several_scenes_into_a_folder(scene, tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.png", "b.png"]
 
 
+@pytest.mark.parametrize("integrator", ["path", "prb"])
+def test_passes_leave_the_number_of_samples(scene, monkeypatch, integrator):
+    from eigengs_dr.scene.rendering import render_in_passes
+
+    monkeypatch.setattr("eigengs_dr.scene.rendering.SAMPLES_PER_PASS", 8 * 6 * 2)
+    mi.set_variant(LLVM[1])
+    loaded = mi.load_file(str(scene()))
+    renderer = mi.load_dict({"type": integrator})
+    rendered = [
+        render_in_passes(loaded, 0, spp, integrator=renderer).spp for spp in (None, 5, None)
+    ]
+    assert rendered == [2, 5, 2]
+
+
 @pytest.mark.exr
 def test_passes_make_one_picture(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("eigengs_dr.scene.rendering.SAMPLES_PER_PASS", 8 * 6 * 2)

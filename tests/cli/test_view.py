@@ -54,6 +54,12 @@ def test_shows_levels_and_a_photo(photo):
     assert levels_of(page_of(photo)) == "16, 64"
 
 
+@pytest.mark.parametrize("command", ["view", "pack"])
+def test_the_encoding_is_that_of_an_image(photo, command):
+    page = photo.with_suffix(".html" if command == "view" else ".egs")
+    assert_refused(run(command, photo, "-o", page, "--encoding", "linear"), "needs --image")
+
+
 def test_refuses_too_many_gaussians_before_it_decodes_them(photo, monkeypatch):
     said("pack", photo, "-o", "photo.egs", "--levels", 2)
     monkeypatch.setattr(page, "MAX_GAUSSIANS", 63)

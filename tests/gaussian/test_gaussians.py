@@ -133,7 +133,10 @@ def test_selection(backend, index):
 
 @pytest.mark.parametrize(
     ("index", "error"),
-    [(i, IndexError) for i in (COUNT, -COUNT - 1, [0, COUNT], np.ones(COUNT - 1, bool), 0.5)]
+    [
+        (i, IndexError)
+        for i in (COUNT, -COUNT - 1, [0, COUNT], np.ones(COUNT - 1, bool), 0.5, [[0], [1]])
+    ]
     + [(i, ValueError) for i in (np.array([], int), slice(5, 5), np.zeros(COUNT, bool))],
     ids=str,
 )

@@ -88,3 +88,5 @@ def test_arrays_that_are_no_tensors_are_refused():
     g = random_scene().on("llvm")
     with pytest.raises(TypeError, match=r"color is a numpy\.ndarray, expected a Dr\.Jit"):
         eg.from_tensors({"color": np.ones((24, 3))}, like=g)
+    with pytest.raises(TypeError, match=r"color is a builtins\.list"):
+        eg.from_tensors({"color": [[1, 2, 3]]}, like=g)

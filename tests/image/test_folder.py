@@ -54,6 +54,16 @@ def test_planes_are_the_channels_row_by_row(space):
     np.testing.assert_allclose(result.reshape(3, HEIGHT, WIDTH), np.moveaxis(expected, 2, 0), 1e-6)
 
 
+def test_light_in_files_is_encoded(tmp_path):
+    [image] = pictures(1)
+    save_image(tmp_path / "a.pfm", image / 255, encoding="srgb")
+    save_image(tmp_path / "b.pfm", np.full((HEIGHT, WIDTH, 3), 5.0), encoding="linear")
+    [found] = read(tmp_path, 2)
+    [same] = read(image[None])
+    assert len(found) == 2
+    np.testing.assert_allclose(found[:1], same, atol=1e-4)
+
+
 def test_a_source_may_overwrite_its_arrays():
     images = pictures(9)
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.signal import correlate2d
 from skimage import color, metrics
 
@@ -71,6 +72,20 @@ def test_equal_weights_are_no_weights(rng, space):
     assert psnr(a, b, space, np.full((30, 20), 3)) == pytest.approx(psnr(a, b, space), abs=1e-6)
     assert ssim(a, b, np.full((30, 20), 3)) == pytest.approx(ssim(a, b), abs=1e-7)
     assert psnr(a, a, space, weight=np.ones((30, 20))) == math.inf
+
+
+def test_weights_of_pillow_images_are_those_of_their_pixels(rng):
+    a, b = rng.integers(0, 256, (2, 30, 20, 4), np.uint8)
+    weight = rng.random((30, 20, 3))
+    for mode in ("L", "RGB"):
+        x, y = (Image.fromarray(image[..., :3]).convert(mode) for image in (a, b))
+        arrays = [np.atleast_3d(np.asarray(image)) for image in (x, y)]
+        given = weight[..., : arrays[0].shape[2]]
+        for measure in (psnr, ssim):
+            assert measure(x, y, weight=given) == measure(*arrays, weight=given)
+    opaque = np.dstack([a[..., :3], np.full((30, 20), 255, np.uint8)])
+    shown = Image.fromarray(opaque), Image.fromarray(b[..., :3])
+    assert psnr(*shown, weight=weight) == psnr(a[..., :3], b[..., :3], weight=weight)
 
 
 def test_psnr_of_grey_images_takes_weights(rng):

@@ -75,6 +75,8 @@ def test_options_that_results_do_not_have(photos, output):
     """They are refused where they are given, or would mix; a run without work only says so."""
     eg.fit_many(photos, output, **QUICK)
     before = files_of(output)
+    same = eg.fit_many(photos, output, **QUICK, space="ycbcr")  # the default
+    assert [row.status for row in same] == ["skipped"] * 3
     text = (
         r"fits: holds results with gaussians 20 instead of 9; use their options or another folder"
     )

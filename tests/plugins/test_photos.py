@@ -18,7 +18,7 @@ def variant():
     mi.set_variant("llvm_ad_rgb")
 
 
-def wall(texture, light=1.0, normals=None):
+def wall(texture, light=1.0, normals=None, sky=None):
     """A diffuse wall under the same light from all sides: it looks like its texture."""
     at, cameras = mi.ScalarTransform4f(), {}
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "pixel_format": "rgb"}
@@ -38,7 +38,7 @@ def wall(texture, light=1.0, normals=None):
         {
             "type": "scene",
             "integrator": {"type": "prb", "max_depth": 2},
-            "sky": {"type": "constant", "radiance": light},
+            "sky": sky or {"type": "constant", "radiance": light},
             "wall": {"type": "rectangle", "bsdf": coat},
             **cameras,
         }
@@ -188,6 +188,28 @@ def test_a_light_is_found_along():
     method = eg.COARSE_TO_FINE.at_rates(0.01)
     eg.fit(loss=loss, size=(32, 32), start=start, iterations=60, method=method)
     assert light[key][0] == pytest.approx(1.5, abs=0.05)
+
+
+def test_a_judge_renders_with_the_parameters():
+    from eigengs_dr.plugins import photo_loss
+
+    photos = photos_of(wall(true_texture(), light=1.5))
+    light = mi.ad.Adam(lr=0.03, params={"sky.radiance.value": mi.Float(1.5)})
+    loss = photo_loss(wall(GREY), NAME, photos, held_out=0.2, parameters=light)
+    assert abs(loss.judge(mi.TensorXf(true_texture())).array[0]) < 1e-3
+
+
+def test_bounds_are_those_of_textures_or_none():
+    from eigengs_dr.plugins import photo_loss
+
+    scene, photos = wall(GREY), photos_of(wall(GREY))
+    assert photo_loss(scene, NAME, photos).bounds == (0, 1)
+    scene = wall(GREY, sky={"type": "envmap", "bitmap": mi.Bitmap(GREY)})
+    assert photo_loss(scene, "sky", photos).bounds is None
+    both = {"color": NAME, "light": "sky"}
+    with pytest.raises(ValueError, match="an envmap has none; give bounds=None"):
+        photo_loss(scene, both, photos)
+    assert photo_loss(scene, both, photos, bounds=None).bounds is None
 
 
 def test_photos_that_do_not_fit_are_refused():
@@ -396,7 +418,7 @@ def test_an_environment_map_is_recovered():
 
     photos, scene = views(lit(light)), lit(np.full((16, 32, 3), 0.5))
     before = np.mean([(a - b) ** 2 for a, b in zip(views(scene), photos, strict=True)])
-    loss = photo_loss(scene, "sky", photos, bounds=None, spp=16)
+    loss = photo_loss(scene, "sky", photos, spp=16)
     found = eg.fit(loss=loss, size=(32, 16), gaussians=40, iterations=60, space="log")
     after = np.mean([(a - b) ** 2 for a, b in zip(views(scene), photos, strict=True)])
     assert after < 0.05 * before

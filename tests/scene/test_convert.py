@@ -368,6 +368,8 @@ def test_a_material_of_lights_stays(folder, tmp_path, monkeypatch, kind):
 def test_an_error_is_no_reason_to_leave_a_bitmap(folder, tmp_path):
     with pytest.raises(ValueError, match="iterations is -1"):
         eg.convert_scene(wall(folder), tmp_path / "new", iterations=-1)
+    with pytest.raises(ValueError, match="parameters are those of an XML file"):
+        eg.convert_scene(room(mi, folder), tmp_path / "new", parameters={"spp": "4"})
     with pytest.raises(ValueError, match="spp is -1"):
         eg.convert_scene(wall(folder), tmp_path / "new", spp=-1)
     assert list(tmp_path.iterdir()) == []

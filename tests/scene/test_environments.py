@@ -120,6 +120,13 @@ def test_what_stays_and_why(pixels, others, words, tmp_path):
     assert words in reason
 
 
+@pytest.mark.exr
+def test_a_low_goal_is_met(tmp_path):
+    given = scene(bitmap=mi.Bitmap(horizon()))
+    found = eg.convert_scene(given, tmp_path / "new", 5, iterations=10, spp=0, replace_all=True)
+    assert found.left == [] and found.textures[0].psnr > 5
+
+
 def test_gaussians_that_are_there_stay(tmp_path):
     """Also from memory: they become a file."""
     from eigengs_dr.plugins import environment_of

@@ -50,12 +50,16 @@ def cut_head(folder):
     (folder / HEAD).write_text('{"settings": {"si')
 
 
+def lose_work(folder):
+    (folder / "part.npz").unlink()
+
+
 def empty(folder):
     shutil.rmtree(folder)
     folder.mkdir()
 
 
-@pytest.mark.parametrize("damage", [lose_head, cut_head, empty])
+@pytest.mark.parametrize("damage", [lose_head, cut_head, lose_work, empty])
 def test_a_folder_that_a_kill_left_is_begun_anew(output, stopped, damage):
     damage(stopped)
     with open_checkpoint(output, SETTINGS, ["b"]) as checkpoint:

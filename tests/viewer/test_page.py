@@ -347,6 +347,9 @@ def test_the_light_follows_the_pointer(actual, lit, kind):
     light = tab.run("lights.direction")
     np.testing.assert_allclose(light, [-(0.75**0.5), 0, 0.5], atol=1e-6)
     assert differ(tab.image(), codes(model.relight(light))) < 0.1
+    tab.page.check("#follows")
+    tab.page.locator("#view").press("+")
+    assert tab.run("lights.direction") == light
 
 
 def test_the_light_follows_a_finger(show, lit):

@@ -5,9 +5,10 @@ const ZOOM_STEP = 1.25;
 /**
  * Pan and zoom by mouse, touch, pen and keyboard.
  * `moved()` runs after every change, `pointed(x, y)` with the pixel under the pointer or null.
+ * After a key, `centred(x, y)` gets the pixel in the middle.
  * `steered(x, y)` gets the pixel under a single finger first: if it returns true, the picture stays.
  */
-function listen(canvas, camera, { moved, steered, pointed }) {
+function listen(canvas, camera, { moved, steered, pointed, centred }) {
   const pointers = new Map();
   let travelled = 0;
   let lastTap = 0;
@@ -83,6 +84,6 @@ function listen(canvas, camera, { moved, steered, pointed }) {
     event.preventDefault();
     keys[event.key]();
     moved();
-    pointed(camera.width / 2, camera.height / 2);
+    centred(camera.width / 2, camera.height / 2);
   });
 }

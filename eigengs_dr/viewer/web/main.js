@@ -18,13 +18,15 @@ function start() {
     window.lights = new Lights(facts.lights, set);
     steer = connectLights(viewer, window.lights);
   }
+  const choose = (x, y) => showChosen(viewer, viewer.choose(x, y));
   listen(viewer.canvas, viewer.camera, {
     moved: () => viewer.redraw(true),
     steered: steer,
     pointed: (x, y) => {
       const isLight = x !== null && steer(x, y); // which no outline disturbs
-      showChosen(viewer, viewer.choose(isLight ? null : x, y));
+      choose(isLight ? null : x, y);
     },
+    centred: facts.lights ? () => {} : choose,
   });
   viewer.draw();
   viewer.renderer.finish();
