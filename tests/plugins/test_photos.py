@@ -196,7 +196,7 @@ def test_a_judge_renders_with_the_parameters():
     photos = photos_of(wall(true_texture(), light=1.5))
     light = mi.ad.Adam(lr=0.03, params={"sky.radiance.value": mi.Float(1.5)})
     loss = photo_loss(wall(GREY), NAME, photos, held_out=0.2, parameters=light)
-    assert abs(loss.judge(mi.TensorXf(true_texture())).array[0]) < 1e-3
+    assert abs(loss.judge(mi.TensorXf(true_texture())).array[0]) < 5e-3  # 0.06 without
 
 
 def test_bounds_are_those_of_textures_or_none():
