@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -45,7 +45,7 @@ def photo_loss(
     integrator: mi.Integrator | None = None,
     spp: int = 4,
     held_out: float = 0.0,
-    bounds: tuple[float, float] | str | None = "auto",
+    bounds: tuple[float, float] | Literal["auto"] | None = "auto",
     parameters: Any = None,
     seed: int = 0,
     encoding: str | None = None,

@@ -25,7 +25,7 @@ from eigengs_bench.names import (
 )
 from eigengs_bench.rows import FILE, Row, Task, code_state
 from eigengs_bench.rows import record as record_rows
-from eigengs_dr.backend.selection import select
+from eigengs_dr.backend.selection import name_of, select
 from eigengs_dr.cli import options
 from eigengs_dr.cli.console import FAILED, bar
 from eigengs_dr.cli.options import number
@@ -77,14 +77,18 @@ def question(bench: str, usual: tuple[str, ...] = ()) -> Any:
                 settings["names"] = settings["names"] or (usual if shared["data"] else (SAMPLES,))
                 if not shared["data"] and set(settings["names"]) - {SAMPLES}:
                     raise ValueError("--set needs DATA, the folder of the set, for all but samples")
+            if record and not (CHECKOUT / "docs").exists():
+                raise click.UsageError("--record needs a checkout: pip install -e ./benchmarks")
             folder.mkdir(parents=True, exist_ok=True)
             check_outputs([folder / FILE], [])
-            select(run.backend)
-            about = {**describe_run(run.context, run.backend), **code_state()}
+            backend = name_of(select(run.backend))
+            about = {**describe_run(run.context, backend), **code_state()}
             module = import_module(f"eigengs_bench.{bench}")
             with bar(run.quiet) as show:
-                task = Task(folder, about, backend=run.backend, progress=show, **shared)
+                task = Task(folder, about, backend=backend, progress=show, **shared)
                 rows = module.run(task, **settings)
+            if not rows:
+                raise ValueError("these options and DATA leave nothing to measure")
             _show(module.summarize(rows), rows, folder, run)
             if record:
                 from eigengs_bench.pages import ROWS, write
@@ -282,7 +286,6 @@ def kernels() -> None:
 @question("texture")
 @data_argument
 @several("--part", "parts", TEXTURE_PARTS, "What to compare", TEXTURE_PARTS)
-@click.option("--variant", default="llvm_ad_rgb", help="Variant of Mitsuba.")
 def texture() -> None:
     """Compare Gaussians with bitmaps in Mitsuba.
 

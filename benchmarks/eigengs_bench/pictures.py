@@ -91,9 +91,11 @@ def _curves_chart(rows: Sequence[Row]) -> Figure:
         for preset in PRESETS:
             job = {"set": name, "preset": preset}
             some = [row for row in rows if job.items() <= row["job"].items()]
+            marks: list[int] = max((row["marks"] for row in some), key=len, default=[])
             # A fit that has failed is None in a file, and NaN here.
-            means = np.mean(np.array([row["psnr_ycbcr"] for row in some], float), axis=0)
-            axis.plot(some[0]["marks"], means, label=preset, color=fr.COLORS[preset])
+            curves = [row["psnr_ycbcr"] for row in some if row["marks"] == marks]
+            means = np.mean(np.array(curves, float), axis=0) if marks else []
+            axis.plot(marks, means, label=preset, color=fr.COLORS[preset])
         fr.label_axes(axis, "iterations", "PSNR in YCbCr / dB", "", False, title=name)
     fr.legend_below(figure, axes[0], len(PRESETS))
     return figure

@@ -32,7 +32,7 @@ HELD = (1_000, 10_000, 100_000)  # Gaussians of the files that are loaded
 PIXELS = 32  # of the picture of a file, for each of its Gaussians
 
 
-def run(task: Task, variant: str, parts: Sequence[str] = TEXTURE_PARTS) -> list[Row]:
+def run(task: Task, parts: Sequence[str] = TEXTURE_PARTS) -> list[Row]:
     """Time a material ball with each texture in turn; every figure is a median.
 
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_filtered_N` with
@@ -45,6 +45,7 @@ def run(task: Task, variant: str, parts: Sequence[str] = TEXTURE_PARTS) -> list[
     memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
     For the other rows see `eigengs_bench.poster` and `eigengs_bench.sky`.
     """
+    variant = f"{task.backend}_ad_rgb"
     ball: Row = {"variant": variant, "at": time.time()}  # each call measures anew
     jobs: dict[str, Iterable[Job]] = {
         "posters": poster.jobs(variant, task.data),

@@ -20,6 +20,7 @@ from . import options
 if TYPE_CHECKING:
     import eigengs_dr as eg
 from .console import MISSED, print_message, table
+from .outputs import plain
 
 
 @click.command()
@@ -57,9 +58,13 @@ def doctor(
         print_message(f"{name}: on llvm and on {device}")
         comparisons.append(compare_backends(name, device))
     if as_json:
-        rows = [{**row._asdict(), "agrees": row.agrees} for row in comparisons]
+        sides = [{"llvm": row.llvm._asdict(), "gpu": row.gpu._asdict()} for row in comparisons]
+        rows = [
+            {**row._asdict(), **side, "agrees": row.agrees}
+            for row, side in zip(comparisons, sides, strict=True)
+        ]
         facts |= {"trials": rows} if gpu else {}
-        click.echo(json.dumps(facts, indent=2, default=str))
+        click.echo(json.dumps(plain(facts), indent=2))
     else:
         click.echo(machine.describe_machine(facts))
     if gpu and not as_json:

@@ -56,7 +56,7 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
 @options.value("--target-psnr", "DB", float, "Take the fewest Gaussians for this PSNR.")
 @options.choice("--target-space", ["rgb", "ycbcr"], "Colour space of --target-psnr.", True)
 @options.number("--max-gaussians", "Largest number of Gaussians for --target-psnr.")
-@options.value("--blocks", "SIZE", int, "Fit by blocks of this side.")
+@options.value("--blocks", "SIZE", click.IntRange(min=1), "Fit by blocks of this side.")
 @options.level_counts("Number of levels of detail, each 4 times as large, or Gaussians up to each.")
 @options.number("--iterations", "Optimisation steps.", 1000)
 @options.choice("--init", INITS, "Initial placement.  [default: adaptive]", True)
@@ -148,8 +148,8 @@ def fit(
             print_message(line)
     if blocks and not has_blocks:
         raise ValueError(
-            "--blocks needs the default preset and init; leave out --target-psnr, --levels and "
-            "--preview"
+            "--blocks needs the default preset and init; leave out --basis, --target-psnr, "
+            "--levels and --preview"
         )
     if not run.cluster:
         select(run.backend)

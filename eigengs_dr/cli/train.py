@@ -10,7 +10,7 @@ from ..backend.selection import select
 from ..backend.types import Record
 from . import options
 from .console import INTERRUPTED, bar, open_cluster, print_message
-from .outputs import check_outputs, name_outputs, name_pictures
+from .outputs import check_outputs, lock_outputs, name_outputs, name_pictures
 
 FREQUENCY_AWARE: dict[str, bool | str] = {"auto": "auto", "yes": True, "no": False}
 """Values of the option by their names on the command line."""
@@ -160,6 +160,7 @@ def _train_on_lights(
     [picture] = name_pictures([folder], preview)
     photos = [Path(folder) / name for name in read_lights(lights)[0]]
     check_outputs([output, picture, run.report], [lights, *photos])
+    lock_outputs(output)
     select(run.backend)
     steps = choices["iterations"]
     started, stopped = time.perf_counter(), False

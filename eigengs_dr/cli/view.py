@@ -15,7 +15,7 @@ from ..gaussian import file as set_file
 from ..gaussian.packed import is_packed
 from ..storage import npz
 from . import options
-from .console import prefix_errors
+from .console import prefix_errors, print_message
 from .outputs import check_outputs, lock_outputs, name_outputs
 
 SUFFIXES = (".html", ".htm")
@@ -71,8 +71,8 @@ def view(
         result = eg.view(source, photo, levels=counts, title=file.stem, encoding=encoding)
     result.save(page)
     run.tell(f"{file}: wrote {page} ({page.stat().st_size:,} bytes)")
-    if opens:
-        click.launch(str(page))
+    if opens and click.launch(str(page)):
+        print_message(f"note: no program opens {page}; open it in a browser")
 
 
 def _load(

@@ -9,6 +9,7 @@ import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
 from _helpers.packed import few_groups
+from eigengs_dr.storage.atomic import lock_output
 
 LIGHTS = directions(16)
 
@@ -83,3 +84,10 @@ def test_wrong_commands_are_refused_in_one_line(
 def test_photos_at_a_url_are_refused(folder, tmp_path):
     lights = ["--lights", folder / "dirs.lp", "-o", tmp_path / "x.npz"]
     assert_refused(run("train", "https://host.example/photos", *lights), "a folder of this machine")
+
+
+def test_a_second_training_into_one_model_is_refused(folder, tmp_path):
+    output = tmp_path / "x.npz"
+    with lock_output(output):
+        ended = run("train", folder, "--lights", folder / "dirs.lp", "-o", output)
+    assert_refused(ended, "wait for its end")

@@ -43,6 +43,11 @@ def test_writes_a_page_here(photo, monkeypatch):
     assert "64 Gaussians, 32 x 24 pixels" in page_of(photo) and levels_of(page_of(photo)) == ""
 
 
+def test_no_program_that_opens_a_page_is_told(photo, monkeypatch):
+    monkeypatch.setattr("click.launch", lambda page: 1)
+    assert "no program opens photo.html" in run("view", photo, "--open").stderr
+
+
 def test_shows_levels_and_a_photo(photo):
     assert said("view", photo, "--image", "photo.png", "--levels", 3, "--quiet") == ""
     assert levels_of(page_of(photo)) == "4, 16, 64"
