@@ -49,13 +49,14 @@ help:
 
 setup: $(READY)
 
-# pip prints hundreds of lines; the log has them, and its end is shown where pip fails.
+# pip prints hundreds of lines; the log has them, and its end is shown where pip fails. Python
+# compiles what it imports, which is a small part of what pip would compile.
 $(READY): pyproject.toml benchmarks/pyproject.toml
 	@$(APT_INSTALL); $(PYTHON) -c 'import ensurepip' 2>/dev/null \
 		|| apt_install python3-venv "$(VENV_ADVICE)"
 	@$(PYTHON) -m venv .venv
 	@echo "make setup: installing into .venv, in about a minute"
-	@$(BIN)/python -m pip install --disable-pip-version-check --editable '.[dev]' \
+	@$(BIN)/python -m pip install --disable-pip-version-check --no-compile --editable '.[dev]' \
 		--editable ./benchmarks >.venv/setup.log 2>&1 \
 		|| { tail -n 20 .venv/setup.log >&2; \
 			echo "make setup: pip failed; .venv/setup.log has all that it said" >&2; exit 1; }
