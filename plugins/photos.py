@@ -22,6 +22,7 @@ from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_floats
 from eigengs_dr.image.pixels import ImageError, check_encoding, reason_of
 from eigengs_dr.image.read import is_picture
+from eigengs_dr.image.space import space_of
 
 from .environment import texels_of
 from .follow import check_scene, sensor_of
@@ -427,14 +428,13 @@ def _space_for(known: mi.SceneParameters, name: str, key: str) -> str:
 
 def _bounds_for(spaces: set[str]) -> tuple[float, float] | None:
     """Return the bounds of maps of some spaces: those of textures, and none for an ``envmap``."""
-    if "log" not in spaces:
-        return 0.0, 1.0
-    if len(spaces) > 1:
+    bounded = {space_of(space).bounded for space in spaces}
+    if len(bounded) > 1:
         raise ValueError(
             "photo_loss: bounds hold for all maps, and light of an envmap has none; give "
             "bounds=None, or recover them one after another"
         )
-    return None
+    return (0.0, 1.0) if bounded == {True} else None
 
 
 def _check_photo(number: int, photo: Any, size: Sequence[int], encoding: str | None) -> mi.TensorXf:

@@ -58,18 +58,19 @@ def doctor(
         print_message(f"{name}: on llvm and on {device}")
         comparisons.append(compare_backends(name, device))
     if as_json:
-        sides = [{"llvm": row.llvm._asdict(), "gpu": row.gpu._asdict()} for row in comparisons]
-        rows = [
-            {**row._asdict(), **side, "agrees": row.agrees}
-            for row, side in zip(comparisons, sides, strict=True)
-        ]
-        facts |= {"trials": rows} if gpu else {}
+        facts |= {"trials": list(map(_record, comparisons))} if gpu else {}
         click.echo(json.dumps(plain(facts), indent=2))
     else:
         click.echo(machine.describe_machine(facts))
     if gpu and not as_json:
         click.echo("\n".join(["", *_describe(comparisons, device)]))
     context.exit(0 if works and all(row.agrees for row in comparisons) else MISSED)
+
+
+def _record(row: Agreement) -> Record:
+    """Return a trial with the names of its figures, for JSON."""
+    sides = {"llvm": row.llvm._asdict(), "gpu": row.gpu._asdict()}
+    return row._asdict() | sides | {"agrees": row.agrees}
 
 
 def _describe(comparisons: list[Agreement], device: str) -> list[str]:

@@ -15,6 +15,7 @@ from eigengs_bench import clock, images, rows
 from eigengs_bench import report as fr
 from eigengs_bench.names import PRESETS as NAMES
 from eigengs_bench.names import SETS, ImageSet
+from eigengs_bench.pictures import _curves_chart
 from eigengs_dr.cli.fit import PRESETS as COMMANDS
 from eigengs_dr.image.io import ImageError, save_image
 
@@ -143,6 +144,20 @@ def test_mistakes_are_told_before_the_work(tmp_path):
 
 
 # --- Programs in turns, sets of images and their models ---
+
+
+def test_nothing_to_measure_is_told(tmp_path):
+    ended = run("bench", "tables", "-o", tmp_path, "--table", "ablation")
+    assert_refused(ended, "leave nothing to measure")
+
+
+def test_curves_are_those_of_the_longest_fits():
+    fits = []
+    for preset, count in zip((*NAMES, NAMES[0]), (3, 3, 3, 2), strict=True):
+        job = {"set": "samples", "preset": preset, "iterations": count}
+        fits.append({"job": job, "marks": [*range(count)], "psnr_ycbcr": [20.0] * count})
+    lines = _curves_chart(fits).axes[0].lines
+    assert [len(line.get_xdata()) for line in lines] == [3, 3, 3]
 
 
 def test_methods_have_the_names_of_the_command_line():

@@ -85,6 +85,8 @@ MISTAKES = {
     "blocks, preview": (["--blocks", 64, "--preview", "x.png"], ["--blocks needs", "--preview"]),
     "blocks, init": (["--blocks", 64, "--init", "random"], ["--blocks needs"]),
     "small blocks": (["--blocks", 5], ["at least 32"]),
+    "no blocks": (["--blocks", 0], ["--blocks"]),
+    "blocks, basis": (["--blocks", 64, "--basis", "natural"], ["--blocks needs", "--basis"]),
     "basis": (["--basis", "nowhere"], ["'nowhere'", "natural"]),
     "basis, folder": (["--basis", "."], ["neither a file"]),
     "no folder": (["-o", "gone/x.npz"], ["gone"]),
