@@ -43,20 +43,13 @@ def _read_packed(path: Path, sections: int | None) -> SetData:
     return read_egs(path, sections).set_data()
 
 
-def _packed_maps(path: Path) -> tuple[TextureMap, ...]:
-    from .codec.egs import read_egs_maps
+def _packed_head(path: Path) -> tuple[tuple[TextureMap, ...], bytes]:
+    from .codec.egs import read_egs_head
 
-    return read_egs_maps(path)
-
-
-def _packed_lights(path: Path) -> bytes:
-    from .codec.egs import read_egs_lights
-
-    return read_egs_lights(path)
+    return read_egs_head(path)
 
 
 messages.make_html = _make_html
-packed.read_set, packed.read_maps = _read_packed, _packed_maps
-packed.read_lights = _packed_lights
+packed.read_set, packed.read_head = _read_packed, _packed_head
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

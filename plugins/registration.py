@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,14 +13,14 @@ from eigengs_dr.backend import recording
 from .gaussian_environment import gaussian_environment
 from .gaussian_relightable import gaussian_relightable
 from .gaussian_texture import gaussian_texture
-from .versions import register_bsdf, register_emitter, register_texture
+from .versions import register
 
-PLUGINS: dict[str, tuple[Callable[[str, Any], None], Callable[[], type]]] = {
-    "gaussian_texture": (register_texture, gaussian_texture),
-    "gaussian_environment": (register_emitter, gaussian_environment),
-    "gaussian_relightable": (register_bsdf, gaussian_relightable),
+PLUGINS: dict[str, tuple[str, Callable[[], type]]] = {
+    "gaussian_texture": ("texture", gaussian_texture),
+    "gaussian_environment": ("emitter", gaussian_environment),
+    "gaussian_relightable": ("bsdf", gaussian_relightable),
 }
-"""How each plugin is registered, and what makes its class for the current variant."""
+"""The kind of each plugin, and what makes its class for the current variant."""
 
 
 def register_plugins() -> None:
@@ -60,8 +59,8 @@ def _follow() -> None:
 @cache  # once for each variant
 def _register(variant: str) -> None:
     scalar = variant.startswith("scalar")
-    for name, (register, create) in PLUGINS.items():
-        register(name, partial(_refuse, name) if scalar else create())
+    for name, (kind, create) in PLUGINS.items():
+        register(kind, name, partial(_refuse, name) if scalar else create())
 
 
 def _refuse(name: str, props: mi.Properties) -> None:

@@ -36,30 +36,20 @@ def texture_kind() -> object:
     return _renamed(mi.ObjectType, "Texture", "Field")
 
 
-def register_texture(name: str, create: Callable[[mi.Properties], Texture]) -> None:
-    """Register a texture with the current variant, by the type of the plugin in scenes.
+def register(kind: str, name: str, create: Callable[[mi.Properties], Any]) -> None:
+    """Register a plugin with the current variant.
 
     Parameters
     ----------
+    kind : {"texture", "emitter", "bsdf"}
     name : str
+        The type of the plugin in scenes.
     create : callable
-        A subclass of `texture_class`, or a function that refuses the properties.
+        A class of the kind, or a function that refuses the properties.
     """
-    if hasattr(mi, "register_texture"):
-        mi.register_texture(name, reason_first(create))
-    else:
-        field = _as_field(create) if isinstance(create, type) else create
-        mi.register_field(name, reason_first(field))
-
-
-def register_emitter(name: str, create: Callable[[mi.Properties], Any]) -> None:
-    """Register an emitter with the current variant, by the type of the plugin in scenes."""
-    mi.register_emitter(name, reason_first(create))
-
-
-def register_bsdf(name: str, create: Callable[[mi.Properties], Any]) -> None:
-    """Register a material with the current variant, by the type of the plugin in scenes."""
-    mi.register_bsdf(name, reason_first(create))
+    if kind == "texture" and not hasattr(mi, "register_texture"):
+        kind, create = "field", _as_field(create) if isinstance(create, type) else create
+    getattr(mi, f"register_{kind}")(name, reason_first(create))
 
 
 @cache

@@ -239,6 +239,7 @@ RUN_AS_A_WHOLE = (  # above
     "how-to/own-loop.md",
     "how-to/recover.md",
     "getting-started.md",
+    "extending.md",  # below
 )
 
 

@@ -84,14 +84,14 @@ class Scene(NamedTuple):
     def load(self, mi: Any, maps: Maps | None = None) -> Any:
         """Load the scene of Mitsuba with maps, by default those of the start."""
         maps = maps or {name: grey(self.kind, name) for name in self.maps}
-        return _load(mi, self.kind, maps, self.cameras, self.data)
+        return load_scene(mi, self.kind, _bitmaps(mi, maps), self.cameras, self.data)
 
 
 @cache
 def scene_of(mi: Any, kind: str, cameras: int, data: Path | None) -> Scene:
     """Make a scene with the photos of its cameras and judges, once."""
     maps = _maps(kind, data)
-    loaded = _load(mi, kind, maps, cameras, data)
+    loaded = load_scene(mi, kind, _bitmaps(mi, maps), cameras, data)
     photos, seen = photos_of(mi, loaded), _seen(mi, loaded, kind, cameras)
     return Scene(kind, cameras, maps, photos, seen, data)
 
@@ -144,8 +144,14 @@ def bitmap(mi: Any, values: Image) -> dict[str, Any]:
     return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
 
 
-def _load(mi: Any, kind: str, maps: Maps, count: int, data: Path | None) -> Any:
-    textures = {name: bitmap(mi, values) for name, values in maps.items()}
+def _bitmaps(mi: Any, maps: Maps) -> dict[str, Any]:
+    return {name: bitmap(mi, values) for name, values in maps.items()}
+
+
+def load_scene(
+    mi: Any, kind: str, textures: Mapping[str, Any], count: int, data: Path | None = None
+) -> Any:
+    """Load a scene with textures in place of its maps, `count` cameras, and the judges."""
     if kind in ("painting", "wall"):
         assert data is not None
         content, cameras = _hung(mi, kind, textures, data), _before_the_painting(mi)

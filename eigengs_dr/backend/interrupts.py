@@ -127,13 +127,9 @@ def defer_interrupts() -> Iterator[Callable[[], bool]]:
     False
     """
     received: list[bool] = []
-    with _first_signal(_is_heard, lambda: received.append(True)):
-        yield lambda: bool(received)
-
-
-def _is_heard(handler: Handler) -> bool:
     # Python cannot restore a handler that is None; an ignored signal stays ignored.
-    return handler not in (None, signal.SIG_IGN)
+    with _first_signal(lambda h: h not in (None, signal.SIG_IGN), lambda: received.append(True)):
+        yield lambda: bool(received)
 
 
 @contextmanager

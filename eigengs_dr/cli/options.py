@@ -1,6 +1,7 @@
 """Options that several commands share, and the types of their values."""
 
 import glob
+import json
 import re
 from collections.abc import Callable, Iterable
 from functools import wraps
@@ -15,8 +16,8 @@ from ..backend.types import Record
 from ..image.pixels import ENCODINGS
 from ..image.remote import is_url
 from ..image.space import SPACES
-from ..storage.atomic import refuse_url
-from .outputs import describe_run, write_json
+from ..storage.atomic import atomic_write, refuse_url
+from .outputs import describe_run, plain
 
 EXISTING = click.Path(exists=True, dir_okay=False, path_type=Path)
 
@@ -257,7 +258,9 @@ class Run(NamedTuple):
     def write_report(self, figures: dict[str, object], backend: str | None = None) -> None:
         """Write figures, the command and the machine as JSON; `backend` overrides the option."""
         if self.report:
-            write_json(self.report, describe_run(self.context, backend or self.backend) | figures)
+            content = plain(describe_run(self.context, backend or self.backend) | figures)
+            with atomic_write(self.report) as temporary:
+                temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def shared(*names: str) -> Option:

@@ -14,7 +14,7 @@ from ..backend.selection import describe
 from ..gaussian.file import FORMAT, MATERIAL
 from ..image.remote import stem_of
 from ..storage import npz
-from ..storage.atomic import atomic_write, lock_output, remove_stale, require_writable
+from ..storage.atomic import lock_output, remove_stale, require_writable
 from .console import NAME
 
 
@@ -144,18 +144,6 @@ def check_replaceable(output: Path, maps: bool) -> None:
 def describe_run(context: click.Context, backend: str | None) -> dict[str, object]:
     """Return the command line and the machine, for a report."""
     return {"command": shlex.join([NAME, *context.obj]), **describe(backend)}
-
-
-def write_json(path: Path, figures: dict[str, object]) -> None:
-    """Write figures as JSON atomically; see `plain`.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an existing file does not change.
-    """
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(plain(figures), indent=2) + "\n", encoding="utf-8")
 
 
 def plain(value: object) -> Any:

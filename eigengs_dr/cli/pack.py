@@ -89,45 +89,35 @@ def _pack(
     """Pack one set into a file, and return its figures."""
     from ..relight.model import holds_lights
 
-    if holds_lights(file):
-        return _pack_lights(file, target, run, bool(image or maps or levels), drop)
-    gaussians = eg.Gaussians.load(file, run.backend)
-    if maps and not gaussians.maps:
-        raise ValueError(f"{file}: holds one image and no maps; give --image instead of --map")
-    if image and gaussians.maps:
-        raise ValueError(f"{file}: holds a material; give its images with --map NAME=FILE")
-    if levels is not None and gaussians.maps:
-        raise ValueError(f"{file}: a material has no levels in .egs files; leave out --levels")
-    images: Any = {name: m.path for name, m in maps.items()} or image
-    counts = eg.level_counts(len(gaussians), 1 if levels is None else levels)
-    sections = [n - before for before, n in zip([0, *counts], counts, strict=False)]
-    packed = eg.pack(gaussians, target, images, drop, sections, encoding=encoding)
     before = file.stat().st_size
+    if holds_lights(file):
+        if image or maps or levels:
+            raise ValueError(f"{file}: a model of lights takes no --image, --map and --levels")
+        model = eg.Relightable.load(file, run.backend)
+        gaussians, packed = model.planes, eg.pack(model, target, max_psnr_drop=drop)
+        compared = " of left-out lights"
+    else:
+        gaussians = eg.Gaussians.load(file, run.backend)
+        if maps and not gaussians.maps:
+            raise ValueError(f"{file}: holds one image and no maps; give --image instead of --map")
+        if image and gaussians.maps:
+            raise ValueError(f"{file}: holds a material; give its images with --map NAME=FILE")
+        if levels is not None and gaussians.maps:
+            raise ValueError(f"{file}: a material has no levels in .egs files; leave out --levels")
+        images: Any = {name: m.path for name, m in maps.items()} or image
+        counts = eg.level_counts(len(gaussians), 1 if levels is None else levels)
+        sections = [n - fewer for fewer, n in zip([0, *counts], counts, strict=False)]
+        packed = eg.pack(gaussians, target, images, drop, sections, encoding=encoding)
+        against = "the original" if images else "the rendering of the input"
+        psnr = packed.psnr if isinstance(packed.psnr, dict) else {"": packed.psnr}
+        values = ", ".join(f"{key} {value:.2f} dB".strip() for key, value in psnr.items())
+        name = "psnr_rgb" if gaussians.maps else gaussians.space.comparable_name
+        compared = f"; {name} against {against}: {values}"
     figures: Record = {"input": file, "output": target, "bytes_before": before, **packed._asdict()}
     figures |= {"gaussians": len(packed.gaussians), "steps": packed.steps._asdict()}
-    against = "the original" if images else "the rendering of the input"
-    psnr = packed.psnr if isinstance(packed.psnr, dict) else {"": packed.psnr}
-    values = ", ".join(f"{key} {value:.2f} dB".strip() for key, value in psnr.items())
-    name = "psnr_rgb" if gaussians.maps else gaussians.space.comparable_name
     run.tell(
         f"{file}: {len(gaussians):,} Gaussians, {before:,} bytes",
         f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel",
-        f"  lost {packed.psnr_drop:.2f} dB; {name} against {against}: {values}",
-    )
-    return figures
-
-
-def _pack_lights(file: Path, target: Path, run: options.Run, given: bool, drop: float) -> Record:
-    """Pack a model of lights into a file, and return its figures."""
-    if given:
-        raise ValueError(f"{file}: a model of lights takes no --image, --map and --levels")
-    model = eg.Relightable.load(file, run.backend)
-    packed, before = eg.pack(model, target, max_psnr_drop=drop), file.stat().st_size
-    figures: Record = {"input": file, "output": target, "bytes_before": before, **packed._asdict()}
-    figures |= {"gaussians": len(packed.gaussians), "steps": packed.steps._asdict()}
-    run.tell(
-        f"{file}: {len(model.planes):,} Gaussians, {before:,} bytes",
-        f"  wrote {target}: {packed.bytes:,} bytes, {packed.bits_per_pixel:.3f} bits per pixel",
-        f"  lost {packed.psnr_drop:.2f} dB of left-out lights",
+        f"  lost {packed.psnr_drop:.2f} dB{compared}",
     )
     return figures

@@ -99,7 +99,7 @@ def _load(
             raise ValueError(f"{file}: is a model; leave out --levels and --map")
         return eg.EigenGS.load(file, backend), []
     with prefix_errors(file):
-        check_count(sum(sections) or set_file.read_head(file).gaussians)
+        check_count(sum(sections) or set_file.read_head(file)[0])
         gaussians = eg.Gaussians.from_data(set_file.read_map(file, name, "--map"), backend)
         if levels is not None:
             return gaussians, eg.level_counts(len(gaussians), levels)

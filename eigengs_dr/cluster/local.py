@@ -43,22 +43,11 @@ def local_cluster(workers: int, **settings: object) -> LocalCluster:
 def dask_setup(worker: Worker) -> None:
     """Set up the process of a worker; Dask calls this function before the first task."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes
-    choose_gpu(worker.name)
+    gpus = len(list(Path("/proc/driver/nvidia/gpus").glob("*")))
+    if gpus > 1 and isinstance(worker.name, int):  # as the workers of a `LocalCluster` are named
+        os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(worker.name % gpus))
     # Dr.Jit keeps memory for reuse during a task, so neither pausing nor spilling to disk helps. At
     # 95 % of its limit a worker is restarted. A configuration would not reach the new process.
     worker.memory_manager.memory_pause_fraction = False
     worker.memory_manager.memory_spill_fraction = False
     worker.memory_manager.memory_target_fraction = False
-
-
-def choose_gpu(name: object) -> None:
-    """Assign one GPU of the machine to each worker, unless CUDA_VISIBLE_DEVICES is set.
-
-    Parameters
-    ----------
-    name : object
-        Name of the worker. Workers of a `distributed.LocalCluster` are named 0, 1, 2.
-    """
-    count = len(list(Path("/proc/driver/nvidia/gpus").glob("*")))
-    if count > 1 and isinstance(name, int):
-        os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(name % count))

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..backend.types import Integers
 from ..gaussian.channels import TextureMap, channel_weights, check_maps
-from ..gaussian.file import CUTOFF, SetData, check
+from ..gaussian.file import CUTOFF, SetData, check, file_errors
 from ..gaussian.packed import MAGIC
 from ..image.color import MAX_CHANNELS
 from ..image.space import SPACES, Space
@@ -146,10 +146,8 @@ def write_egs(path: str | os.PathLike[str], packed: EgsContent) -> int:
     OSError
         If the file cannot be written; an existing file does not change.
     """
-    try:
+    with file_errors(path):
         check(packed.set_data())
-    except BadValue as error:
-        raise ValueError(f"{path}: {error}") from None
     content = egs_bytes(packed)
     with atomic_write(path) as temporary:
         return temporary.write_bytes(content)
@@ -253,16 +251,11 @@ def read_egs(path: str | os.PathLike[str], sections: int | None = None) -> EgsCo
         return content
 
 
-def read_egs_maps(path: str | os.PathLike[str]) -> tuple[TextureMap, ...]:
-    """Return the maps of a packed set, without its Gaussians; errors as for `read_egs`."""
+def read_egs_head(path: str | os.PathLike[str]) -> tuple[tuple[TextureMap, ...], bytes]:
+    """Return the maps of a packed set, and the table of lights of planes; errors as `read_egs`."""
     with _opened(path) as file:
-        return _read_header(file)[3].maps
-
-
-def read_egs_lights(path: str | os.PathLike[str]) -> bytes:
-    """Return the table of lights of packed planes, empty for other sets; errors as `read_egs`."""
-    with _opened(path) as file:
-        return _read_header(file)[3].lights
+        content = _read_header(file)[3]
+    return content.maps, content.lights
 
 
 def section_counts(path: str | os.PathLike[str]) -> list[int]:
@@ -275,11 +268,8 @@ def section_counts(path: str | os.PathLike[str]) -> list[int]:
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a file, and put its name into errors."""
-    with open(path, "rb") as file:
-        try:
-            yield file
-        except BadValue as error:
-            raise ValueError(f"{path}: {error}") from None
+    with open(path, "rb") as file, file_errors(path):
+        yield file
 
 
 def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:

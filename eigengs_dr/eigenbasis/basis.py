@@ -178,7 +178,9 @@ class Eigenbasis:
         if actual != expected:
             raise ValueError(f"coefficients have shapes {actual}; expected {expected}")
         pairs = zip(weights, self.components, strict=True)
-        return _rgb(self.mean + np.stack([np.tensordot(w, c, 1) for w, c in pairs]), self.space)
+        planes = self.mean + np.stack([np.tensordot(w, c, 1) for w, c in pairs])
+        image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
+        return np.asarray(space_of(self.space).decode_image(image))
 
     def energy(self) -> tuple[Doubles, ...]:
         """Return the share of the variance of the first 1, 2, ..., k_c components.
@@ -253,12 +255,6 @@ class Eigenbasis:
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
         pairs = zip(lengths, self._coefficients(planes), strict=True)
         return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
-
-
-def _rgb(planes: Singles, space: str) -> Singles:
-    """Convert planes (C, H, W) of a colour space to RGB (H, W, 3)."""
-    image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
-    return np.asarray(space_of(space).decode_image(image))
 
 
 def check_components(

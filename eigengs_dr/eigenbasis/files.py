@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.types import Arrays, Record, Singles
-from ..gaussian.file import CUTOFF, SetData, check
+from ..gaussian.file import CUTOFF, SetData, check, file_errors
 from ..gaussian.gaussians import Gaussians
 from ..image.space import FAMILY_SPACES, space_of
 from ..storage import npz
@@ -76,7 +74,7 @@ def read_basis(path: str | os.PathLike[str]) -> Record:
     shapes = {"mean": (3, max(1, height), max(1, width)), "variance": (3,)}
     components = {f"components{c}": (len(head[f"eigenvalues{c}"]), height, width) for c in range(3)}
     layout = {key: Field("f4", 3, math.prod(shape)) for key, shape in components.items()}
-    with _named(path):
+    with file_errors(path):
         check_arrays(head, shapes)
         if head["count"] < 1:
             raise BadValue(f"count is {head['count']}, expected at least 1")
@@ -95,7 +93,7 @@ def read_basis(path: str | os.PathLike[str]) -> Record:
 def write_model(path: str | os.PathLike[str], fields: Record) -> None:
     """Write the fields of an `eigengs_dr.EigenGS` atomically; see its `save`."""
     arrays = model_arrays(fields)
-    with _named(path):
+    with file_errors(path):
         check_model(arrays)
     npz.write(path, MODEL_FORMAT, MODEL_VERSION, arrays)
 
@@ -103,7 +101,7 @@ def write_model(path: str | os.PathLike[str], fields: Record) -> None:
 def read_model(path: str | os.PathLike[str], backend: str | None) -> Record:
     """Read the fields of an `eigengs_dr.EigenGS`; see its `load`."""
     arrays = npz.read(path, MODEL_FORMAT, MODEL_VERSION, MODEL_LAYOUT)
-    with _named(path):
+    with file_errors(path):
         weights = check_model(arrays)
     low, low_components = arrays["split"].tolist()
     return {
@@ -232,12 +230,3 @@ def _set_of(arrays: Arrays) -> SetData:
     """Return the set that the arrays of a model hold."""
     parts = {key: arrays[key] for key in ("mean", "factor", "color", "background")}
     return SetData(parts, tuple(arrays["size"].tolist()), space_of(str(arrays["space"])))
-
-
-@contextmanager
-def _named(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the name of a file before what is wrong with its values."""
-    try:
-        yield
-    except BadValue as error:
-        raise ValueError(f"{Path(path)}: {error}") from None

@@ -11,7 +11,6 @@ from __future__ import annotations
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -88,10 +87,8 @@ def _divide(factor: SuperLU, sums: Doubles) -> Doubles:
     return factor.solve(np.asarray(sums, np.float32, order="F")).astype(np.float64)
 
 
-@cache
-def _threads() -> ThreadPoolExecutor:
-    """Return the thread pool for sparse products."""
-    return ThreadPoolExecutor(THREADS, thread_name_prefix="columns")
+_POOL = ThreadPoolExecutor(THREADS, thread_name_prefix="columns")
+"""The threads of sparse products; they start at the first one."""
 
 
 class NormalEquations:
@@ -198,7 +195,7 @@ class NormalEquations:
         columns = np.empty(flat.shape[::-1], np.float32)
         for first in range(0, len(columns), STRIP_PIXELS):
             columns[first : first + STRIP_PIXELS] = flat[:, first : first + STRIP_PIXELS].T
-        return np.vstack(list(_threads().map(lambda share: share @ columns, self.shares)))
+        return np.vstack(list(_POOL.map(lambda share: share @ columns, self.shares)))
 
     def _adjoint(self, planes: Singles, result: Doubles) -> None:
         """Write ``A^T D`` of few planes to an array (N, M), computed by Dr.Jit."""

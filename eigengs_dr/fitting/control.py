@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import make_divisor, types_of
 from ..backend.recording import record
 from ..backend.types import Bool, Float, Rows, UInt
-from ..gaussian.gaussians import Gaussians, concatenate, take
+from ..gaussian.gaussians import Gaussians, concatenate, take, whole
 from ..raster.binning.lists import TileLists
 from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums, sum_by_image, sum_lanes
@@ -298,7 +298,7 @@ class Perturb:
         curvature = objective.model.mean_curvature(objective.grid, objective.channels)
         error = squares / (curvature * dr.opaque(type(squares), max(1, len(movable))))
         seed = int(np.random.SeedSequence([key, step]).generate_state(1)[0])
-        color = [row + dr.zeros(type(squares), len(gaussians)) for row in gaussians.color]
+        color = whole(gaussians.color, gaussians)
         mean, factor = perturb(
             gaussians.mean, gaussians.factor, color, movable, error, strength, seed, images
         )
@@ -494,11 +494,10 @@ class _Comparison:
 
 def _compare(gaussians: Gaussians, objective: Pixels, lists: TileLists | None) -> _Comparison:
     """Compare a set with an objective; list the Gaussians of the tiles unless lists are given."""
-    types = types_of(gaussians.mean)
     if lists is None:
         lists = bin_gaussians(gaussians, images=objective.grid.images)
-    shape, zeros = detached_shape(gaussians), dr.zeros(types.Float, len(gaussians))
-    colors = [c + zeros for c in gaussians.color], list(gaussians.background)
+    shape = detached_shape(gaussians)
+    colors = whole(gaussians.color, gaussians), list(gaussians.background)
     dr.eval(shape, colors)
     return _Comparison(shape, colors, lists, gaussians.cutoff, objective.model)
 
@@ -619,10 +618,8 @@ def exchange(
 
         # What takes their places
         peaks = scene.peaks(slope, leaving - dropped)
-        mean, factor = (
-            type(rows)([row + dr.zeros(types.Float, total) for row in rows])
-            for rows in (gaussians.mean, gaussians.factor)
-        )
+        pair = gaussians.mean, gaussians.factor
+        mean, factor = (type(rows)(whole(rows, gaussians)) for rows in pair)
         if dr.width(peaks.rank):
             slot = peaks.image * dr.opaque(types.UInt, leaving) + peaks.rank
             slot = dr.gather(types.UInt, moved, slot)

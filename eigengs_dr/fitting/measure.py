@@ -20,7 +20,6 @@ from ..backend.types import Float, Record
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import RGB_TO_YCBCR, to_linear, to_pu21
 from ..image.metrics import psnr_from_mse
-from ..image.space import Space
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import forward, sum_by_image
 from ..raster.parameters import (
@@ -125,11 +124,13 @@ def _squared_errors(
                 error = sum(dr.square((s - v) * a) for s, v in zip(sums, seen, strict=True))
                 rendering, seen = ([dr.fma(v, a, b) for v in pixel] for pixel in (sums, seen))
             else:
-                rendering = shown_pixel(space, [dr.fma(s, a, b) for s in sums], light)
+                decoded = space.decode([dr.fma(s, a, b) for s in sums])
+                rendering = [space.display(v * light) for v in decoded]
                 if bases is not None:
                     rendering = [s + v for s, v in zip(rendering, bases[k], strict=True)]
-                error = squared_difference(rendering, seen, space.figure)
-            errors = error, squared_difference(rendering, seen, "rgb"), types.Float(len(seen))
+                error = sum(map(dr.square, DIFFERENCES[space.figure](rendering, seen)))
+            in_codes = sum(map(dr.square, DIFFERENCES["rgb"](rendering, seen)))
+            errors = error, in_codes, types.Float(len(seen))
             f = factors[k][0]
             totals = [t + dr.select(f > 0, e * f, 0) for t, e in zip(totals, errors, strict=True)]
         Double = dr.float64_array_t(types.Float)
@@ -137,16 +138,6 @@ def _squared_errors(
         for group, value in zip((floats, codes, areas), sums, strict=True):
             group.append(value)
     return [*floats, *codes, *areas]
-
-
-def shown_pixel(space: Space, sums: list, exposure: Float | float = 1.0) -> list:
-    """Convert the channels of a pixel as `eigengs_dr.picture_of` does, light to sRGB."""
-    return [space.display(channel * exposure) for channel in space.decode(sums)]
-
-
-def squared_difference(a: list, b: list, figure: str) -> Float:
-    """Return the squared difference of two pixels, lists of channels, as `eigengs_dr.psnr` does."""
-    return sum(dr.square(d) for d in DIFFERENCES[figure](a, b))
 
 
 def _minus(a: list, b: list) -> list:

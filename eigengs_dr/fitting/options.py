@@ -101,7 +101,7 @@ class Goal:
             raise ValueError(
                 f"target_psnr is {self.psnr}; it must be above 0 and at most {MAX_PSNR:g}"
             )
-        if self.space not in GOAL_SPACES:
+        if self.space not in ("rgb", "ycbcr"):
             raise ValueError(f"Goal: space {self.space!r} is unknown; use one of rgb, ycbcr")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1")
@@ -113,10 +113,6 @@ class Goal:
         is psnr_ycbcr, in the `figure` of the space.
         """
         return f"psnr_{self.space}" if space.has_rgb else "psnr_ycbcr"
-
-
-GOAL_SPACES = ("rgb", "ycbcr")
-"""Spaces of a `Goal`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,11 +138,9 @@ class FitOptions:
     levels: int | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.gaussians, Sequence) and not isinstance(self.gaussians, (str, bytes)):
-            object.__setattr__(self, "gaussians", tuple(_check_counts(None, self.gaussians)))
-        elif isinstance(self.gaussians, np.ndarray):
-            counts = tuple(_check_counts(None, self.gaussians.tolist()))
-            object.__setattr__(self, "gaussians", counts)
+        given = self.gaussians
+        if isinstance(given, (Sequence, np.ndarray)) and not isinstance(given, (str, bytes)):
+            object.__setattr__(self, "gaussians", tuple(_check_counts(None, list(given))))
         if self.target_psnr is not None and not isinstance(self.target_psnr, Goal):
             object.__setattr__(self, "target_psnr", Goal(self.target_psnr))
         kinds = FitOptions.__annotations__

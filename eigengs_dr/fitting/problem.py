@@ -18,13 +18,12 @@ from ..backend.arrays import ArrayTypes, types_in, types_of
 from ..backend.doors import plain_numbers
 from ..backend.selection import select
 from ..backend.types import ArrayLike, PathLike, Values
-from ..gaussian.channels import TextureMap, check_maps, check_name, usual_space
+from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space
 from ..gaussian.gaussians import Gaussians, one_image
 from ..image.io import check_data, check_image, read_image
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import EncodedImage, ImageError
 from ..image.space import DATA, YCBCR, Space, space_of
-from ..storage.npz import BadValue
 from .loss import LossObjective
 from .measure import Measured, Row, psnrs
 from .method import Model
@@ -354,24 +353,10 @@ def _unknown_channels(spaces: Spaces) -> tuple[Channels, ...]:
     known = {name: space_of(space) for name, space in named.items()}
     maps = [TextureMap(name, s, 1 if s.by_range else 3) for name, s in known.items()]
     if isinstance(spaces, Mapping):
-        _check_maps(maps)
-    return tuple(_channels_of(maps))
-
-
-def _check_maps(maps: Sequence[TextureMap]) -> None:
-    try:
         check_maps(maps, sum(m.channels for m in maps))
-    except BadValue as error:
-        raise ValueError(str(error)) from None
-
-
-def _channels_of(maps: Sequence[TextureMap]) -> list[Channels]:
-    """Return the channels of maps, one after the other."""
-    ends = np.cumsum([m.channels for m in maps]).tolist()
-    return [
-        Channels(m.name, m.space, slice(end - m.channels, end), factor=m.weight)
-        for m, end in zip(maps, ends, strict=True)
-    ]
+    return tuple(
+        Channels(m.name, m.space, part) for m, part in zip(maps, slices(maps), strict=True)
+    )
 
 
 def read_maps(
@@ -393,23 +378,20 @@ def read_maps(
         listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
         raise ImageError(f"maps differ in size: {listed}; scale them to one size")
     described = [TextureMap(c.name, c.space, c.number) for c in read.values()]
-    _check_maps(described)
+    check_maps(described, sum(m.channels for m in described))
     lacking = [name for name, c in read.items() if c.goal is None]
     if 0 < len(lacking) < len(read):
         raise ValueError(
             f"map {lacking[0]!r} has no goal; give each map one, or target_psnr for the rest"
         )
-    parts = [c.part for c in _channels_of(described)]
-    return tuple(c._replace(part=part) for c, part in zip(read.values(), parts, strict=True))
+    pairs = zip(read.values(), slices(described), strict=True)
+    return tuple(channels._replace(part=part) for channels, part in pairs)
 
 
 def _read_map(
     name: str, given: Map, goal: Goal | None, weight: Image | None, encoding: str | None
 ) -> Channels:
-    try:
-        check_name(name)
-    except BadValue as error:
-        raise ValueError(str(error)) from None
+    check_name(name)
     try:
         numbers = plain_numbers(vars(given), Map.__annotations__)
         if not MIN_WEIGHT <= numbers["weight"] <= 1 / MIN_WEIGHT:

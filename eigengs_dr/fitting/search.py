@@ -127,7 +127,7 @@ def fewest(
         estimate = _estimate(run, max_count, tries)
         if not run.ended() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
             longest = round(MAX_LENGTH * iterations)
-            trial = _fit_estimate(run, estimate, max_count, fit, longest)
+            trial = _fit_estimate(run, *estimate, max_count, fit, longest)
             # If the iterations are few, or two fits have used them up, polish all the same.
             sure = SURE_DROPS if trial.missing <= 0 else SURE_POLISHES
             max_steps = max(longest, run.step + sure * polish)
@@ -234,15 +234,11 @@ def _better(a: _Trial, b: _Trial) -> bool:
     return a.missing < b.missing
 
 
-class _Estimate(NamedTuple):
-    """The set of the last try, and the estimated number of Gaussians placed where it left error."""
+def _estimate(run: _Run, max_count: int, steps: int) -> tuple[Gaussians, Gaussians]:
+    """Estimate the number of Gaussians by tries, each placed where the one before left error.
 
-    tried: Gaussians
-    placed: Gaussians
-
-
-def _estimate(run: _Run, max_count: int, steps: int) -> _Estimate:
-    """Estimate the number of Gaussians by tries, each placed where the one before left error."""
+    Return the set of the last try, and the estimated number placed where it left error.
+    """
     placed, before, last = run.start, run.best, None
     for _ in range(MAX_TRIES):
         trial = run.descend(placed, steps)
@@ -260,24 +256,23 @@ def _estimate(run: _Run, max_count: int, steps: int) -> _Estimate:
         last, before = trial, run.score(placed)
         if close or run.ended():
             break
-    return _Estimate(trial.gaussians, placed)
+    return trial.gaussians, placed
 
 
 def _fit_estimate(
-    run: _Run, estimate: _Estimate, max_count: int, steps: int, max_steps: int
+    run: _Run, tried: Gaussians, placed: Gaussians, max_count: int, steps: int, max_steps: int
 ) -> _Trial:
     """Fit the estimated number; if it was far off, fit once more, in the steps that are left."""
-    trial, number = _fit(run, estimate, steps), len(estimate.placed)
+    trial, number = _fit(run, tried, placed, steps), len(placed)
     count = _count_for_gain(run, number, trial.missing, max_count)
     if run.ended() or count - number <= FIT_TOLERANCE * number:
         return trial
-    again = _Estimate(trial.gaussians, run.redistribute(trial.gaussians, count))
-    return _fit(run, again, max(1, min(steps, max_steps - run.step)))
+    again = run.redistribute(trial.gaussians, count)
+    return _fit(run, trial.gaussians, again, max(1, min(steps, max_steps - run.step)))
 
 
-def _fit(run: _Run, estimate: _Estimate, steps: int) -> _Trial:
+def _fit(run: _Run, tried: Gaussians, placed: Gaussians, steps: int) -> _Trial:
     """Fit the estimated number, with a surplus that is placed as well and leaves."""
-    tried, placed = estimate
     more = run.descent.method.surplus(placed, run.descent.objective, steps)
     if more:
         placed = run.redistribute(tried, len(placed) + more)

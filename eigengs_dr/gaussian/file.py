@@ -167,19 +167,8 @@ def write_set(
     npz.write(path, kind, VERSIONS[kind], members, compressed)
 
 
-class SetHead(NamedTuple):
-    """Properties of a set in a file, without its large arrays; see `SetData`."""
-
-    gaussians: int
-    channels: int
-    size: tuple[int, int]
-    space: Space
-    cutoff: float
-    maps: tuple[TextureMap, ...]
-
-
-def read_head(path: Path) -> SetHead:
-    """Read the properties of a set from an ``.npz`` file, without its Gaussians.
+def read_head(path: Path) -> tuple[int, SetData]:
+    """Return the number of Gaussians in an ``.npz`` file, and its properties without arrays.
 
     Raises
     ------
@@ -192,9 +181,9 @@ def read_head(path: Path) -> SetHead:
     small = {name: field for name, field in layout.items() if name not in ARRAYS}
     shape = npz.read_shapes(path, kind, version, {"color": LAYOUT["color"]})["color"]
     with file_errors(path):
-        size, space, cutoff, maps = _properties(npz.read(path, kind, version, small))
-        space, maps = _check_properties(shape[1], size, space, cutoff, maps)
-    return SetHead(shape[0], shape[1], size, space, cutoff, maps)
+        head = SetData({}, *_properties(npz.read(path, kind, version, small)))
+        space, maps = _check_properties(shape[1], *head[1:])
+    return shape[0], head._replace(space=space, maps=maps)
 
 
 @contextmanager
@@ -234,7 +223,7 @@ def _properties(members: Arrays) -> tuple[tuple[int, int], Space, float, tuple[T
 
 def maps_of(path: Path) -> tuple[TextureMap, ...]:
     """Return the maps of an ``.npz`` or ``.egs`` file, () for one image; errors: see `read_set`."""
-    return packed.read_maps(path) if packed.is_packed(path) else read_head(path).maps
+    return packed.read_head(path)[0] if packed.is_packed(path) else read_head(path)[1].maps
 
 
 def read_map(path: Path, name: str | None, option: str = "map") -> SetData:

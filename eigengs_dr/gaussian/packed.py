@@ -21,12 +21,9 @@ read_set: Callable[[Path, int | None], tuple]
 """``read_set(path, sections)`` reads a `eigengs_dr.gaussian.file.SetData`; `sections` is a number,
 or None for all."""
 
-read_maps: Callable[[Path], tuple[TextureMap, ...]]
-"""``read_maps(path)`` reads the maps of a set, without its Gaussians."""
-
-
-read_lights: Callable[[Path], bytes]
-"""``read_lights(path)`` reads the table of lights of planes, empty for other sets."""
+read_head: Callable[[Path], tuple[tuple[TextureMap, ...], bytes]]
+"""``read_head(path)`` reads the maps of a set, and the table of lights of planes; both may be
+empty."""
 
 
 def is_packed(path: str | os.PathLike[str]) -> bool:

@@ -70,7 +70,10 @@ def rgb_to_ycbcr(image: FloatImage) -> FloatImage:
     >>> rgb_to_ycbcr(np.ones(3)).round(4)
     array([0.9216, 0.502 , 0.502 ])
     """
-    image = _check_rgb(image)
+    image = np.asarray(image)
+    if image.shape[-1:] != (3,):
+        raise ValueError(f"image has shape {image.shape}; expected (..., 3)")
+    _functions(image)  # rejects bytes, which would be taken for values in [0, 1]
     result = image @ RGB_TO_YCBCR.T.astype(image.dtype)
     result += YCBCR_OFFSET.astype(image.dtype)
     return result
@@ -178,15 +181,6 @@ def _functions(array: Samples) -> tuple[Function, Function, Function]:
     if dtype not in (np.float32, np.float64):
         raise ValueError(f"array is {dtype}; convert to float32 or float64 in [0, 1] first")
     return np.where, np.maximum, np.power
-
-
-def _check_rgb(image: FloatImage) -> FloatImage:
-    """Reject an image without three float channels: bytes would be taken for values in [0, 1]."""
-    image = np.asarray(image)
-    if image.shape[-1:] != (3,):
-        raise ValueError(f"image has shape {image.shape}; expected (..., 3)")
-    _functions(image)
-    return image
 
 
 LOG_SLOPE = 100.0

@@ -324,16 +324,8 @@ class _YCbCr(Space):
         return [a * y + b * cb + c * cr + d for (a, b, c), d in zip(matrix, black, strict=True)]
 
 
-class _Light(Space):
-    """Spaces of linear light."""
-
-    encoding = "linear"
-
-    def display(self, rendered: Samples) -> Samples:
-        return color.to_coded(color.clamp(rendered, math.inf))
-
-    def grey(self, low: float, high: float, channels: int) -> list[float]:
-        return [GREY] * channels
+class _Plain(Space):
+    """Spaces whose decoded values a texture shows as they are."""
 
     def to_light(self, channel: Samples) -> Samples:
         return channel
@@ -343,6 +335,18 @@ class _Light(Space):
 
     def slope(self, channel: Samples) -> Samples:
         return 1.0
+
+
+class _Light(_Plain):
+    """Spaces of linear light."""
+
+    encoding = "linear"
+
+    def display(self, rendered: Samples) -> Samples:
+        return color.to_coded(color.clamp(rendered, math.inf))
+
+    def grey(self, low: float, high: float, channels: int) -> list[float]:
+        return [GREY] * channels
 
 
 class _Linear(_Light):
@@ -359,7 +363,7 @@ class _Linear(_Light):
         return by_strips(color.to_linear, pixels)
 
     def weight(self, values: Image) -> Image | None:
-        return by_strips(_dark_weight, values)
+        return by_strips(lambda part: np.maximum(part, BLACK) ** (-2 * DARKNESS), values)
 
     def placement_image(self, values: Image, pixels: Image | None = None) -> Image:
         # Linear light would put too few Gaussians into dark parts.
@@ -424,7 +428,7 @@ class _Log(_Light):
         return (color.from_log(channel) + 1 / color.LOG_SLOPE) * math.log1p(color.LOG_SLOPE)
 
 
-class _Data(Space):
+class _Data(_Plain):
     """Anything else: roughness, heights, masks. A fit has the unit of their range."""
 
     encoding = None
@@ -438,21 +442,13 @@ class _Data(Space):
     def has_codes(self, pixels: Image) -> bool:
         return Extent.of(pixels).is_of_codes
 
-    def to_light(self, channel: Samples) -> Samples:
-        return channel
 
-    def from_light(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
-        return light
-
-    def slope(self, channel: Samples) -> Samples:
-        return 1.0
-
-
-class _Normal(_Data):
+class _Normal(_Plain):
     """Codes ``(n + 1) / 2`` of normals, whose length a rendering makes 1."""
 
+    encoding = None
     affine = False
-    by_range = False
+    figure = "data"
     numbers = (3,)
     page_kind = 3
 
@@ -470,14 +466,8 @@ class _Normal(_Data):
     def decode(self, channels: Sequence[Samples]) -> list[Samples]:
         return color.unit_codes(channels)
 
-    def unit(self, extent: Extent) -> Affine:
-        return Affine()
-
     def grey(self, low: float, high: float, channels: int) -> list[float]:
         return [0.5, 0.5, 1.0]
-
-    def has_codes(self, pixels: Image) -> bool:
-        return True
 
     def to_lights(self, channels: Sequence[Samples]) -> list[Samples]:
         if len(channels) != 3:
@@ -528,8 +518,3 @@ def to_planes(image: Image, space: str) -> Image:
     result = np.einsum("ij,jn->in", color.RGB_TO_YCBCR.astype(np.float32), planes)
     result += color.YCBCR_OFFSET.astype(np.float32)[:, None]
     return result
-
-
-def _dark_weight(light: Image) -> Image:
-    """Return the factors of squared errors in linear light, see `DARKNESS`."""
-    return np.asarray(np.maximum(light, BLACK) ** (-2 * DARKNESS), np.float32)

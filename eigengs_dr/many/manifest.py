@@ -30,7 +30,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.folder import list_images
 from ..image.remote import is_url, stem_of
 from ..storage.atomic import atomic_write, lock_folder, refuse_link, remove_stale
-from ..storage.settings import Settings, difference, to_json
+from ..storage.checkpoint import difference, to_json
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ SKIPPED = ("width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", 
 @contextmanager
 def open_manifest(
     folder: Path,
-    options: Settings | None = None,
+    options: Record | None = None,
     given: Collection[str] = (),
     overwrite: bool = False,
 ) -> Iterator[Manifest]:
@@ -244,7 +244,7 @@ def open_manifest(
                 remove_stale(folder)
 
 
-def _conflict(folder: Path, rows: dict[str, Record], options: Settings) -> str:
+def _conflict(folder: Path, rows: dict[str, Record], options: Record) -> str:
     """Return a message if some options differ from those of results, else "".
 
     Rows of older versions have no options.
@@ -281,7 +281,7 @@ class Manifest(NamedTuple):
     path: Path
     rows: dict[str, Record]
     file: BinaryIO
-    options: Settings
+    options: Record
     overwrite: bool
     conflict: str
 
@@ -306,14 +306,14 @@ class Manifest(NamedTuple):
         if row.get("status") == "done" and not self.overwrite and is_zipfile(output):
             return source.row("skipped", **{name: row.get(name) for name in SKIPPED})
         try:
-            head = read_head(output)
+            count, head = read_head(output)
         except (ValueError, OSError):
             reason = "exists and is not a set of Gaussians; move it, or use another folder"
             return source.row("failed", error=f"{output}: {reason}")
         if self.overwrite or row.get("status") == "failed":
             return None
         width, height = head.size
-        figures: Record = {"width": width, "height": height, "gaussians": head.gaussians}
+        figures: Record = {"width": width, "height": height, "gaussians": count}
         if fit := read_figures(output):
             figures |= {k: v for k, v in fit._asdict().items() if k != "source"}
         return source.row("skipped", **figures)

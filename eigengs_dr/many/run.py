@@ -31,6 +31,7 @@ from ..backend.executor import Executor
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import warn
 from ..backend.recording import exclusive
+from ..backend.types import Record
 from ..cluster import executor_for
 from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write_set
@@ -39,7 +40,6 @@ from ..image.folder import read_ahead
 from ..image.io import check_data, read_floats
 from ..image.pixels import EncodedImage
 from ..storage.atomic import refuse_url, require_writable
-from ..storage.settings import Settings
 from .manifest import ImageRow, Images, Manifest, RowProgress, RunImage, list_sources, open_manifest
 
 WRITERS = 2
@@ -119,7 +119,7 @@ class Job(NamedTuple):
     keep_grey: bool = False
     encoding: str | None = None
     steps: int = 0
-    options: Settings | None = None
+    options: Record | None = None
     given: Collection[str] = ()
 
 

@@ -6,6 +6,5 @@
 - ``kernels``: the sum over all Gaussians, and its error against a target
 - ``adjoint``: the gradient of the sum
 - ``render``: the differentiable operation, `render`, and tile layout
-- ``reference``: slow renderers for comparison
 - ``lookup``: the sum at scattered points, for textures
 """

@@ -152,7 +152,8 @@ def find_planes(photos: Photos, planes: int | None = None) -> Planes:
     gram = product(rows, rows) / rows.shape[1]
     limit = planes or min(MAX_PLANES, most_planes(len(lights)))
     psnrs = {choice: left_out(gram, mean, lights, *choice, limit) for choice in TABLES}
-    count = planes or fewest_planes(max(psnrs.values(), key=lambda values: values.max()))
+    best = max(psnrs.values(), key=lambda values: values.max())
+    count = planes or int(np.argmax(best >= best.max() - SPARED)) + 1
     kind, smoothing = max(psnrs, key=lambda choice: psnrs[choice][count - 1])
     _, weights = largest_eigenpairs(gram.copy(), count, 0.0)
     if not weights.size:
@@ -211,11 +212,6 @@ def left_out(
         found.append(np.maximum(errors, ROUNDING))
     psnrs = [[psnr_from_mse(e) for e in row] for row in np.concatenate(found).tolist()]
     return np.asarray(np.mean(psnrs, axis=0))
-
-
-def fewest_planes(psnrs: Doubles) -> int:
-    """Return the smallest number of planes within `SPARED` of the best."""
-    return int(np.argmax(psnrs >= psnrs.max() - SPARED)) + 1
 
 
 def fit_planes(

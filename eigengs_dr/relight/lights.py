@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -214,7 +214,7 @@ def _functions(kind: str, light: Sequence[Any], centres: Sequence[Any], xp: Any)
 
 
 def check_table(table: LightTable, planes: int) -> LightTable:
-    """Return a table from a file, or raise `BadValue` if a part is invalid."""
+    """Return a table from a file, with lights of length 1; `BadValue` if a part is invalid."""
     if table.kind not in KINDS:
         raise BadValue(f"kind is {table.kind[:20]!r}, expected one of {', '.join(KINDS)}")
     expected = (len(table.lights), 3, planes + 1)
@@ -225,10 +225,9 @@ def check_table(table: LightTable, planes: int) -> LightTable:
     if not 0 < table.smoothing <= 1:
         raise BadValue(f"smoothing is {table.smoothing}, expected up to 1")
     try:
-        check_lights(table.lights)
+        return replace(table, lights=check_lights(table.lights))
     except ValueError as error:
         raise BadValue(str(error)) from None
-    return table
 
 
 MAX_FACTOR = 1e6

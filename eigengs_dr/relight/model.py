@@ -242,15 +242,14 @@ class Relightable:
                 str(members["kind"]),
                 float(members["smoothing"]),
             )
-            check_table(table, data.arrays["color"].shape[1])
-            table = replace(table, lights=check_lights(table.lights))
+            table = check_table(table, data.arrays["color"].shape[1])
             return cls(Gaussians.from_data(data, backend), table, float(members["psnr_held_out"]))
 
 
 def holds_lights(path: str | os.PathLike[str]) -> bool:
     """Return whether a file that this package wrote holds a model of lights."""
     if packed.is_packed(path):
-        return bool(packed.read_lights(Path(path)))
+        return bool(packed.read_head(Path(path))[1])
     return npz.format_of(path) == FORMAT
 
 
@@ -310,7 +309,7 @@ def table_bytes(model: Relightable) -> bytes:
 
 def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable, float]:
     """Read the parts of a model from an ``.egs`` file."""
-    content = packed.read_lights(path)
+    content = packed.read_head(path)[1]
     if not content:
         raise BadValue("holds a set without a table of lights; read it by Gaussians.load")
     data = read_set(path)
@@ -326,5 +325,4 @@ def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable
     rounded = np.frombuffer(content[ends[1] :], np.int8).reshape(count, 3, planes + 1)
     name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
     table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
-    table = replace(table, lights=check_lights(lights))
     return Gaussians.from_data(data, backend), table, psnr

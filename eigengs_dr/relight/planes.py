@@ -15,16 +15,14 @@ from __future__ import annotations
 
 import json
 import os
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
-from ..backend.types import ArrayLike, Doubles, Record, Singles
+from ..backend.types import Doubles, Singles
 from ..raster.render import picture_of
 from ..storage.atomic import atomic_folder
-from .lights import check_lights
 from .model import Relightable
 
 RESOLUTION = 16
@@ -33,11 +31,8 @@ RESOLUTION = 16
 QUALITY = 95
 """Quality of the JPEG files, relight's default."""
 
-INFO, MAX_INFO = "info.json", 1 << 24
-"""Name of the file with all but the pixels, and its largest size in bytes."""
-
-MAX_PLANES, MAX_RESOLUTION, MAX_PIXELS = 66, 64, 1 << 28
-"""Largest numbers that are read."""
+INFO = "info.json"
+"""Name of the file with all but the pixels."""
 
 
 class PixelPlanes(NamedTuple):
@@ -67,21 +62,6 @@ class PixelPlanes(NamedTuple):
         factors = np.pad(factors[..., :-1], ((0, 0), (0, 0), (0, padding)))
         whole = np.concatenate([factors, mean], axis=2)
         return cls(images, whole.reshape(resolution, resolution, 3, -1))
-
-    def picture(self, light: ArrayLike) -> Singles:
-        """Return what viewers show under a light, (H, W, 3), in sRGB codes that may leave [0, 1].
-
-        They interpolate linearly between the directions of the grid.
-        """
-        [[x, y, z]] = check_lights(np.asarray(light, np.float64)[None], "light")
-        last = len(self.grid) - 1
-        turned = np.array([x + y, y - x]) / (abs(x) + abs(y) + max(z, 0))
-        place = (turned + 1) / 2 * last
-        column, row = np.clip(np.floor(place), 0, last - 1).astype(int)
-        (right, down), cell = place - (column, row), self.grid[row : row + 2, column : column + 2]
-        weights = np.outer([1 - down, down], [1 - right, right])
-        factors = np.tensordot(weights, cell, 2).astype(np.float32)
-        return np.asarray(self.images @ factors[:, :-1].T + factors[:, -1])
 
     def write(self, folder: str | os.PathLike[str], quality: int = QUALITY) -> None:
         """Write a folder, which does not exist or is empty, in one step.
@@ -119,64 +99,6 @@ class PixelPlanes(NamedTuple):
                 picture = Image.fromarray(np.ascontiguousarray(codes[..., k : k + 3]))
                 name = place / f"plane_{k // 3}.jpg"
                 picture.save(name, quality=quality, optimize=True, keep_rgb=True)
-
-    @classmethod
-    def read(cls, folder: str | os.PathLike[str]) -> PixelPlanes:
-        """Read a folder with a bilinear basis, from this package or from relight.
-
-        Raises
-        ------
-        ValueError
-            If a file is missing, damaged, or of another type: one line that names it.
-        """
-        path = Path(folder) / INFO
-        try:
-            if path.stat().st_size > MAX_INFO:
-                raise ValueError(f"it has more than {MAX_INFO} bytes")
-            info = json.loads(path.read_text(encoding="utf-8"))
-            return cls(*_checked(info, Path(folder)))
-        except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
-            what = f"{error} is missing" if isinstance(error, KeyError) else error
-            raise ValueError(f"{path}: is no bilinear basis of planes; {what}") from None
-
-
-def _checked(info: Record, folder: Path) -> tuple[Singles, Doubles]:
-    """Return the planes and the grid of a folder."""
-
-    def integer(name: str, largest: int) -> int:
-        value = info[name]
-        if not isinstance(value, int) or not 2 <= value <= largest:
-            raise ValueError(f"{name} is {str(value)[:20]}; expected 2 to {largest}")
-        return value
-
-    def numbers(source: object, name: str, count: int) -> Doubles:
-        values = np.array(source, np.float64)
-        if values.shape != (count,) or not np.isfinite(values).all():
-            raise ValueError(f"{name} has shape {values.shape}; expected {count} finite numbers")
-        return values
-
-    for name, expected in (("type", "bilinear"), ("colorspace", "mrgb")):
-        if info[name] != expected:
-            raise ValueError(f"{name} is {str(info[name])[:20]!r}; expected {expected!r}")
-    width, height = (integer(name, MAX_PIXELS) for name in ("width", "height"))
-    count, side = integer("nplanes", MAX_PLANES), integer("resolution", MAX_RESOLUTION)
-    if count % 3 or width * height > MAX_PIXELS:
-        raise ValueError(f"it has {count} planes of {width}x{height}; expected a multiple of 3")
-    [material] = info["materials"]
-    ranges, scale, bias = (numbers(material[k], k, count) for k in ("range", "scale", "bias"))
-    if not (ranges > 0).all():
-        raise ValueError("range must be above 0")
-    basis = numbers(info["basis"], "basis", 3 * (count + 1) * side**2)
-    mean, *rows = basis.reshape(count + 1, side, side, 3)
-    grid = np.stack([*((r - 127) / k for r, k in zip(rows, ranges, strict=True)), mean / 255], 3)
-    parts = []
-    for k in range(count // 3):
-        with Image.open(folder / f"plane_{k}.jpg", formats=["JPEG"]) as file:
-            if file.size != (width, height) or file.mode != "RGB":
-                raise ValueError(f"plane_{k}.jpg is {file.size} {file.mode}; expected RGB")
-            parts.append(np.asarray(file, np.float32) / 255)
-    images = (np.concatenate(parts, axis=2) - bias) * scale
-    return images.astype(np.float32), grid
 
 
 def directions(resolution: int) -> Doubles:

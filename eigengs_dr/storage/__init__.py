@@ -3,6 +3,5 @@
 - ``atomic``: files and folders that are created in one step, and have one writer at a time
 - ``npz``: arrays with a format, a version and checks
 - ``memory``: limits of the memory that a file may take
-- ``settings``: the options on which a result depends
 - ``checkpoint``: the state of an unfinished run
 """

@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from ..backend.interrupts import undone_at_end
-from ..backend.types import Arrays
+from ..backend.types import Arrays, Record
 from . import npz
 from .atomic import atomic_folder, lock_output, refuse_link, remove_folder, remove_stale
-from .settings import Settings, difference, to_json
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
 
@@ -29,7 +28,7 @@ HEAD = "run.json"
 
 @contextmanager
 def open_checkpoint(
-    output: str | os.PathLike[str], settings: Settings, files: list[str]
+    output: str | os.PathLike[str], settings: Record, files: list[str]
 ) -> Iterator[Checkpoint]:
     """Lock an output during a block, and open the folder with the state of its run.
 
@@ -72,7 +71,7 @@ def open_checkpoint(
             remove_folder(folder)
 
 
-def _resumed(folder: Path, settings: Settings) -> Checkpoint | None:
+def _resumed(folder: Path, settings: Record) -> Checkpoint | None:
     """Return the checkpoint in a folder; delete a folder that holds none."""
     refuse_link(folder)
     if not folder.exists():
@@ -193,3 +192,18 @@ def read_arrays(path: Path) -> Arrays:
     except (ValueError, AttributeError, TypeError):
         raise ValueError(f"{path}: layout is damaged") from None
     return npz.read(path, FORMAT, VERSION, fields)
+
+
+def to_json(settings: Record) -> Record:
+    """Return settings as JSON stores them: without tuples and NumPy numbers."""
+    plain: Record = json.loads(json.dumps(settings, default=lambda number: number.item()))
+    return plain
+
+
+def difference(stored: Record, settings: Record) -> str:
+    """Describe settings that differ, as in "gaussians 500 instead of 900"; empty if none does.
+
+    Record that only one of the two has, because another version wrote the file, are ignored.
+    """
+    changed = [key for key in settings if key in stored and stored[key] != settings[key]]
+    return ", ".join(f"{key} {stored[key]} instead of {settings[key]}" for key in changed)

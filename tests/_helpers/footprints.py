@@ -6,6 +6,7 @@ import pytest
 
 from _helpers.reference import render_exact
 from _helpers.sets import SIZE
+from eigengs_dr.backend.arrays import upload_rows
 
 CUTOFF = 5.0
 FINE = 4
@@ -16,6 +17,11 @@ def some_points(count=60, size=SIZE, seed=3):
     """Random points in an image, rounded to float32, shape (count, 2)."""
     points = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * size
     return points.astype(np.float32).astype(np.float64)
+
+
+def coordinates(Float, points):
+    """x and y of points, shape (count, 2); memory of NumPy may be unaligned: another kernel."""
+    return upload_rows(Float, points.T)
 
 
 def around(points, wrap, size=SIZE):

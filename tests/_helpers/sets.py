@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from _helpers.reference import render_exact
+from eigengs_dr.backend.arrays import upload_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.gaussians import Gaussians
 
@@ -47,8 +48,7 @@ class Scene(NamedTuple):
         Float = getattr(module, "Float" + suffix)
 
         def rows(kind, array):
-            columns = [Float(np.ascontiguousarray(c)) for c in np.atleast_2d(array).T]
-            return getattr(module, kind + suffix)(columns)
+            return getattr(module, kind + suffix)(upload_rows(Float, np.atleast_2d(array).T))
 
         return Gaussians(
             mean=rows("Array2f", self.mean),
@@ -165,7 +165,7 @@ def check_equal(gaussians, arrays):
 
 def upload(types, *arrays):
     """Arrays of a backend that hold the values of NumPy arrays."""
-    return [types.Float(np.ascontiguousarray(v)) for v in arrays]
+    return upload_rows(types.Float, arrays)
 
 
 def bound(scene, rounding):

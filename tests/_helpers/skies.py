@@ -9,6 +9,7 @@ mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 import eigengs_dr as eg  # noqa: E402
 from _helpers.poster import camera  # noqa: E402
 from _helpers.texture import backend  # noqa: E402
+from eigengs_dr.backend.arrays import upload_rows  # noqa: E402
 
 WIDTH, HEIGHT = 64, 32
 
@@ -45,7 +46,7 @@ def directions(u, v):
 def seen(emitter, d):
     """Light from directions, shape (n, channels)."""
     si = dr.zeros(mi.SurfaceInteraction3f, d.shape[1])
-    si.wi = -mi.Vector3f(*(mi.Float(np.ascontiguousarray(k)) for k in d))
+    si.wi = -mi.Vector3f(*upload_rows(mi.Float, d))
     return np.array(emitter.eval(si)).T
 
 

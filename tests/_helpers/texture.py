@@ -8,6 +8,7 @@ from _helpers.sets import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 from _helpers.poster import camera  # noqa: E402
+from eigengs_dr.backend.arrays import upload_rows  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 
 
@@ -48,7 +49,7 @@ def in_front(si, distance=1.0):
 def texel_centres(size=SIZE):
     """Surface interactions at the centres of all texels."""
     v, u = np.mgrid[: size[1], : size[0]] + 0.5
-    return at(*(mi.Float(np.float32(k.ravel())) for k in (u / size[0], v / size[1])))
+    return at(*upload_rows(mi.Float, (u.ravel() / size[0], v.ravel() / size[1])))
 
 
 def picture(rows, size=SIZE):

@@ -24,11 +24,10 @@ def refusal(library):
     return process.stdout
 
 
-@pytest.mark.parametrize("version", [14, 16, 17])
-def test_forced_old_llvm_is_refused_before_it_is_loaded(tmp_path, version):
-    (tmp_path / f"libLLVM.so.{version}.1").touch()
-    message = refusal(tmp_path / f"libLLVM.so.{version}.1")
-    assert f"is LLVM {version}" in message
+def test_forced_old_llvm_is_refused_before_it_is_loaded(tmp_path):
+    (tmp_path / "libLLVM.so.17.1").touch()
+    message = refusal(tmp_path / "libLLVM.so.17.1")
+    assert "is LLVM 17" in message
     assert all(name in message for name in SYSTEMS)
 
 

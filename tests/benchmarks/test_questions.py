@@ -46,12 +46,13 @@ from eigengs_dr.image.io import load_image, save_image
 from eigengs_dr.image.resize import resample
 
 
-def answered(out, bench, *arguments):
-    """The rows and the texts of a command, which does nothing when it is called again."""
+def answered(out, bench, *arguments, again=False):
+    """The rows and the texts of a command, which does nothing if it is called `again`."""
     command = ("bench", bench, *arguments, "-o", out)
     told = said(*command)
     rows, before = read(out / FILE, bench), (out / FILE).read_bytes()
-    assert said(*command) == told and (out / FILE).read_bytes() == before
+    if again:
+        assert said(*command) == told and (out / FILE).read_bytes() == before
     return rows, told
 
 
@@ -66,7 +67,7 @@ def small(monkeypatch):
 
 def test_tables(data, tmp_path, backend):  # noqa: F811
     arguments = (data, "--set", "cats256", "--images", 1, "--iterations", 12, "--backend", backend)
-    rows, text = answered(tmp_path / "out", "tables", *arguments)
+    rows, text = answered(tmp_path / "out", "tables", *arguments, again=True)
     ends = {row["job"]["preset"]: row["moments"][-1] for row in rows if "moments" in row}
     assert set(ends) == {"default", "gaussianimage", "eigengs"}
     for words in ("eigengs, own basis", "eigengs, universal basis", "psnr_ycbcr / psnr_rgb in dB"):

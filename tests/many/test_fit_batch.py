@@ -88,7 +88,7 @@ def test_no_gaussian_of_a_batch_is_steep():
 
 def test_many_gaussians_an_image():
     """Dr.Jit adds up more than 32,768 numbers in another order in batches."""
-    images = pictures(4, 180, 190)
+    images = pictures(2, 180, 190)
     rows = eg.fit_many(images, gaussians=33000, iterations=0)
     assert_same_bits(rows[1].result, eg.fit(images[1], 33000, 0))
 
@@ -104,7 +104,7 @@ def test_an_image_that_is_done_rests(backend):
 
 
 def test_interrupts_end_the_batch(backend):
-    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
         fit_images(pictures(2), options(backend, iterations=100_000))
 

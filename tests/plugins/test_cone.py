@@ -20,6 +20,7 @@ from _helpers.texture import (
     texel_centres,
     texture,
 )
+from eigengs_dr.backend.arrays import upload_rows
 from eigengs_dr.plugins import pixel_angle, texture_of
 from eigengs_dr.plugins.cone import PIXEL, metric
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance
@@ -124,7 +125,7 @@ class TestPlane:
         scene, line = random_scene(), np.linspace(-1, 2, 1201)
         uv = np.stack([line if k is None else np.full_like(line, k) for k in (u, v)], axis=1)
         tex = texture(scene.on(backend()), wrap_mode="clamp", raw=True, cutoff=5.0, prefilter=angle)
-        si = in_front(at(*(mi.Float(np.float32(k)) for k in uv.T.copy())))
+        si = in_front(at(*upload_rows(mi.Float, uv.T)))
         found = np.array(tex.eval(si)).T
         covariance = np.diag((PIXEL * angle * np.array(SIZE)) ** 2)
         exact = brute_force(scene, "clamp", (uv * SIZE)[::40], covariance)

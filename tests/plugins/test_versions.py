@@ -49,7 +49,7 @@ class LaterMitsuba:
 def fields(monkeypatch):
     """The texture as a field is "gaussian_field"."""
     monkeypatch.setattr(versions, "mi", LaterMitsuba())
-    versions.register_texture("gaussian_field", gaussian_texture.gaussian_texture())
+    versions.register("texture", "gaussian_field", gaussian_texture.gaussian_texture())
 
 
 VARIANTS = ["llvm_ad_rgb", "llvm_ad_spectral"]

@@ -30,7 +30,8 @@ SHOWN = {"data": lambda image: image, "ycbcr": YCBCR.decode_image, "log": from_l
 
 OTHER_SIZES = [{"width": 33}, {"width": 11, "height": 40}, {"width": 9, "height": 5}]
 asked_sizes = pytest.mark.parametrize("asked", [{}, *OTHER_SIZES])
-precisions = pytest.mark.parametrize(("bits", "rtol"), [(32, 1e-3), (64, 1e-6)])
+PRECISIONS = ((32, 1e-3), (64, 1e-6))
+"""Bits of numbers, and relative errors that they allow."""
 rounding = pytest.mark.parametrize(("bits", "share"), [(32, 1e-5), (64, 1e-13)])
 
 
@@ -109,29 +110,28 @@ def check(found, exact, rtol, floor=0.02):
 # --- Against finite differences ----------------------------------------------------------------
 
 
-@precisions
 @pytest.mark.parametrize(
     ("asked", "channels"), [*(({}, k) for k in (1, 2, 3, 4)), *((size, 3) for size in OTHER_SIZES)]
 )
-def test_reverse(backend, bits, rtol, asked, channels):
+def test_reverse(backend, asked, channels):
     scene = random_scene(channels, COUNT, channels=channels)
     delta = upstream(image_of(scene, WIDE, asked).shape)
     exact = numeric_gradient(lambda s: (delta * image_of(s, WIDE, asked)).sum(), scene)
-    check(reverse(scene.on(backend, bits), delta, cutoff=WIDE, **asked), exact, rtol)
+    for bits, rtol in PRECISIONS:
+        check(reverse(scene.on(backend, bits), delta, cutoff=WIDE, **asked), exact, rtol)
 
 
-@precisions
-def test_reverse_of_gaussians_in_thousands_of_tiles(backend, bits, rtol):
+def test_reverse_of_gaussians_in_thousands_of_tiles(backend):
     """A GPU adds pieces in blocks: one Gaussian has 122 pieces of 16 tiles."""
     scene, asked = random_scene(1, 3), {"width": 200}
     delta = upstream(image_of(scene, WIDE, asked).shape)
     exact = numeric_gradient(lambda s: (delta * image_of(s, WIDE, asked)).sum(), scene)
-    check(reverse(scene.on(backend, bits), delta, cutoff=WIDE, **asked), exact, rtol)
+    for bits, rtol in PRECISIONS:
+        check(reverse(scene.on(backend, bits), delta, cutoff=WIDE, **asked), exact, rtol)
 
 
-@precisions
 @asked_sizes
-def test_forward(backend, bits, rtol, asked):
+def test_forward(backend, asked):
     scene, direction = random_scene(2, COUNT), random_scene(3, COUNT)
     step = 1e-6
     up, down = (
@@ -143,12 +143,12 @@ def test_forward(backend, bits, rtol, asked):
         for s in (step, -step)
     )
     exact = (up - down) / (2 * step)
-    found = forward(scene.on(backend, bits), direction, cutoff=WIDE, **asked)
-    np.testing.assert_allclose(found, exact, rtol=rtol, atol=0.02 * rtol * np.abs(exact).max())
+    for bits, rtol in PRECISIONS:
+        found = forward(scene.on(backend, bits), direction, cutoff=WIDE, **asked)
+        np.testing.assert_allclose(found, exact, rtol=rtol, atol=0.02 * rtol * np.abs(exact).max())
 
 
-@precisions
-def test_inside_the_cutoff(backend, bits, rtol):
+def test_inside_the_cutoff(backend):
     """At the default cutoff, on scenes in which no pixel is so close to an edge as to cross it."""
     drawn = (random_scene(seed, 3) for seed in range(1000))
     clear = (s for s in drawn if s.off_edge(CUTOFF, 2e-3).all() and s.distances().min() < CUTOFF)
@@ -156,7 +156,8 @@ def test_inside_the_cutoff(backend, bits, rtol):
         scene = next(clear)
         delta = upstream(scene.exact().shape)
         exact = numeric_gradient(lambda s, d=delta: (d * s.exact(CUTOFF)).sum(), scene)
-        check(reverse(scene.on(backend, bits), delta), exact, rtol)
+        for bits, rtol in PRECISIONS:
+            check(reverse(scene.on(backend, bits), delta), exact, rtol)
 
 
 @asked_sizes

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
@@ -27,11 +28,28 @@ def folder(model, tmp_path):
     return tmp_path / "planes"
 
 
+def shown(folder, light):
+    """Return what viewers show under a light: they interpolate between directions of the grid."""
+    info = json.loads((folder / "info.json").read_text())
+    [material], side = info["materials"], info["resolution"]
+    files = sorted(folder.glob("plane_*.jpg"))
+    planes = np.concatenate([np.asarray(Image.open(f), np.float32) / 255 for f in files], 2)
+    mean, *rows = np.reshape(info["basis"], (-1, side, side, 3))
+    rows = [(r - 127) / k for r, k in zip(rows, material["range"], strict=True)]
+    grid, (x, y, z) = np.stack([*rows, mean / 255], 3), light
+    turned = np.array([x + y, y - x]) / (abs(x) + abs(y) + max(z, 0))
+    place = (turned + 1) / 2 * (side - 1)
+    column, row = np.floor(place).astype(int).clip(0, side - 2)
+    right, down = place - (column, row)
+    weights = np.outer([1 - down, down], [1 - right, right])
+    factors = np.tensordot(weights, grid[row : row + 2, column : column + 2], 2)
+    images = (planes - material["bias"]) * material["scale"]
+    return images @ factors[:, :-1].T + factors[:, -1]
+
+
 def test_a_viewer_shows_what_the_model_shows(model, folder):
-    read = PixelPlanes.read(folder)
-    assert read.images.shape == (24, 24, 6)  # planes come by threes
     for light in directions(9, 0.4) @ np.diag([1, -1, 1]):
-        assert eg.psnr(read.picture(light), eg.picture_of(model.relight(light))) > 38
+        assert eg.psnr(shown(folder, light), eg.picture_of(model.relight(light))) > 38
 
 
 def test_the_grid_is_the_octahedron_of_the_format():
@@ -60,25 +78,6 @@ def test_files_are_those_that_viewers_ask_for(folder):
     assert b"Adobe" in (folder / "plane_0.jpg").read_bytes()[:64]  # RGB, as relight writes it
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "says"),
-    [
-        ("type", "rbf", "type is 'rbf'"),
-        ("nplanes", 7, "multiple of 3"),
-        ("resolution", 10**9, "resolution is"),
-        ("basis", [1, 2], "basis has shape"),
-        ("materials", [], "not enough values"),
-        ("width", 25, "plane_0.jpg is"),
-    ],
-)
-def test_damaged_files_are_refused_in_one_line(folder, name, value, says):
-    info = json.loads((folder / "info.json").read_text())
-    (folder / "info.json").write_text(json.dumps(info | {name: value}))
-    with pytest.raises(ValueError, match=says) as caught:
-        PixelPlanes.read(folder)
-    assert str(folder / "info.json") in str(caught.value) and "\n" not in str(caught.value)
-
-
 def test_a_folder_that_holds_something_is_not_overwritten(model, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(OSError):
@@ -90,7 +89,7 @@ def test_the_command_writes_planes(model, tmp_path):
     model.save(tmp_path / "model.npz")
     text = said("render", tmp_path / "model.npz", "--planes", tmp_path / "planes")
     assert "6 planes of 24x24 pixels" in text
-    assert PixelPlanes.read(tmp_path / "planes").images.shape == (24, 24, 6)
+    assert len(list((tmp_path / "planes").glob("plane_*.jpg"))) == 2
 
 
 def test_planes_are_no_picture(model, tmp_path):

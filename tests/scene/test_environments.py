@@ -13,7 +13,7 @@ pytestmark = pytest.mark.mitsuba
 QUICK = {"iterations": 30, "spp": 64}
 
 
-def horizon(width=256, height=128, sun=0.0):
+def horizon(width=128, height=64, sun=0.0):
     """A sky over a ground, with a soft sun; light shape (height, width, 3)."""
     y, x = np.mgrid[:height, :width]
     theta, phi = np.pi * y / (height - 1), 2 * np.pi * (x + 0.5) / width
@@ -51,7 +51,7 @@ def test_a_smooth_sky_takes_less_memory(sun, tmp_path):
     assert found.missed(40) == []
     assert found.psnr[0] > found.noise[0] - 1
     saved = eg.Gaussians.load(tmp_path / "new" / "sky.npz")
-    assert (saved.width, saved.height) == (256, 128)
+    assert (saved.width, saved.height) == (128, 64)
     assert saved.space == ("log" if sun else "linear")
     images = [
         np.array(mi.render(s, spp=256)).mean((0, 1))
@@ -65,7 +65,7 @@ def test_the_light_keeps_its_mean(tmp_path):
     light = horizon(sun=5.0)
     given, wanted = scene(bitmap=mi.Bitmap(light)), mean_on_sphere(light)
     eg.convert_scene(given, tmp_path / "new", 36, iterations=30, spp=0)
-    found = eg.render(eg.Gaussians.load(tmp_path / "new" / "sky.npz"), 512, 256).numpy()
+    found = eg.render(eg.Gaussians.load(tmp_path / "new" / "sky.npz"), 256, 128).numpy()
     np.testing.assert_allclose(mean_on_sphere(found), wanted, rtol=0.01)
 
 

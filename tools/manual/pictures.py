@@ -20,7 +20,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from eigengs_dr.image.color import to_coded, to_linear
-from eigengs_dr.image.resize import resample
+from eigengs_dr.image.resize import center_crop, resample
 from eigengs_dr.image.sheet import text_line
 from eigengs_dr.plugins import follow, keep_in_bounds, texture_of
 
@@ -153,7 +153,7 @@ def many() -> list[Row]:
     """Fit eight photos in one call."""
     side = (WIDTH + GAP) // 4 - GAP
     names = ("astronaut", "brick", "chelsea", "coffee", "hubble", "motorcycle", "retina", "rocket")
-    photos = [resample(square(eg.sample(name)), side, side) for name in names]
+    photos = [center_crop(eg.sample(name), side, side) for name in names]
     rows = eg.fit_many(photos, gaussians=2000, iterations=300)
     fits = [row.result.image for row in rows]
     return [dict(zip(names[k : k + 4], fits[k : k + 4], strict=True)) for k in (0, 4)]
@@ -161,7 +161,7 @@ def many() -> list[Row]:
 
 def relight() -> list[Row]:
     """Relight a relief of bricks, a made-up object, beside its formula."""
-    height = gaussian_filter(resample(square(eg.sample("brick")), 240, 240)[..., 0], 2) * 40
+    height = gaussian_filter(center_crop(eg.sample("brick"), 240, 240)[..., 0], 2) * 40
     dy, dx = np.gradient(height)
     normal = np.stack([-dx, dy, np.ones_like(dx)], -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -182,13 +182,6 @@ def relight() -> list[Row]:
         {f"light {name}": photo(np.array(light)) for name, light in unseen.items()},
         {f"{name}, model": eg.picture_of(model.relight(d)) for name, d in unseen.items()},
     ]
-
-
-def square(photo: np.ndarray) -> np.ndarray:
-    """Cut the middle of a photo."""
-    side = min(photo.shape[:2])
-    top, left = ((length - side) // 2 for length in photo.shape[:2])
-    return np.ascontiguousarray(photo[top : top + side, left : left + side])
 
 
 def family() -> list[np.ndarray]:
@@ -286,7 +279,7 @@ def conversion() -> list[Row]:
     with TemporaryDirectory() as name:
         folder = Path(name)
         for photo in ("chelsea", "coffee", "brick"):
-            eg.save_image(folder / f"{photo}.png", resample(square(eg.sample(photo)), 192, 192))
+            eg.save_image(folder / f"{photo}.png", center_crop(eg.sample(photo), 192, 192))
         eg.convert_scene(room(folder), folder / "converted", replace_all=True)
         before, after = (
             eg.load_image(folder / "converted" / f"{name}-1.png") for name in ("before", "after")
@@ -326,7 +319,7 @@ def room(folder: Path) -> dict:
 def descent() -> list[Row]:
     """Descend from the Gaussians of one photo until a wall looks like a rendering of another."""
     start, other = (
-        eg.fit(resample(square(eg.sample(name)), 192, 192), 2000, 300, space="linear").gaussians
+        eg.fit(center_crop(eg.sample(name), 192, 192), 2000, 300, space="linear").gaussians
         for name in ("coffee", "chelsea")
     )
     goal = mi.render(wall_of(other), spp=64)

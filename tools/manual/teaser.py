@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 
-from eigengs_bench.inverse import bitmap, grey, scene_of
+from eigengs_bench.subjects import bitmap, grey, load_scene
 from eigengs_dr.image.color import to_coded
 from eigengs_dr.plugins import photo_loss, texture_of
 from eigengs_dr.viewer.pictures import overlay
@@ -32,9 +32,10 @@ def main() -> None:
     photo = eg.sample("coffee")[:400, 120:520]
     few = eg.fit(photo, 1500)
     many = eg.fit(photo, 5000, space="linear").gaussians
-    scene = scene_of(mi, "poster", {"color": texture_of(many, wrap_mode="clamp")}, CAMERAS)
+    texture = texture_of(many, wrap_mode="clamp")
+    scene = load_scene(mi, "poster", {"color": texture}, CAMERAS)
     photos = [mi.render(scene, sensor=k, spp=64, seed=k).numpy() for k in range(CAMERAS)]
-    unknown = scene_of(mi, "poster", {"color": bitmap(mi, grey("color"))}, CAMERAS)
+    unknown = load_scene(mi, "poster", {"color": bitmap(mi, grey("poster", "color"))}, CAMERAS)
     loss = photo_loss(unknown, "poster.bsdf.reflectance", photos, sensors=range(CAMERAS))
     recovered = eg.fit(loss=loss, size=(256, 256), iterations=480, space="linear")
     seen = eg.psnr(photo, eg.picture_of(recovered.gaussians, width=photo.shape[1]))

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import drjit as dr
 
 from ...backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
-from ...backend.types import Bool, Float, FloatLike, UInt
+from ...backend.types import Float, FloatLike, UInt
 
 
 class Granularity(NamedTuple):
@@ -254,10 +254,14 @@ def for_each_row(
 
     Parameters
     ----------
+    shape, radius, grid, pad
+        As for `tile_columns`.
     visit : callable
         ``visit(row, first, last, state) -> state`` with the columns ``[first, last)``.
-    shape, radius, grid, state, pad, label
-        As for `for_each_tile`.
+    state : PyTree
+        Initial state.
+    label : str
+        Name of the loop for profilers.
 
     Returns
     -------
@@ -273,54 +277,3 @@ def for_each_row(
     return dr.while_loop(
         (row, state), lambda row, state: row < stop, body, label=label, max_iterations=-1
     )[-1]
-
-
-def for_each_tile(
-    shape: list,
-    radius: FloatLike,
-    grid: GridArrays,
-    visit: Callable[[UInt, UInt, UInt, Bool, State], State],
-    state: State,
-    *,
-    pad: FloatLike = 0.0,
-    label: str,
-) -> State:
-    """Call `visit` for every Gaussian and every tile that its ellipse touches, row by row.
-
-    In every row, the lanes of a packet wait for the longest row. One loop over rows and columns
-    would avoid the wait, but compute the columns of a row for every tile: on llvm it took three
-    times as long.
-
-    Parameters
-    ----------
-    shape : list of 5 Float, shape (N,)
-        As for `tile_columns`.
-    radius, grid, pad
-        As for `tile_columns`.
-    visit : callable
-        ``visit(tile, column, row, active, state) -> state`` with ``tile = row * nx + column``.
-    state : PyTree
-        Initial state.
-    label : str
-        Name of the loop for profilers.
-
-    Returns
-    -------
-    PyTree
-        The final `state`.
-    """
-
-    def visit_row(row: UInt, first: UInt, last: UInt, state: State) -> State:
-        def body(column: UInt, state: State) -> tuple[UInt, State]:
-            tile = row * grid.nx + column
-            return column + 1, visit(tile, column, row, column < last, state)
-
-        return dr.while_loop(
-            (first, state),
-            lambda column, state: column < last,
-            body,
-            label=label,
-            max_iterations=-1,
-        )[-1]
-
-    return for_each_row(shape, radius, grid, visit_row, state, pad=pad, label=label)

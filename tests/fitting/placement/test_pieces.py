@@ -14,6 +14,7 @@ from _helpers.plain_placement import (
     to_canvas,
 )
 from _helpers.sets import few
+from eigengs_dr.backend.arrays import upload_rows
 from eigengs_dr.fitting.placement.pieces import curve_of, lloyd_step, stratify_along_hilbert
 
 
@@ -25,7 +26,7 @@ def pieces(density, count, backend="llvm", shift=0.0):
 
 def relaxed(mean, density, backend="llvm", spacing=None):
     canvas, values = to_canvas(density, backend)
-    rows = [canvas.types.Float(np.ascontiguousarray(v, np.float32)) for v in np.transpose(mean)]
+    rows = upload_rows(canvas.types.Float, np.transpose(mean))
     spacing = spacing or np.sqrt(density.size / len(mean))
     return centers(*lloyd_step(canvas, tuple(rows), values, spacing))
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
-from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.arrays import types_in, upload_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.binning.lists import PACKET, build_lists, order_lanes
 from eigengs_dr.raster.binning.tiles import ON_CPU, ON_GPU, TILE, Grid
@@ -21,7 +21,7 @@ GRID = Grid(*SIZE)
 
 def upload(backend, mean, factor):
     types = types_in(select(backend))
-    return [types.Float(np.ascontiguousarray(v, np.float32)) for v in (*mean.T, *factor.T)]
+    return upload_rows(types.Float, (*mean.T, *factor.T))
 
 
 EDGE = 1e-3

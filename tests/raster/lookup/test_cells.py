@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from _helpers.footprints import check_gradient, exact_at, some_points, stacked
+from _helpers.footprints import check_gradient, coordinates, exact_at, some_points, stacked
 from _helpers.sets import random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.binning.lists import build_lists
@@ -42,7 +42,7 @@ def sums_of(gaussians, points, side=4, cutoff=3.0):
     p, cells = decode_parameters(gaussians), lists_of(gaussians, side, cutoff)
     packed = Packed(cells.pack(p.shape, p.color), gaussians.channels, cutoff)
     types = types_of(gaussians.mean)
-    x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
+    x, y = coordinates(types.Float, points)
     return sum_at_points(cells, packed, x, y, types.Bool(True), value_terms(packed))
 
 
@@ -78,8 +78,8 @@ def test_bands_change_no_filtered_sum(backend, wrap, variance, monkeypatch):
     scene.mean[:6, 1] = BANDED[1] + np.arange(4, 10)
     gaussians = scene.on(backend)
     p, types = decode_parameters(gaussians), types_of(gaussians.mean)
-    x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
-    footprint = [types.Float(variance * k) for k in (1, 0.3, 0.6)]
+    x, y = coordinates(types.Float, points)
+    footprint = [dr.opaque(types.Float, variance * k) for k in (1, 0.3, 0.6)]
     for most in (1000, 59):
         monkeypatch.setattr(numbered, "MOST", most)
         sizes = classify_by_size(dr.detach(p.shape), *BANDED, 3.0, wrap)

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from _helpers.footprints import some_points, stacked
+from _helpers.footprints import coordinates, some_points, stacked
 from _helpers.sets import SIZE, random_scene
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.evaluate import inverted
@@ -64,7 +64,7 @@ def lookups(gaussians, filtered, encode, parameters=None):
     """Sums of a set at points or over footprints: of words, or of the floats that are given."""
     p = decode_parameters(gaussians)
     types, size = types_of(gaussians.mean), (gaussians.width, gaussians.height)
-    x, y = (types.Float(np.ascontiguousarray(POINTS[:, k])) for k in (0, 1))
+    x, y = coordinates(types.Float, POINTS)
     if filtered:
         sizes = classify_by_size(dr.detach(p.shape), *size, 3.0, "repeat")
         cells = sizes.cells
@@ -79,7 +79,7 @@ def lookups(gaussians, filtered, encode, parameters=None):
         packed = Packed(cells.pack(shape, color), gaussians.channels, 3.0, filtered)
     if not filtered:
         return stacked(sum_at_points(cells, packed, x, y, types.Bool(True), value_terms(packed)))
-    footprint = [types.Float(k) for k in (4.0, 1.5, 2.0)]
+    footprint = [dr.opaque(types.Float, k) for k in (4.0, 1.5, 2.0)]
     return stacked(sum_prefiltered(sizes, packed, x, y, footprint, types.Bool(True)))
 
 

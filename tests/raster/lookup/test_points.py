@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from _helpers.footprints import check_gradient, exact_at, some_points, stacked
+from _helpers.footprints import check_gradient, coordinates, exact_at, some_points, stacked
 from _helpers.sets import SIZE, few, random_scene, scenes
-from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.arrays import types_in, types_of, upload_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.lookup.cells import list_cells
 from eigengs_dr.raster.lookup.points import (
@@ -32,7 +32,7 @@ def arrays_of(gaussians, points, cutoff, side=4):
     """Lists, packed parameters, and x and y of points, as lookups take them."""
     p = decode_parameters(gaussians)
     types = types_of(gaussians.mean)
-    x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
+    x, y = coordinates(types.Float, points)
     level, size = (dr.detach(p.shape), side), (gaussians.width, gaussians.height)
     cells = list_cells([level], *size, kernel_radius(cutoff))
     return cells, Packed(cells.pack(p.shape, p.color), gaussians.channels, cutoff), x, y
@@ -92,7 +92,9 @@ class TestDerivatives:
         def loss(gaussians):
             rows = look_up(gaussians, POINTS, WIDE)
             Float = types_of(gaussians.mean).Float
-            return dr.sum(sum(r * Float(w) for r, w in zip(rows, weight.T.copy(), strict=True)))
+            return dr.sum(
+                sum(r * w for r, w in zip(rows, upload_rows(Float, weight.T), strict=True))
+            )
 
         check_gradient(loss, random_scene(7, count=7), name, backend)
 

@@ -12,13 +12,14 @@ from _helpers.footprints import (
     around,
     brute_force,
     check_gradient,
+    coordinates,
     exact_at,
     matrices,
     some_points,
     stacked,
 )
 from _helpers.sets import SIZE, covariances, few, random_scene
-from eigengs_dr.backend.arrays import types_in, types_of
+from eigengs_dr.backend.arrays import types_in, types_of, upload_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.lookup.footprint import MAX_FOOTPRINT, bound_covariance, quick_erf
 from eigengs_dr.raster.lookup.points import Packed, invert
@@ -44,8 +45,9 @@ def arguments(gaussians, wrap, points, covariance, cutoff=CUTOFF):
     sizes = classify_by_size(shape, gaussians.width, gaussians.height, cutoff, wrap)
     rows = sizes.cells.pack(*invert(p.shape, p.color))
     packed = Packed(rows, gaussians.channels, cutoff, inverted=True)
-    x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
-    footprint = [types.Float(float(covariance[k])) for k in ((0, 0), (0, 1), (1, 1))]
+    x, y = coordinates(types.Float, points)
+    entries = (float(covariance[k]) for k in ((0, 0), (0, 1), (1, 1)))
+    footprint = [dr.opaque(types.Float, entry) for entry in entries]
     return sizes, packed, x, y, footprint, types.Bool(True)
 
 
@@ -125,7 +127,9 @@ class TestSumFiltered:
         def loss(gaussians):
             rows = filtered(gaussians, wrap, points, FOOTPRINTS[k], 9.0)
             Float = types_of(gaussians.mean).Float
-            return dr.sum(sum(r * Float(w) for r, w in zip(rows, weight.T.copy(), strict=True)))
+            return dr.sum(
+                sum(r * w for r, w in zip(rows, upload_rows(Float, weight.T), strict=True))
+            )
 
         check_gradient(loss, random_scene(5, 9), name, backend)
 

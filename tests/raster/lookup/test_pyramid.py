@@ -11,12 +11,13 @@ from _helpers.footprints import (
     around,
     brute_force,
     check_gradient,
+    coordinates,
     some_points,
     stacked,
     tiled,
 )
 from _helpers.sets import SIZE, random_scene
-from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.backend.arrays import types_of, upload_rows
 from eigengs_dr.raster.lookup import pyramid as coarsen
 from eigengs_dr.raster.lookup.points import Packed, invert
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
@@ -55,8 +56,9 @@ def lattice_of(*given):
 
 def looked_up(lattice, points, covariance):
     types = types_of(lattice.scale)
-    x, y = (types.Float(np.ascontiguousarray(points[:, k])) for k in (0, 1))
-    footprint = [types.Float(float(covariance[k])) for k in ((0, 0), (0, 1), (1, 1))]
+    x, y = coordinates(types.Float, points)
+    entries = (float(covariance[k]) for k in ((0, 0), (0, 1), (1, 1)))
+    footprint = [dr.opaque(types.Float, entry) for entry in entries]
     assert np.array(is_minified(lattice, footprint)).all()
     return sum_pyramid(lattice, x, y, footprint, types.Bool(True))
 
@@ -121,7 +123,7 @@ class TestGradient:
             lattice = lattice_of(gaussians, wrap, 9.0)
             rows = looked_up(lattice, points, FOOTPRINTS[4])
             Float = types_of(gaussians.mean).Float
-            seen = sum(r * Float(w) for r, w in zip(rows, weight.T.copy(), strict=True))
+            seen = sum(r * w for r, w in zip(rows, upload_rows(Float, weight.T), strict=True))
             return dr.sum(seen) + pyramid_mean(lattice)[0]
 
         check_gradient(loss, inner_scene(5, 9), name, backend)
