@@ -80,7 +80,10 @@ def _lit(folder: Path) -> Lit:
 def run(task: Task, names: Sequence[str] = ()) -> list[Row]:
     """Measure all methods on sets, by default on all in the folder of data."""
     data = Path(task.data or "")
-    jobs = [job for name in names or sets_of(data) for job in _jobs(task, data / name, name)]
+    known = sets_of(data)
+    if missing := set(names) - set(known):
+        raise ValueError(f"--set {min(missing)}: {data} has {', '.join(known) or 'no sets'}")
+    jobs = [job for name in names or known for job in _jobs(task, data / name, name)]
     return task.measure("relight", jobs)
 
 
@@ -352,7 +355,10 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     sets = {
         str(name): comparison(part, exact[exact.set == name])
         for name, part in points.groupby("set", sort=False)
+        if set(STYLES) <= set(part.method)
     }
+    if not sets:  # a run that was stopped has not measured all methods
+        return fr.Section()
     frame = pd.DataFrame(sets).T
     ratios = [RELIGHT, *CODED]
     middle = frame.median()

@@ -35,6 +35,7 @@ from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.io import check_data, check_image
 from ..image.metrics import psnr as psnr_of
+from ..image.pixels import check_encoding
 from ..image.space import DATA, LINEAR, Affine, Space, space_of
 from ..plugins.cone import PIXEL
 from ..plugins.follow import check_scene
@@ -172,6 +173,7 @@ def fit_for_scene(
     check_scene("fit_for_scene", scene)
     if space not in COLORS:
         raise ValueError(f"space {space!r} is unknown; textures hold {' or '.join(COLORS)}")
+    check_encoding(encoding)
     check_asked(target_psnr, iterations)
     goal = Goal(target_psnr, max_gaussians=max_gaussians)
     with stages(progress) as tell:

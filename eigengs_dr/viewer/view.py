@@ -118,8 +118,8 @@ def view(
     Raises
     ------
     ValueError
-        If the set has more than a million Gaussians, a value is not finite, the aspect ratios of
-        the image and the set differ, or a fit has a mean image of pixels.
+        If the set has more than a million Gaussians, a value is not finite, the image has another
+        aspect ratio than a set (a model encodes any), or a fit has a mean image of pixels.
     TypeError
         If the source has another type.
 

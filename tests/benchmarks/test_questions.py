@@ -39,6 +39,7 @@ from eigengs_bench import (
 from eigengs_bench.clock import METHODS
 from eigengs_bench.images import images_of
 from eigengs_bench.names import SETS, ImageSet
+from eigengs_bench.report import Section
 from eigengs_bench.rows import FILE, read
 from eigengs_dr.fitting.fit import fit
 from eigengs_dr.image.color import to_coded
@@ -578,6 +579,9 @@ def test_relight(lit, tmp_path, backend, monkeypatch):
     points = [point for row in rows for point in row["points"]]
     assert all(p["bytes_per_pixel"] == p["bytes"] / 24**2 for p in points)
     assert "median" in text and (tmp_path / "out" / "relight.svg").exists()
+    assert relight.summarize(rows[:-1]) == Section()  # the run was stopped
+    missing = run("bench", "relight", lit, "--set", "c", "-o", tmp_path / "other")
+    assert_refused(missing, "--set c", "has a")
 
 
 def test_every_fifth_light_is_left_out(lit):

@@ -195,6 +195,7 @@ class TestFit:
     ("arguments", "words"),
     [
         ({"space": "ycbcr"}, "space 'ycbcr'.*linear"),
+        ({"space": "data", "encoding": "light"}, "encoding 'light'"),
         ({"target_psnr": 80.0}, "target_psnr is 80"),
         ({"target_psnr": float("nan")}, "target_psnr is nan"),
         ({"iterations": -1}, "iterations"),
