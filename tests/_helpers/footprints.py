@@ -9,7 +9,7 @@ from _helpers.sets import SIZE
 from eigengs_dr.backend.arrays import upload_rows
 
 CUTOFF = 5.0
-FINE = 4
+FINE = 3
 """Samples a pixel of the pictures that brute force sums, along each axis."""
 
 

@@ -459,8 +459,8 @@ def test_an_interrupted_fit_keeps_its_set(last):
     assert result.stopped == "interrupted" and result.loss < 0.05
 
 
-STOPS = {"first": 0, "texels": 3, "later": 25}
-"""Steps at which a loss ends a fit of 40, in half of them texels without an image."""
+STOPS = {"first": 0, "texels": 2, "later": 13}
+"""Steps at which a loss ends a fit of 20, in half of them texels without an image."""
 
 
 @pytest.mark.parametrize(
@@ -494,13 +494,13 @@ def test_a_loss_or_a_judge_may_end_the_fit(kind, stop):
     for error in errors if stop == "first" else errors[:2]:
         ended[:], judged = [error], []
         with pytest.raises(BaseException) as got:
-            eg.fit(**given, iterations=40, space="rgb", loss=asked)
+            eg.fit(**given, iterations=20, space="rgb", loss=asked)
         if isinstance(error, KeyboardInterrupt):
             assert isinstance(got.value, eg.Interrupted)
             result = got.value.result
             assert result.stopped == "interrupted" and result.image.shape == IMAGE.shape
             assert len(result.gaussians) == given.get("gaussians", len(result.gaussians))
-            assert result.iterations <= max(40, 2 * STOPS.get(stop, 40))
+            assert result.iterations <= max(20, 2 * STOPS.get(stop, 20))
         else:
             assert got.value is error
 
