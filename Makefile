@@ -30,7 +30,7 @@ APT_INSTALL := apt_install() { \
 	{ $$get install $$1 || { $$get update && $$get install $$1; }; } </dev/null >/dev/null 2>&1 \
 	|| { echo "make setup: $$2" >&2; exit 1; }; }
 
-# What pip did not compile, and tests, are compiled once: Python keeps it.
+# Set-up compiles nothing, so Python keeps the byte code of what it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup demo scenes test layers test-slow test-cuda-sim docs pages dist bench report basis clean

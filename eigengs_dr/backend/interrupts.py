@@ -128,7 +128,8 @@ def defer_interrupts() -> Iterator[Callable[[], bool]]:
     """
     received: list[bool] = []
     # Python cannot restore a handler that is None; an ignored signal stays ignored.
-    with _first_signal(lambda h: h not in (None, signal.SIG_IGN), lambda: received.append(True)):
+    ignored = None, signal.SIG_IGN
+    with _first_signal(lambda handler: handler not in ignored, lambda: received.append(True)):
         yield lambda: bool(received)
 
 

@@ -18,7 +18,7 @@ from ..gaussian.file import check_index_range, check_sides
 from ..gaussian.gaussians import Fitted, Gaussians
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import check_encoding
-from ..image.space import Space, space_of
+from ..image.space import FAMILY_SPACES, Space, space_of
 from .coarse import Coarse
 from .loss import Loss
 from .method import DEFAULT, Method, Model
@@ -101,7 +101,7 @@ class Goal:
             raise ValueError(
                 f"target_psnr is {self.psnr}; it must be above 0 and at most {MAX_PSNR:g}"
             )
-        if self.space not in ("rgb", "ycbcr"):
+        if self.space not in FAMILY_SPACES:
             raise ValueError(f"Goal: space {self.space!r} is unknown; use one of rgb, ycbcr")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise ValueError(f"max_gaussians is {self.max_gaussians}; it must be at least 1")

@@ -91,8 +91,9 @@ def test_smooth_picture_has_no_seam():
     assert psnr_in(near, shown, 255 * sky) > min(50, psnr_in(near, whole, 255 * sky) - 1)
 
 
-def test_order_of_blocks_does_not_matter(long):
-    assert_same_bits(long, eg.fit_large(mosaic(128), client=Here(), **LONG))
+def test_order_of_blocks_does_not_matter(short, long):
+    for settings, one in ((FEW, short), (LONG, long)):
+        assert_same_bits(one, eg.fit_large(mosaic(128), client=Here(), **settings))
 
 
 def test_kind_of_source_does_not_matter(tmp_path, short):

@@ -221,7 +221,7 @@ SETS = {
 class TestSampling:
     @pytest.mark.parametrize("name", SETS)
     def test_the_density_is_one(self, name):
-        emitter, count = mi.load_dict(environment_of(sky(**SETS[name]))), 100_000
+        emitter, count = mi.load_dict(environment_of(sky(**SETS[name]))), 400_000
         ds = dr.zeros(mi.DirectionSample3f, count)
         ds.d = mi.warp.square_to_uniform_sphere(uniform(count))
         density = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f, count), ds), np.float64)
