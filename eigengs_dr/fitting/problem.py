@@ -29,7 +29,7 @@ from .measure import Measured, Row, psnrs
 from .method import Model
 from .objective import Channels, Pixels, Target, restored, squares_of
 from .options import FitOptions, Goal
-from .placement.adaptive import squares_by_channel
+from .placement.redistribution import squares_by_channel
 from .start import check_start, load_start, set_in
 
 Image = NDArray[np.float32]

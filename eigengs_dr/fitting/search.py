@@ -21,7 +21,7 @@ from .control import densify, prune
 from .loop import Descent, Refinement, descend
 from .measure import Row
 from .objective import Pixels
-from .placement.adaptive import redistribute
+from .placement.redistribution import redistribute
 from .state import begin
 
 # The constants of a search, chosen on training photos of ImageNet classes. With a surplus in the

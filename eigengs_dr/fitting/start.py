@@ -17,7 +17,7 @@ from .control import densify, in_order, prune
 from .method import Method, Model
 from .objective import Pixels
 from .options import FitOptions, Start
-from .placement.adaptive import Owners, error_by_pixel
+from .placement.redistribution import Owners, error_by_pixel
 from .solve import solve
 
 MAX_ERROR, TRUSTED_STEPS = 0.4, 50

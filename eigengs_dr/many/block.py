@@ -27,20 +27,18 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import types_in
 from ..backend.selection import select
-from ..backend.types import Arrays, Float
+from ..backend.types import Arrays, Float, Singles
 from ..fitting.loop import descend, last
 from ..fitting.method import Method
 from ..fitting.objective import Channels, Part, Pixels, Target, squares_of
 from ..fitting.options import FitOptions
 from ..fitting.placement.adaptive import (
-    Owners,
     density_from_hessian,
-    density_ratio,
-    error_by_pixel,
     place_by_density,
+    planes_of,
     shift_of,
 )
-from ..fitting.placement.filters import Canvas
+from ..fitting.placement.redistribution import Owners, density_ratio, error_by_pixel
 from ..fitting.problem import WHITE
 from ..fitting.solve import solve
 from ..fitting.state import State, begin
@@ -49,7 +47,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import to_linear
 from ..image.pixels import ImageError
 from ..image.space import DATA, YCBCR, Affine, Extent, Space
-from ..raster.render import to_tensor
+from ..raster.render import batch_to_tiles
 from .grid import Block
 from .windows import Window
 
@@ -144,11 +142,11 @@ def survey(task: BlockTask, settings: BlockSettings) -> NDArray[np.float64]:
     These are the integral of the density over the core, and the sum of the values of each channel.
     """
     objective = _objective(task, settings)
-    canvas, _, density = _density(objective, settings)
+    _, density = _density(objective, settings)
     assert objective.model.target is not None
     values = objective.picture(objective.model.target).numpy()[task.block.core]
     total = values.sum(axis=(0, 1), dtype=np.float64)
-    return np.append(_mass(canvas, density, task.block), total)
+    return np.append(_mass(density, task.block), total)
 
 
 def _objective(task: BlockTask, settings: BlockSettings) -> Pixels:
@@ -159,16 +157,15 @@ def _objective(task: BlockTask, settings: BlockSettings) -> Pixels:
     return squares_of([Channels("", settings.space, part, (target,))], types)
 
 
-def _density(objective: Pixels, settings: BlockSettings) -> tuple[Canvas, Float, Float]:
-    """Return the canvas of a window, the squared Hessian and the density."""
-    canvas = Canvas.of(objective.types, objective.grid)
-    return canvas, *density_from_hessian(canvas, objective.placement_image, settings.spacing)
+def _density(objective: Pixels, settings: BlockSettings) -> tuple[Singles, Singles]:
+    """Return the squared Hessian (3, H, W) of a window, and the density (H, W)."""
+    [image] = planes_of(objective.placement_image, objective.grid)
+    return density_from_hessian(image, settings.spacing)
 
 
-def _mass(canvas: Canvas, density: Float, block: Block) -> float:
-    """Return the integral of a density (pixels,) over the core of a block."""
-    pixels = to_tensor(density, canvas.grid, 1).numpy()[..., 0]
-    return float(pixels[block.core].sum(dtype=np.float64))
+def _mass(density: Singles, block: Block) -> float:
+    """Return the integral of a density over the core of a block."""
+    return float(density[block.core].sum(dtype=np.float64))
 
 
 def place_in_block(task: BlockTask, settings: BlockSettings) -> Arrays:
@@ -179,20 +176,22 @@ def place_in_block(task: BlockTask, settings: BlockSettings) -> Arrays:
     dict of str to ndarray
         The mean (n, 2), in pixels of the window and inside the core, and the factor (n, 3).
     """
-    options, count, spacing = settings.options, task.gaussians, settings.spacing
-    canvas, energy, density = _density(_objective(task, settings), settings)
-    types, grid = canvas.types, canvas.grid
+    objective = _objective(task, settings)
+    energy, density = _density(objective, settings)
     if task.arrays is not None:
-        arrays, size = task.arrays | {"color": task.arrays["ratio"]}, (grid.width, grid.height)
-        old = _set_of(arrays, size, DATA, settings)
-        density *= Owners.of(old).average(old.color[0])
-    column, row, _, _ = canvas.pixels()
-    for position, part in zip((row, column), task.block.core, strict=True):
-        first, last = (dr.opaque(types.Int, edge) for edge in (part.start, part.stop))
-        density = dr.select((position >= first) & (position < last), density, 0)
-    shift = shift_of(types, options.seed)
-    mean, factor = place_by_density(canvas, density, energy, count, spacing, shift)
-    return {"mean": mean.numpy().T, "factor": factor.numpy().T}
+        arrays = task.arrays | {"color": task.arrays["ratio"]}
+        old = _set_of(arrays, objective.size, DATA, settings)
+        density *= _at_pixels(Owners.of(old), old.color[0])
+    core = np.zeros_like(density)
+    core[task.block.core] = density[task.block.core]
+    shift = shift_of(settings.options.seed)
+    mean, factor = place_by_density(core, energy, task.gaussians, settings.spacing, shift)
+    return {"mean": mean.astype(np.float32), "factor": factor.astype(np.float32)}
+
+
+def _at_pixels(owners: Owners, ratio: Float) -> Singles:
+    """Return the ratio (N,) of Gaussians at the pixels that they own, (H, W)."""
+    return planes_of(owners.average(ratio), owners.lists.grid)[0, 0]
 
 
 StepDone = Callable[[int], None]
@@ -213,16 +212,16 @@ def find_density(
     full = _objective(task, settings)
     objective, start = _start(task, full, settings)
     fitted = _descend(objective, start, task, settings, step_done)
-    canvas, _, density = _density(full, settings)
+    _, density = _density(full, settings)
     owners = Owners.of(fitted)
     error = error_by_pixel(fitted, objective, owners.lists)
-    ratio = density_ratio(owners, error, density)
+    ratio = density_ratio(owners, error, batch_to_tiles(full.types, density[..., None]))
     arrays = fitted.to_arrays()
     return {
         "mean": arrays["mean"][task.members],
         "factor": arrays["factor"][task.members],
         "ratio": ratio.numpy()[task.members, None],
-        "mass": np.array([_mass(canvas, density * owners.average(ratio), task.block)]),
+        "mass": np.array([_mass(density * _at_pixels(owners, ratio), task.block)]),
     }
 
 

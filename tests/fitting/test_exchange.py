@@ -12,7 +12,7 @@ from _helpers.halves import SIDE, fitted, objective_for, picture, squared_error
 from _helpers.sets import few, scenes
 from eigengs_dr.fitting.control import densify, exchange, exchange_levels, prune, removal_cost
 from eigengs_dr.fitting.objective import Part
-from eigengs_dr.fitting.placement.filters import SIZE
+from eigengs_dr.fitting.placement.peaks import SIZE
 from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import render
 

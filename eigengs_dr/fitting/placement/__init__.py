@@ -1,6 +1,7 @@
 """Where Gaussians start, and where they are added.
 
-- ``adaptive``: placement by second derivatives of the image; redistribution by the error of a fit
-- ``filters``: blurs and second derivatives of images in tile layout; peaks of a residual
-- ``pieces``: centres of equal mass of a density
+- ``adaptive``: placement by second derivatives of the image
+- ``redistribution``: placing the Gaussians of a fit anew, by its error
+- ``peaks``: where an added Gaussian would reduce the error most
+- ``curve``: a Hilbert curve, along which neighbours in memory are close in space
 """

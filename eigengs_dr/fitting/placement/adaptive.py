@@ -1,55 +1,37 @@
 """Adaptive placement: more and smaller Gaussians where the image has large second derivatives.
 
 Gaussians approximate an image well where it is nearly linear; the error comes from the second
-derivatives. So the density of Gaussians follows the squared Hessian
-(`eigengs_dr.fitting.placement.filters`). The means are the centroids of pieces of equal mass of a
-Hilbert curve, after one Lloyd step (`eigengs_dr.fitting.placement.pieces`). Each Gaussian is
-stretched along the direction of the smallest second derivative. The constants were chosen on
-training images of faces and of ImageNet classes by the error after 10 steps of the colour solve.
+derivatives. So the density of Gaussians follows the squared Hessian ``sum_c H_c H_c``, with the
+second derivatives ``H_c`` of channel c. The means are the centroids of pieces of equal mass of a
+Hilbert curve. Each Gaussian is stretched along the direction of the smallest second derivative. The
+constants were chosen on training images of faces and of ImageNet classes by the error after 10
+steps of the colour solve.
 
-Redistribution places the Gaussians of a fit anew, denser where the fit left more error. At a
-density of rho Gaussians per pixel, a fit leaves a squared error of about ``e = k rho^-q`` per
-pixel, with q = `ERROR_EXPONENT`. For a given number of
-Gaussians, the sum of the errors is smallest if all Gaussians have the same error ``s = e / rho``.
-So the density and the error of one fit give the best density:
-
-    rho' ~ k^(1 / (q + 1)) = rho s^(1 / (q + 1)).
-
-Only a fit can tell parts that are hard to fit from parts that merely have large second derivatives.
-Neighbouring Gaussians share their errors, see `Owners`; in what a Gaussian owns, the density
-follows the second derivatives. The constants were chosen on training images of ImageNet classes and
-of cats, by the error after 1,000 steps.
-
-Images are in tile layout, and everything runs on the device. A batch of images takes one launch of
-each kernel; no sum of one depends on another.
+This runs on the host, in NumPy and SciPy: a fit places once or twice, and kernels for it would take
+longer to compile than all others of a first fit.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import drjit as dr
+import numpy as np
+from scipy.ndimage import gaussian_filter
 
-from ...backend.arrays import ArrayTypes, rcp, release_memory, types_of
-from ...backend.recording import record
-from ...backend.types import Float, Rows
+from ...backend.types import Doubles, Float, Singles
+from ...gaussian.covariance import factor_from_covariance
 from ...gaussian.file import CUTOFF
-from ...gaussian.gaussians import Gaussians, whole
-from ...raster.binning.lists import TileLists
-from ...raster.binning.tiles import Grid
-from ...raster.kernels import forward, sum_by_image, sum_lanes
-from ...raster.parameters import detached_shape, gather_run, kernel_radius, pack_parameters
-from ...raster.render import bin_gaussians
-from ..objective import Pixels, Quadratic
-from ..solve import Unknowns, apply, correlate, for_channels, solve, spread
-from .filters import PIXELS, Canvas, downsampled, smoothed, squared_hessian
-from .pieces import lloyd_step, pixel_of, stratify_along_hilbert
+from ...gaussian.gaussians import Gaussians
+from ...raster.binning.tiles import TILE, Grid
+from ..objective import Pixels
+from .curve import hilbert_curve
 
-Density = Callable[[Canvas, Float, int], Float]
-"""``density(canvas, default, times)`` returns the Gaussians per pixel, up to a factor, for the
-density by `density_from_hessian` of an image, which was shrunk by `times`; all in tile layout."""
+Density = Callable[[Singles, int], Singles]
+"""``density(default, times)`` returns the Gaussians per pixel, up to a factor, of images that were
+shrunk by `times`. The default follows second derivatives alone; both have the shape (images, H, W).
+"""
 
 IMAGE_BLUR = 0.18
 """Standard deviation of the blur of the image, in spacings: it removes details that no Gaussian can
@@ -81,6 +63,9 @@ WORKING_SPACING = 8.0
 """Pixels between Gaussians for placement. Images with at least twice this spacing are shrunk first:
 the constants above were chosen near this spacing, and filters of large images take long."""
 
+TRUNCATION = 2.5
+"""Radius of the weights of a blur, in standard deviations."""
+
 
 def place_adaptive(
     objective: Pixels,
@@ -90,8 +75,6 @@ def place_adaptive(
     seed: int = 0,
 ) -> Gaussians:
     """Place and shape Gaussians by the second derivatives of an image, with the colour 0.
-
-    Everything runs on the device, without a copy to the host.
 
     Parameters
     ----------
@@ -104,370 +87,171 @@ def place_adaptive(
     density : callable, optional
         See `Density`.
     seed : int, optional
-        Moves all means along the curve by the same share of a piece, see `SEED_STEP`.
+        Moves all means along the curve by the same share of a piece, see `shift_of`.
 
     Returns
     -------
     Gaussians
         Neighbours in memory are close in space.
     """
-    types, grid, channels = objective.types, objective.grid, objective.channels
-    canvas, image = Canvas.of(types, grid), objective.placement_image
-    mean, factor = _place(canvas, image, count, density, seed)
-    color = [dr.zeros(types.Float, grid.images * count) for _ in range(channels)]
-    background = [dr.zeros(types.Float, grid.images) for _ in range(channels)]
-    dr.make_opaque(color, background)
-    rows = types.FloatX(color), types.FloatX(background)
-    placed = Gaussians(mean, factor, *rows, *objective.size, objective.space, float(cutoff))
-    placed = placed.bounded()
-    dr.eval(placed)
-    release_memory(
-        dr.width(objective.placement_image)
-    )  # nothing later asks for blocks of these sizes
-    return placed
-
-
-def _place(
-    canvas: Canvas,
-    image: Float,
-    count: int,
-    density: Density | None,
-    seed: int,
-    times: int = 1,
-) -> tuple[Rows, Rows]:
-    """Return the means and the factors of `place_adaptive`, for an image after shrinking."""
-    types, grid = canvas.types, canvas.grid
-    spacing = math.sqrt(grid.width * grid.height / count)
-    smaller = int(spacing / WORKING_SPACING)
-    if smaller > 1:
-        small = Grid(-(-grid.width // smaller), -(-grid.height // smaller), images=grid.images)
-        less = Canvas.of(types, small)
-        image = downsampled(canvas, image, less, smaller)
-        mean, factor = _place(less, image, count, density, seed, smaller * times)
-        scale, inverse = (dr.opaque(types.Float, v) for v in (smaller, 1 / smaller))
-        return mean * scale, factor * inverse
-    energy, per_pixel = density_from_hessian(canvas, image, spacing)
-    del image  # images take most of the memory
+    grid, types = objective.grid, objective.types
+    times = max(1, int(math.sqrt(grid.width * grid.height / count) / WORKING_SPACING))
+    images = shrunk(planes_of(objective.placement_image, grid), times)
+    spacing = math.sqrt(math.prod(images.shape[2:]) / count)
+    energies, default = zip(*(density_from_hessian(i, spacing) for i in images), strict=True)
+    per_pixel = np.stack(default)
     if density:
-        per_pixel = density(canvas, per_pixel, times)
-    return place_by_density(canvas, per_pixel, energy, count, spacing, shift_of(types, seed))
+        per_pixel = density(per_pixel, times)
+    placed = [
+        place_by_density(*both, count, spacing, shift_of(seed))
+        for both in zip(per_pixel, energies, strict=True)
+    ]
+    mean, factor = (np.concatenate(rows) for rows in zip(*placed, strict=True))
+    return Gaussians.from_arrays(
+        mean * times,
+        factor / times,
+        np.zeros((len(mean), objective.channels)),
+        size=objective.size,
+        space=objective.space,
+        backend=types.backend,
+        cutoff=cutoff,
+        dtype=np.float32 if types.bits == 32 else np.float64,
+    ).bounded()
 
 
-def shift_of(types: ArrayTypes, seed: int) -> Float:
-    """Return the shift of a seed, see `stratify_along_hilbert`; that of seed 0 is 0."""
-    return dr.opaque(types.Float, 0.5 * (seed * SEED_STEP % 2**32) / 2**32)
+def shift_of(seed: int) -> float:
+    """Return the share of a piece by which a seed moves all cuts back, from 0 to 0.5; 0 for 0."""
+    return 0.5 * (seed * SEED_STEP % 2**32) / 2**32
 
 
-@record
-def place_by_density(
-    canvas: Canvas, density: Float, energy: Float, count: int, spacing: float, shift: Float
-) -> tuple[Rows, Rows]:
-    """Return means, an Array2f, and factors, an Array3f, of Gaussians by a density.
-
-    Parameters
-    ----------
-    canvas : Canvas
-    density : Float, shape (pixels,)
-        Up to a factor; 0 where no Gaussian may lie.
-    energy : Float, shape (pixels * 3,)
-        The squared Hessian, from `density_from_hessian`.
-    count : int
-        Number of Gaussians of an image.
-    spacing : float
-        Mean distance of Gaussians in pixels.
-    shift : Float, shape (1,)
-        See `stratify_along_hilbert`.
-    """
-    density = normalize_density(canvas, density, count)
-    mean = stratify_along_hilbert(canvas, density, count, shift)
-    mean = lloyd_step(canvas, mean, density, spacing)
-    release_memory(dr.width(energy))  # the blur of the energy takes the most
-    factor = shapes_from_hessian(canvas, mean, density, energy, spacing)
-    return canvas.types.Float2(mean), factor
+def planes_of(image: Float, grid: Grid) -> Singles:
+    """Return images in tile layout as planes on the host, shape (images, C, H, W)."""
+    dr.eval(image)
+    width, height = TILE
+    tiles = image.numpy().reshape(grid.images, grid.ny, grid.nx, height, width, -1)
+    planes = tiles.transpose(0, 5, 1, 3, 2, 4).reshape(
+        grid.images, -1, grid.ny * height, grid.nx * width
+    )
+    return np.asarray(planes[..., : grid.height, : grid.width], np.float32)
 
 
-@record
-def density_from_hessian(canvas: Canvas, image: Float, spacing: float) -> tuple[Float, Float]:
+def shrunk(images: Singles, times: int) -> Singles:
+    """Return the means of images (..., H, W) over squares of `times` x `times` pixels."""
+    if times == 1:
+        return images
+    sides = images.shape[-2:]
+    rows, columns = (np.arange(0, side, times) for side in sides)
+    sums = np.add.reduceat(np.add.reduceat(images, rows, -2), columns, -1)
+    high, wide = (np.diff([*s, n]) for s, n in zip((rows, columns), sides, strict=True))
+    return np.asarray(sums / np.float32(high[:, None] * wide))
+
+
+def blurred(plane: Singles, deviation: float) -> Singles:
+    """Return a plane (H, W), or the last two axes of several, blurred by a Gaussian, in pixels."""
+    return np.asarray(
+        gaussian_filter(plane, deviation, mode="nearest", truncate=TRUNCATION, axes=(-2, -1))
+    )
+
+
+def density_from_hessian(image: Singles, spacing: float) -> tuple[Singles, Singles]:
     """Return the squared Hessian of an image, and the density for it, up to a factor.
 
+    Second derivatives are differences of neighbours, those of close floats first, which are exact.
+    An image continues with the pixels of its edges.
+
     Parameters
     ----------
-    canvas : Canvas
-    image : Float, shape (pixels * channels,)
-        In tile layout.
+    image : ndarray of float32, shape (C, H, W)
     spacing : float
         Mean distance of Gaussians in pixels.
 
     Returns
     -------
-    energy : Float, shape (pixels * 3,)
-        See `eigengs_dr.fitting.placement.filters.squared_hessian`.
-    density : Float, shape (pixels,)
-        0 outside the image.
+    energy : ndarray of float32, shape (3, H, W)
+        The entries xx, yy and xy of ``sum_c H_c H_c`` plus isotropic noise.
+    density : ndarray of float32, shape (H, W)
     """
-    noise = (NOISE_SLOPE / spacing**2) ** 2 / 2
-    energy, trace = squared_hessian(canvas, smoothed(canvas, image, IMAGE_BLUR * spacing), noise)
-    trace = smoothed(canvas, trace, DENSITY_BLUR * spacing)
-    inside = canvas.pixels()[-1]
-    density = dr.select(inside, dr.exp2(DENSITY_EXPONENT * dr.log2(trace)), 0)
-    dr.eval(density)
-    return energy, density
+    energy = np.zeros((3, *image.shape[1:]), np.float32)
+    energy[:2] = (NOISE_SLOPE / spacing**2) ** 2 / 2
+    for plane in image:  # one after the other, as small arrays stay in the processor's caches
+        edged = np.pad(blurred(plane, IMAGE_BLUR * spacing), 1, mode="edge")
+        xx = np.diff(edged[1:-1], 2, axis=1)
+        yy = np.diff(edged[:, 1:-1], 2, axis=0)
+        across = edged[:, 2:] - edged[:, :-2]
+        xy = np.float32(0.25) * (across[2:] - across[:-2])
+        energy[2] += xy * (xx + yy)
+        xy *= xy
+        energy[0] += xx * xx + xy
+        energy[1] += yy * yy + xy
+    trace = blurred(energy[0] + energy[1], DENSITY_BLUR * spacing)
+    return energy, trace ** np.float32(DENSITY_EXPONENT)
 
 
-def normalize_density(canvas: Canvas, density: Float, count: int) -> Float:
-    """Scale a density to a sum of about `count` per image, with at most one Gaussian per pixel."""
-    types, grid = canvas.types, canvas.grid
-    total = dr.opaque(types.Float, count)
-    values = types.FloatX(gather_run(types, density, canvas.tile, PIXELS, True))
-    image = canvas.sizes.image_of(canvas.tile)
+def place_by_density(
+    density: Singles, energy: Singles, count: int, spacing: float, shift: float
+) -> tuple[Doubles, Doubles]:
+    """Return means (N, 2) in pixels, and factors (N, 3), of Gaussians by a density.
 
-    def scaled(factor: Float) -> Float:
-        return dr.minimum(values * spread(factor, image), 1)
+    Parameters
+    ----------
+    density : ndarray of float32, shape (H, W)
+        Up to a factor; 0 where no Gaussian may lie.
+    energy : ndarray of float32, shape (3, H, W)
+        The squared Hessian, from `density_from_hessian`.
+    count : int
+        Number of Gaussians.
+    spacing : float
+        Mean distance of Gaussians in pixels.
+    shift : float
+        See `shift_of`.
+    """
+    density = normalized(density, count)
+    mean = centroids_along_curve(density, count, shift)
+    return mean, shapes_from_hessian(mean, density, energy, spacing)
 
-    factor = total / sum_by_image(dr.sum(values, axis=0), grid)
+
+def normalized(density: Singles, count: int) -> Singles:
+    """Scale a density to a sum of about `count`, with at most one Gaussian per pixel."""
+    scaled = density * np.float32(count / density.sum(dtype=np.float64))
     for _ in range(4):  # each round moves the excess of full pixels to the others
-        factor *= total / sum_by_image(dr.sum(scaled(factor), axis=0), grid)
-    result = dr.empty(types.Float, dr.width(density))
-    dr.scatter(result, scaled(factor), canvas.tile)
-    dr.eval(result)
-    return result
+        scaled *= np.float32(count / np.minimum(scaled, 1).sum(dtype=np.float64))
+    return np.asarray(np.minimum(scaled, 1))
+
+
+def centroids_along_curve(density: Singles, count: int, shift: float) -> Doubles:
+    """Cut a Hilbert curve through the pixels into pieces of equal mass; return their centroids.
+
+    All cuts but the two ends move back by `shift` of a piece. The centroids (count, 2), in pixels,
+    are in the order of the curve: neighbours in memory are close in space.
+    """
+    column, row = hilbert_curve(density.shape[1], density.shape[0])
+    mass = density[row, column].astype(np.float64)
+    before = np.concatenate([[0], np.cumsum(mass)])
+    cuts = np.arange(count + 1.0)
+    cuts[1:-1] -= shift
+    cuts *= before[-1] / count
+    # A curve that stands still where the density is 0 has several places for one mass; the moments
+    # of all of them are the same.
+    moments = [
+        np.interp(cuts, before, np.concatenate([[0], np.cumsum(mass * (place + 0.5))]))
+        for place in (column, row)
+    ]
+    centroids = np.diff(moments) / np.diff(cuts)
+    return np.asarray(centroids.T)
 
 
 def shapes_from_hessian(
-    canvas: Canvas, mean: tuple[Float, Float], density: Float, energy: Float, spacing: float
-) -> Rows:
+    mean: Doubles, density: Singles, energy: Singles, spacing: float
+) -> Doubles:
     """Return factors: size by the density, ratio and angle of the axes by the squared Hessian."""
-    types = canvas.types
-    energy = smoothed(canvas, energy, DIRECTION_BLUR * spacing)
-    place, _, _ = pixel_of(canvas, mean)
-    xx, yy, xy = (dr.gather(types.Float, energy, place * 3 + k) for k in range(3))
+    height, width = density.shape
+    x, y = np.minimum(mean.astype(np.int64), [width - 1, height - 1]).T
+    xx, yy, xy = blurred(energy, DIRECTION_BLUR * spacing)[:, y, x].astype(np.float64)
     # The eigenvalues of the energy differ by `split`; the larger one belongs to the direction with
     # the cosine and the sine of twice its angle.
-    split = dr.sqrt(dr.square(xx - yy) + dr.square(2 * xy))
-    cos, sin = (dr.select(split > 0, v / split, 0) for v in (xx - yy, 2 * xy))
+    split = np.hypot(xx - yy, 2 * xy)
+    cos, sin = (np.divide(v, split, np.zeros_like(v), where=split > 0) for v in (xx - yy, 2 * xy))
     ratio = 1 + (MAX_STRETCH - 1) * split / (xx + yy)
-    variance = RELATIVE_SIZE**2 / dr.gather(types.Float, density, place)
-    along, across = variance * ratio, variance / ratio
-    middle, half = 0.5 * (along + across), 0.5 * (along - across)
-    sigma_yy, sigma_xy = middle + half * cos, -half * sin
-    a = dr.sqrt(sigma_yy) / variance
-    factor = types.Float3(a, -sigma_xy / sigma_yy * a, 1 / dr.sqrt(sigma_yy))
-    dr.eval(factor)
-    return factor
-
-
-ERROR_EXPONENT = 4 / 3
-"""Exponent q of the decay of the squared error: twice as many Gaussians leave ``2^-q`` of it, which
-is 4 dB less, as measured from 1,250 to 20,000 Gaussians on 256x256 pixels."""
-
-MIN_ERROR_SHARE = 1e-3
-"""Smallest error of a Gaussian, relative to the average, so that no part of an image is empty."""
-
-NO_ERROR = 1e-12
-"""Smallest squared error of a Gaussian: parts without any error keep some Gaussians too."""
-
-NO_WEIGHT = 1e-6
-"""Sum of weights that counts as zero: pixels that no Gaussian reaches take the average."""
-
-
-@dataclass(frozen=True)
-class Owners:
-    """The parts of pixels that Gaussians own: ``w_n(x) / sum_m w_m(x)`` of the pixel x.
-
-    They overlap, so that what a Gaussian owns is an average over its neighbours too.
-
-    Attributes
-    ----------
-    canvas : Canvas
-    shape : list of Float, shape (N,)
-        See `eigengs_dr.raster.parameters.detached_shape`.
-    lists : TileLists
-    cutoff : float
-    total : Float, shape (pixels,)
-        ``sum_m w_m(x)`` in tile layout.
-    """
-
-    canvas: Canvas
-    shape: list
-    lists: TileLists
-    cutoff: float
-    total: Float
-
-    @classmethod
-    def of(cls, gaussians: Gaussians, images: int = 1) -> Owners:
-        """Return the parts of a set, or of the sets of a batch of images."""
-        types, shape = types_of(gaussians.mean), detached_shape(gaussians)
-        lists = bin_gaussians(gaussians, images=images)
-        total = _sum_weights(shape, types.Float(1), lists, gaussians.cutoff)
-        canvas = Canvas(types, lists.grid, lists.sizes)
-        return cls(canvas, shape, lists, gaussians.cutoff, total)
-
-    def collect(self, first: Float, second: Float) -> list:
-        """Return the sums of two maps (pixels,) over what each Gaussian owns, Floats (N,)."""
-        inverse = dr.select(self.total > NO_WEIGHT, rcp(self.total), 0)
-        both = dr.empty(type(first), 2 * dr.width(first))
-        rows = self.canvas.types.FloatX([first * inverse, second * inverse])
-        dr.scatter(both, rows, dr.arange(self.canvas.types.UInt, dr.width(first)))
-        dr.eval(both)
-        return correlate(self.shape, both, 2, self.lists, self.cutoff)
-
-    def average(self, values: Float) -> Float:
-        """Return the average of values (N,) over the owners of each pixel."""
-        sums = _sum_weights(self.shape, values, self.lists, self.cutoff)
-        _, _, first, _ = self.canvas.pixels()
-        image = self.canvas.sizes.image_of(first)
-        mean = spread(_mean_by_image(values, self.lists), image)
-        return dr.fma(NO_WEIGHT, mean, sums) / (self.total + NO_WEIGHT)
-
-
-def _sum_weights(shape: list, values: Float, lists: TileLists, cutoff: float) -> Float:
-    """Return ``sum_n values_n w_n(x)`` in tile layout; evaluated."""
-    packed = pack_parameters([*shape, values])
-    image = forward(packed, [type(values)(0)], lists, kernel_radius(cutoff))
-    dr.eval(image)
-    return image
-
-
-def _mean_by_image(values: Float, lists: TileLists) -> Float:
-    return sum_by_image(values, lists.grid) / (dr.width(values) // lists.grid.images)
-
-
-@record
-def _squares(shape: list, x: Unknowns, model: Quadratic, lists: TileLists, cutoff: float) -> Float:
-    """Return ``h (p - t)^2`` of every pixel, added over the channels; evaluated."""
-    assert model.target is not None
-    types, channels = types_of(model.target), len(x[0])
-    error, _ = apply(shape, x, lists, cutoff, Quadratic(model.target))
-    dr.eval(error)
-    curvature = model.curvatures(lists.grid)
-    pixel = dr.arange(types.UInt, lists.grid.tiles * lists.grid.pixels)
-    values = dr.width(curvature) // dr.width(pixel)
-
-    def read(image: Float, c: int, number: int) -> Float:
-        return dr.gather(types.Float, image, pixel * number + c)
-
-    factors = for_channels([read(curvature, c, values) for c in range(values)], channels)
-    squares = sum(f * dr.square(read(error, c, channels)) for c, f in enumerate(factors))
-    dr.eval(squares)
-    return squares
-
-
-def error_by_pixel(
-    gaussians: Gaussians, objective: Pixels, lists: TileLists | None = None
-) -> Float:
-    """Return ``sum h (p - t)^2`` over the channels of each pixel for a set.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-    objective : Pixels
-    lists : TileLists, optional
-        Lists of the set, if available.
-
-    Returns
-    -------
-    Float, shape (pixels,)
-        In tile layout, 0 outside the image.
-    """
-    if lists is None:
-        lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    colors = whole(dr.detach(gaussians.color), gaussians), list(dr.detach(gaussians.background))
-    return _squares(detached_shape(gaussians), colors, objective.model, lists, gaussians.cutoff)
-
-
-def squares_by_channel(gaussians: Gaussians, objective: Pixels) -> list:
-    """Return ``sum h (p - t)^2`` over the pixels for each channel, a Float (images,)."""
-    lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    colors = whole(gaussians.color, gaussians), list(gaussians.background)
-    shape, cutoff = detached_shape(gaussians), gaussians.cutoff
-    with dr.suspend_grad():
-        _, lanes = apply(shape, colors, lists, cutoff, objective.model)
-        return sum_lanes(lanes, lists)
-
-
-def density_ratio(owners: Owners, error: Float, bending: Float) -> Float:
-    """Return the ratio of the density for the error to that for the second derivatives.
-
-    For the parameters see `target_density`. Ratios of several parts of an image have one scale:
-    together they give a density of the whole image.
-
-    Returns
-    -------
-    Float, shape (N,)
-        The ratio for the part that each old Gaussian owns.
-    """
-    lists = owners.lists
-    share, mass = owners.collect(error, bending)
-    dr.eval(share, mass)
-    least = dr.maximum(MIN_ERROR_SHARE * _mean_by_image(share, lists), NO_ERROR)
-    share = dr.maximum(share, spread(least, lists.image))
-    mass = dr.maximum(mass, spread(1e-9 * _mean_by_image(mass, lists), lists.image))
-    ratio = dr.exp2(dr.log2(share) / (ERROR_EXPONENT + 1)) / mass
-    dr.eval(ratio)
-    return ratio
-
-
-@record
-def target_density(owners: Owners, error: Float, bending: Float) -> Float:
-    """Return the density at which all Gaussians would have the same error, up to a factor.
-
-    Parameters
-    ----------
-    owners : Owners
-        Parts of the old set.
-    error : Float, shape (pixels,)
-        Its squared error, in tile layout.
-    bending : Float, shape (pixels,)
-        Density for the second derivatives of the image, up to a factor.
-
-    Returns
-    -------
-    Float, shape (pixels,)
-        What an old Gaussian with the error s owns gets ``s^(1 / (q + 1))`` Gaussians together, with
-        q = `ERROR_EXPONENT`.
-    """
-    return bending * owners.average(density_ratio(owners, error, bending))
-
-
-def redistribute(
-    gaussians: Gaussians, objective: Pixels, count: int, solve_steps: int = 10
-) -> Gaussians:
-    """Place a new set, denser where the old set left more error, and solve for its colours.
-
-    Parameters
-    ----------
-    gaussians : Gaussians
-        The old set, after some steps of a fit. For a batch, the sets of all images.
-    objective : Pixels
-    count : int
-        Number of Gaussians of the new set of each image.
-    solve_steps : int, optional
-        Steps of the colour solve, see `eigengs_dr.fitting.solve`.
-
-    Returns
-    -------
-    Gaussians
-        The new set. It keeps no Gaussian of the old set.
-    """
-    images = objective.grid.images
-    with dr.suspend_grad():
-        owners = Owners.of(gaussians, images)
-        error = error_by_pixel(gaussians, objective, owners.lists)
-
-        def density(canvas: Canvas, default: Float, times: int) -> Float:
-            if times == 1:
-                return target_density(owners, error, default)
-            grid = canvas.grid
-            scale, inverse = (dr.opaque(canvas.types.Float, v) for v in (times, 1 / times))
-            small = replace(
-                gaussians,
-                mean=gaussians.mean * inverse,
-                factor=gaussians.factor * scale,
-                width=grid.width,
-                height=grid.height,
-            )
-            less = downsampled(owners.canvas, error, canvas, times)
-            return target_density(Owners.of(small, images), less, default)
-
-        placed = place_adaptive(objective, count, gaussians.cutoff, density)
-    return solve(placed, objective, solve_steps)
+    variance = RELATIVE_SIZE**2 / density[y, x].astype(np.float64)
+    middle, half = variance * (ratio + 1 / ratio) / 2, variance * (ratio - 1 / ratio) / 2
+    return factor_from_covariance(middle - half * cos, -half * sin, middle + half * cos)

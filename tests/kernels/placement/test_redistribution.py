@@ -1,18 +1,26 @@
-"""The density that an error asks for."""
+"""The density that an error asks for, and placement by it."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.halves import objective_for
-from _helpers.plain_placement import to_canvas, to_pixels
+from _helpers.halves import SIDE, fitted, objective_for, objective_of, picture
 from _helpers.sets import SIZE, random_scene
-from eigengs_dr.fitting.placement.adaptive import (
+from _helpers.tiles import to_map, to_tiles
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
+from eigengs_dr.fitting.place import Grid
+from eigengs_dr.fitting.placement.redistribution import (
     ERROR_EXPONENT,
     Owners,
     error_by_pixel,
+    redistribute,
     target_density,
 )
+from eigengs_dr.image.color import rgb_to_ycbcr
+from eigengs_dr.raster.render import render
 
 
 def rounds(side, backend, spacing=5):
@@ -30,10 +38,8 @@ def rounds(side, backend, spacing=5):
 
 
 def density_for(gaussians, error, bending, backend):
-    canvas, error = to_canvas(error, backend)
-    return to_pixels(
-        canvas, target_density(Owners.of(gaussians), error, to_canvas(bending, backend)[1])
-    )
+    (error, grid), (bending, _) = to_tiles(error, backend), to_tiles(bending, backend)
+    return to_map(target_density(Owners.of(gaussians), error, bending), grid)
 
 
 def test_parts_are_those_of_the_weights(backend):
@@ -46,13 +52,14 @@ def test_parts_are_those_of_the_weights(backend):
     parts = weights / np.where(total > 1e-6, total, np.inf)
     rng = np.random.default_rng(0)
     maps, values = rng.uniform(0, 1, (2, *SIZE[::-1])), rng.uniform(1, 2, len(weights))
-    tiles = [to_canvas(m, backend)[1] for m in maps]
+    tiles = [to_tiles(m, backend)[0] for m in maps]
     for found, expected in zip(owners.collect(*tiles), maps, strict=True):
         np.testing.assert_allclose(
             found.numpy(), (parts * expected).sum((1, 2)), rtol=0.1, atol=0.1
         )
     inner = scene.off_edge(3.0) & (total > 0.1)
-    found = to_pixels(owners.canvas, owners.average(owners.canvas.types.Float(values)))
+    values = types_in(select(backend)).Float(values)
+    found = to_map(owners.average(values), owners.lists.grid)
     expected = np.einsum("n,nhw->hw", values, parts)
     np.testing.assert_allclose(found[inner], expected[inner], rtol=1e-4)
     assert (found > 0.99).all()  # also where there is no Gaussian
@@ -64,12 +71,11 @@ def test_error_is_that_of_the_rendering(backend):
     target = np.random.default_rng(0).uniform(0, 1, (SIZE[1], SIZE[0], 3)).astype(np.float32)
     weight = np.random.default_rng(1).uniform(0, 2, target.shape).astype(np.float32)
     shown = eg.render(gaussians).numpy()
-    canvas, _ = to_canvas(target, backend)
     for factor in (None, weight, weight[..., 0]):
         factors = 1.0 if factor is None else np.atleast_3d(factor)
         expected = (factors * np.square(target - shown)).sum(axis=2)
         objective = objective_for(gaussians, target, factor)
-        found = to_pixels(canvas, error_by_pixel(gaussians, objective))
+        found = to_map(error_by_pixel(gaussians, objective), objective.grid)
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -104,3 +110,25 @@ def test_in_a_part_density_follows_the_bending(backend):
 def test_nothing_missed_and_nothing_bent_is_still_a_density(backend):
     density = density_for(rounds(8, backend), np.zeros((8, 8)), np.full((8, 8), 1e-30), backend)
     assert np.isfinite(density).all() and (density > 0).all()
+
+
+@pytest.mark.parametrize("side", [32, 150])
+def test_rearranged_has_the_count_and_goes_where_the_error_is(side):
+    """Also where splats are so far apart that they are placed on a smaller image."""
+    image = np.kron(picture(), np.ones((-(-side // SIDE), -(-side // SIDE), 1)))[:side, :side]
+    objective = objective_of(image.astype(np.float32))
+    start = replace(eg.DEFAULT, place=Grid()).place_and_solve(objective, 64)
+    result = redistribute(start, objective, 50)
+    left = result.mean.numpy()[0] < side / 2
+    assert len(result) == 50
+    assert left.mean() > 0.6  # half of the area, most of the error
+    assert np.isfinite(render(result).numpy()).all()
+
+
+def test_weights_draw_splats():
+    gaussians, _ = fitted()
+    weight = np.ones((SIDE, SIDE), np.float32)
+    weight[SIDE // 2 :] = 1e-6
+    objective = objective_for(gaussians, rgb_to_ycbcr(picture()), weight)
+    result = redistribute(gaussians, objective, 60)
+    assert (result.mean.numpy()[1] < SIDE / 2).mean() > 0.7

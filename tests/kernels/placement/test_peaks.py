@@ -9,22 +9,19 @@ from hypothesis import strategies as st
 from scipy.ndimage import correlate1d, maximum_filter
 
 from _helpers.sets import few
-from eigengs_dr.backend.arrays import types_in
-from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.placement.filters import SIZE, TRUNCATION, Canvas, residual_peaks
-from eigengs_dr.raster.binning.tiles import Grid
-from eigengs_dr.raster.render import batch_to_tiles
+from _helpers.tiles import to_tiles
+from eigengs_dr.backend.arrays import types_of
+from eigengs_dr.fitting.placement.peaks import RADIUS, SIZE, Canvas, residual_peaks
 
 
 def found_peaks(missed, count, weight=None, backend="llvm"):
     """Mean (n, 2), colour (n, C), image and rank (n,), for an error (H, W, C) and its weights."""
-    images = len(missed) if missed.ndim == 4 else 1
-    types, grid = types_in(select(backend)), Grid(*missed.shape[-2:-4:-1], images=images)
     curvature = np.ones((*missed.shape[:-1], 1)) if weight is None else weight
     curvature = curvature.astype(np.float32)
-    slope = (missed * curvature).astype(np.float32)
-    tiles = batch_to_tiles(types, slope), batch_to_tiles(types, curvature)
-    peaks = residual_peaks(Canvas.of(types, grid), *tiles, count)
+    slope, grid = to_tiles(missed * curvature, backend)
+    types = types_of(slope)
+    canvas = Canvas(types, grid, grid.in_arrays(types))
+    peaks = residual_peaks(canvas, slope, to_tiles(curvature, backend)[0], count)
     return SimpleNamespace(
         mean=peaks.mean.numpy().T,
         color=np.stack([row.numpy() for row in peaks.color], axis=1),
@@ -35,8 +32,7 @@ def found_peaks(missed, count, weight=None, backend="llvm"):
 
 def plain_peaks(missed, weight=None):
     """Mean and colour of all peaks, the best first."""
-    radius = int(np.ceil(TRUNCATION * SIZE))
-    taps = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / SIZE))
+    taps = np.exp(-0.5 * np.square(np.arange(-RADIUS, RADIUS + 1) / SIZE))
     weight = np.ones_like(missed) if weight is None else weight + 0 * missed
     slope = missed.astype(float) * weight
     for axis in (0, 1):

@@ -1,0 +1,232 @@
+"""Adaptive placement: its density, its pieces and its shapes, beside mathematics in float64."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import eigengs_dr as eg
+from _helpers.halves import objective_of
+from _helpers.placements import check_placement, covariances_of, generator, images_and_counts
+from _helpers.sets import few
+from eigengs_dr.backend.arrays import types_in
+from eigengs_dr.backend.selection import select
+from eigengs_dr.codec.range_coder import hilbert_encode
+from eigengs_dr.fitting.objective import Pixels
+from eigengs_dr.fitting.placement.adaptive import (
+    MAX_STRETCH,
+    RELATIVE_SIZE,
+    blurred,
+    centroids_along_curve,
+    density_from_hessian,
+    normalized,
+    place_adaptive,
+    planes_of,
+    shapes_from_hessian,
+    shrunk,
+)
+from eigengs_dr.fitting.placement.curve import hilbert_curve, order_along_hilbert
+from eigengs_dr.image.space import DATA
+
+
+def placed(image, count, backend="llvm", density=None):
+    """Means (N, 2) and factors (N, 3)."""
+    objective = objective_of(image, backend, "data")
+    arrays = place_adaptive(objective, count, density=density).to_arrays()
+    return arrays["mean"], arrays["factor"]
+
+
+def density_of(image, count):
+    """Gaussians per pixel (H, W)."""
+    spacing = float(np.sqrt(image.shape[0] * image.shape[1] / count))
+    return normalized(density_from_hessian(np.moveaxis(image, 2, 0), spacing)[1], count)
+
+
+@few
+@given(drawn=images_and_counts())
+def test_density_of_any_image(drawn):
+    """No pixel has more than one Gaussian, none has nothing."""
+    image, count = drawn
+    density = density_of(image, count)
+    assert (density > 0).all()
+    assert density.max() <= 1
+    assert density.sum(dtype=float) <= count * (1 + 1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 10, 100, 400])
+def test_density_sums_to_the_count(count):
+    y, x = np.indices((40, 40)) / 40
+    image = np.stack([np.sin(7 * x * x + y), np.cos(9 * y), x * y], axis=-1).astype(np.float32)
+    assert density_of(image, count).sum(dtype=float) == pytest.approx(count, rel=1e-5)
+
+
+def test_second_derivatives_of_a_parabola():
+    """2 and 6 along the axes, 1 across: H H, in both channels."""
+    y, x = np.indices((30, 40))
+    image = np.stack([x * x + 3 * y * y + x * y] * 2).astype(np.float32) / 64
+    energy, density = density_from_hessian(image, 4.0)
+    hessian = np.array([[2.0, 1], [1, 6]]) / 64
+    squared = 2 * hessian @ hessian
+    noise = (0.2 / 4.0**2) ** 2 / 2
+    inner = np.s_[10:20, 10:30]
+    expected = squared[0, 0] + noise, squared[1, 1] + noise, squared[0, 1]
+    for entry, value in zip(energy, expected, strict=True):
+        np.testing.assert_allclose(entry[inner], value, rtol=1e-3)
+    trace = np.trace(squared) + 2 * noise
+    np.testing.assert_allclose(density[inner], trace ** (2 / 3), rtol=1e-3)
+
+
+@few
+@given(height=st.integers(1, 90), width=st.integers(1, 90))
+def test_the_curve_is_that_of_the_bits_of_places(height, width):
+    x, y = hilbert_curve(width, height)
+    assert len({*zip(x.tolist(), y.tolist(), strict=True)}) == height * width
+    bits = max(2, (max(height, width) - 1).bit_length())
+    place = hilbert_encode(np.stack([x, y], 1), bits)
+    assert (np.diff(place.astype(np.int64)) > 0).all()
+
+
+@few
+@given(height=st.integers(1, 90), width=st.integers(1, 90), images=st.sampled_from([1, 3]))
+def test_sets_are_ordered_along_the_curve_through_tiles(backend, height, width, images):
+    random = np.random.default_rng(height)
+    mean = random.uniform(0, [width, height], (20 * images, 2)).astype(np.float32)
+    rows, size = ([[1, 0, 1]] * len(mean), [[0]] * len(mean)), (width, height)
+    gaussians = eg.Gaussians.from_arrays(mean, *rows, size=size, space="data", backend=backend)
+    column, row = hilbert_curve(-(-width // 4), -(-height // 4))
+    place = {tile: k for k, tile in enumerate(zip(column.tolist(), row.tolist(), strict=True))}
+    tiles = np.minimum(mean, [width - 1, height - 1]).astype(int) // 4
+    keys = [(k // 20, place[tuple(tile)]) for k, tile in enumerate(tiles.tolist())]
+    expected = sorted(range(len(mean)), key=keys.__getitem__)
+    np.testing.assert_array_equal(order_along_hilbert(gaussians, images).numpy(), expected)
+
+
+@few
+@given(
+    height=st.integers(1, 40),
+    width=st.integers(1, 40),
+    part=st.floats(0, 1),
+    shift=st.sampled_from([0, 0.3]),
+)
+def test_pieces_have_equal_mass(height, width, part, shift):
+    """Also where a pixel holds several of them; with all cuts but the ends moved back."""
+    density = np.random.default_rng(height).uniform(0, 1, (height, width)) ** 4
+    count = max(1, round(part * height * width))
+    mean = centroids_along_curve(density.astype(np.float32), count, shift)
+    assert ((mean >= 0) & (mean <= [width, height])).all()
+    share = np.ones(count) / count
+    if count > 1:
+        share[0] -= shift / count
+        share[-1] += shift / count
+    y, x = np.indices(density.shape)
+    center = [(density * (v + 0.5)).sum() / density.sum() for v in (x, y)]
+    np.testing.assert_allclose(share @ mean, center, rtol=1e-5)
+
+
+def test_pieces_of_an_even_density_are_squares():
+    """64 centres on 32 x 32 pixels: pieces of the curve are blocks of 4 x 4."""
+    mean = centroids_along_curve(np.full((32, 32), 64 / 1024, np.float32), 64, 0.0)
+    expected = {(4 * i + 2.0, 4 * j + 2.0) for i in range(8) for j in range(8)}
+    assert {tuple(m) for m in np.round(mean, 5).tolist()} == expected
+
+
+def test_places_without_mass_get_no_piece():
+    density = np.zeros((40, 52), np.float32)
+    density[10:20, 30:41] = 0.4
+    mean = centroids_along_curve(density, 44, 0.2)
+    assert ((mean > [30, 10]) & (mean < [41, 20])).all()
+
+
+def test_shapes_are_those_of_eigenvectors():
+    """The long axis lies along the smallest second derivative; the area follows the density."""
+    random = generator(5)
+    energy = random.uniform(0.5, 1, (3, 20, 24)).astype(np.float32) - [[[0]], [[0]], [[0.75]]]
+    density = random.uniform(0.01, 0.1, (20, 24)).astype(np.float32)
+    y, x = np.indices(density.shape).reshape(2, -1)
+    mean = np.stack([x, y], 1) + 0.5
+    factor = shapes_from_hessian(mean, density, energy.astype(np.float32), 5.0)
+    xx, yy, xy = blurred(energy.astype(np.float32), 2.0)[:, y, x].astype(float)
+    values, axes = np.linalg.eigh(np.moveaxis(np.array([[xx, xy], [xy, yy]]), 2, 0))
+    ratio = 1 + (MAX_STRETCH - 1) * (values[:, 1] - values[:, 0]) / values.sum(axis=1)
+    variance = RELATIVE_SIZE**2 / density[y, x]
+    # Eigenvalues ascend: the first axis lies along the smallest second derivative.
+    own = np.stack([variance * ratio, variance / ratio], 1)
+    sigma = axes * own[:, None] @ axes.transpose(0, 2, 1)
+    np.testing.assert_allclose(covariances_of(factor), sigma, rtol=1e-4, atol=1e-4 * sigma.max())
+
+
+@few
+@given(
+    shape=st.tuples(st.integers(1, 3), st.integers(1, 30), st.integers(1, 30)),
+    times=st.integers(1, 5),
+)
+def test_images_are_shrunk_to_means(shape, times):
+    image = generator(1).uniform(0, 1, shape).astype(np.float32)
+    small = shrunk(image, times)
+    for c, y, x in np.ndindex(*small.shape):
+        square = image[c, y * times : (y + 1) * times, x * times : (x + 1) * times]
+        np.testing.assert_allclose(small[c, y, x], square.mean(dtype=float), rtol=1e-5)
+
+
+def test_planes_are_those_of_the_images(backend):
+    """Of sizes that whole tiles do not fill."""
+    batch = generator(7).uniform(0, 1, (3, 30, 33, 2)).astype(np.float32)
+    objective = Pixels.of(batch, DATA, types_in(select(backend)))
+    planes = planes_of(objective.placement_image, objective.grid)
+    np.testing.assert_array_equal(planes, np.moveaxis(batch, 3, 1))
+
+
+def test_constant_image_is_covered_evenly(backend):
+    mean, factor = placed(np.full((64, 64, 3), 0.5, np.float32), 256, backend)
+    quarter = (mean // 32).astype(int)
+    numbers = np.bincount(quarter[:, 0] + 2 * quarter[:, 1], minlength=4)
+    assert np.abs(numbers - 64).max() <= 3
+    sigma = covariances_of(factor)
+    np.testing.assert_allclose(
+        sigma, np.tile(sigma[0, 0, 0] * np.eye(2), (256, 1, 1)), rtol=0.1, atol=0.5
+    )
+
+
+def test_splats_lie_along_a_slanted_edge():
+    """At 45 degrees, falling to the right: the covariance of x and y is positive along it."""
+    y, x = np.indices((64, 64))
+    image = np.repeat((x > y)[..., None], 3, axis=2).astype(np.float32)
+    mean, factor = placed(image, 200)
+    near = np.abs(mean[:, 0] - mean[:, 1]) < 6
+    sigma = covariances_of(factor[near])
+    along = sigma.sum(axis=(1, 2)) / 2  # variance along (1, 1) / sqrt 2
+    across = along - 2 * sigma[:, 0, 1]
+    assert (along > 2 * across).mean() > 0.9
+
+
+def test_splats_far_apart_are_placed_on_a_smaller_image():
+    """Their means and covariances are those of the small one, enlarged."""
+    small = generator().uniform(0, 1, (33, 53, 3)).astype(np.float32)
+    image = np.kron(small, np.ones((3, 3, 1), np.float32))[:97, :158]  # splats lie 27 pixels apart
+    mean, factor = placed(image, 21)
+    expected_mean, expected_factor = placed(small, 21)
+    np.testing.assert_allclose(mean, 3 * expected_mean, rtol=1e-4)
+    np.testing.assert_allclose(factor, expected_factor / 3, rtol=1e-3, atol=1e-5)
+    check_placement(mean, factor, 21, (158, 97))
+
+
+def test_density_given_to_adaptive_is_followed():
+    def left(default, times):
+        return np.broadcast_to(np.linspace(1, 1e-5, 40, dtype=np.float32), default.shape)
+
+    mean, _ = placed(np.zeros((40, 40, 3), np.float32), 100, density=left)
+    assert (mean[:, 0] < 20).mean() > 0.7
+
+
+def test_sets_of_a_batch_are_those_of_its_images(backend):
+    batch = generator(7).uniform(0, 1, (3, 30, 33, 3)).astype(np.float32)
+
+    def placed_for(*images):
+        objective = Pixels.of(np.stack(images), DATA, types_in(select(backend)))
+        return place_adaptive(objective, 60)
+
+    together = placed_for(*batch)
+    for name in ("mean", "factor"):
+        rows = getattr(together, name).numpy().T
+        for image, part in zip(batch, np.split(rows, 3), strict=True):
+            np.testing.assert_array_equal(part, getattr(placed_for(image), name).numpy().T)
