@@ -5,13 +5,11 @@ Each backend is tried in its own process, so that a crash ends only this process
 
 import importlib.util
 import json
-import math
 import os
 import platform
 import subprocess
 import sys
 from importlib.metadata import requires
-from typing import NamedTuple
 
 from .selection import (
     BACKENDS,
@@ -140,93 +138,3 @@ def _python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run Python code in a fresh interpreter."""
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-# ---------------------------------------------------------------------------------------------
-#  A GPU against llvm: ``eigengs-dr doctor --trial NAME`` computes something, and prints its figures
-# ---------------------------------------------------------------------------------------------
-
-
-ALLOWED = {"fit": 0.05, "scene": 5e-3}
-"""Largest allowed difference of the figures of each comparison: in dB for "fit", relative to the
-largest figure for "scene". A GPU sums in another order, and some of its instructions have 20 bits.
-"""
-
-TRIAL_SECONDS = 600.0
-"""Time limit of a trial, which spends most of it compiling its programs."""
-
-
-class Trial(NamedTuple):
-    """A trial on one backend.
-
-    Attributes
-    ----------
-    seconds : float
-        Time of the second run in the process, after its programs are compiled.
-    figures : list of float
-    problem : str
-        One line if the trial has failed, otherwise empty.
-    """
-
-    seconds: float
-    figures: list[float]
-    problem: str = ""
-
-
-class Agreement(NamedTuple):
-    """A trial on llvm and on a GPU.
-
-    Attributes
-    ----------
-    name : str
-        A key of `ALLOWED`.
-    llvm, gpu : Trial
-    difference : float
-        See `ALLOWED`; infinite if one of the two has failed.
-    """
-
-    name: str
-    llvm: Trial
-    gpu: Trial
-    difference: float
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the difference is allowed."""
-        return self.difference <= ALLOWED[self.name]
-
-
-def compare_backends(name: str, backend: str) -> Agreement:
-    """Run a trial on llvm and on a GPU; this takes between a few seconds and a minute.
-
-    Parameters
-    ----------
-    name : str
-        A key of `ALLOWED`.
-    backend : {"cuda", "metal"}
-    """
-    llvm, gpu = run_trial(name, "llvm"), run_trial(name, backend)
-    difference = float("inf")
-    if not (llvm.problem or gpu.problem) and len(llvm.figures) == len(gpu.figures):
-        unit = 1.0 if name == "fit" else max(map(abs, llvm.figures))
-        pairs = zip(llvm.figures, gpu.figures, strict=True)
-        differences = [abs(one - other) / unit for one, other in pairs]
-        if all(map(math.isfinite, differences)):
-            difference = max(differences)
-    return Agreement(name, llvm, gpu, difference)
-
-
-def run_trial(name: str, backend: str) -> Trial:
-    """Run one trial on one backend, in another process."""
-    command = [sys.executable, "-m", "eigengs_dr", "doctor", "--trial", name, "--backend", backend]
-    try:
-        process = subprocess.run(
-            command, capture_output=True, text=True, check=False, timeout=TRIAL_SECONDS
-        )
-    except subprocess.TimeoutExpired:
-        return Trial(0.0, [], f"not finished after {TRIAL_SECONDS:.0f} s")
-    if process.returncode == 0:
-        answer: Record = json.loads(process.stdout.splitlines()[-1])
-        return Trial(answer["seconds"], answer["figures"])
-    lines = process.stderr.splitlines()
-    return Trial(0.0, [], f"exit code {process.returncode}: {lines[-1] if lines else ''}"[:200])

@@ -171,10 +171,3 @@ def test_info_of_something_else(trained, tmp_path):
     np.savez(tmp_path / "x.npz", format=np.array("something.else"))
     assert_refused(run("info", tmp_path / "x.npz"), "something.else", "eigengs_dr.model")
     assert_refused(run("info", folder / "m.png"), "m.png")
-
-
-def test_doctor():
-    text = said("doctor")
-    assert "llvm" in text and "libLLVM" in text
-    found = json.loads(said("doctor", "--json"))
-    assert found["llvm"]["works"] or found["cuda"]["works"]
