@@ -25,7 +25,7 @@ from ..backend.recording import record
 from ..backend.types import Bool, Float, Rows, UInt
 from ..gaussian.gaussians import Gaussians, concatenate, take, whole
 from ..raster.binning.lists import TileLists
-from ..raster.kernels import channel_sums, sum_by_image, sum_lanes
+from ..raster.kernels import channel_sums, sum_by_image
 from ..raster.parameters import detached_shape
 from ..raster.render import bin_gaussians, to_tiles
 from .objective import Part, Pixels, Quadratic
@@ -469,7 +469,7 @@ class _Comparison:
     model: Quadratic
 
     def slope(self, colors: Unknowns) -> tuple[Float, list]:
-        """Return ``h (p - t)`` for some colours, and the sums of ``h (p - t)^2`` by lanes."""
+        """Return ``h (p - t)`` for some colours, and the sums of ``h (p - t)^2`` by channels."""
         return apply(self.shape, colors, self.lists, self.cutoff, self.model)
 
     def weigh(self, slope: Float) -> tuple[Float, Unknowns]:
@@ -677,9 +677,8 @@ def _value(
     """
     assert scene.model.target is not None
     types, channels = types_of(scene.model.target), len(scene.colors[0])
-    slope, lanes = scene.slope(scene.colors)
-    squares = sum(sum_lanes(lanes, scene.lists))
-    dr.eval(slope, squares)
+    slope, squares_of_channels = scene.slope(scene.colors)
+    squares = sum(squares_of_channels)
     cost, diagonal = scene.weigh(slope)
     if inside is not None:
         cost = dr.select(among(dr.arange(types.UInt, dr.width(cost)), movable), cost, dr.inf)

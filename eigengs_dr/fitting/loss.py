@@ -26,9 +26,9 @@ from ..backend.types import Float, Record, Tensor, UInt
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.space import Affine
 from ..raster.binning.lists import TileLists
-from ..raster.kernels import forward
+from ..raster.kernels import forward, pixels_inside
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
-from ..raster.render import bin_gaussians, pixels_inside, to_tensor
+from ..raster.render import bin_gaussians, to_tensor
 from .frozen import arrays_of
 from .objective import Channels, Pixels, Quadratic, Slope
 

@@ -21,14 +21,14 @@ from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import RGB_TO_YCBCR, to_linear, to_pu21
 from ..image.metrics import psnr_from_mse
 from ..raster.binning.lists import TileLists
-from ..raster.kernels import forward, sum_by_image
+from ..raster.kernels import image_of, pixels_inside, sum_by_image
 from ..raster.parameters import (
     detached_shape,
     gather_run,
     kernel_radius,
     pack_parameters,
 )
-from ..raster.render import bin_gaussians, pixels_inside
+from ..raster.render import bin_gaussians
 from .objective import Picture
 from .solve import spread
 
@@ -97,8 +97,8 @@ def _squared_errors(
     values. A lane owns the pixels of a row of a tile. The pictures are those of `psnrs`.
     """
     types, grid = types_of(shape[0]), lists.grid
-    rendered = forward(pack_parameters([*shape, *color]), background, lists, kernel_radius(cutoff))
-    dr.eval(rendered)
+    packed = pack_parameters([*shape, *color])
+    rendered = image_of(packed, background, lists, kernel_radius(cutoff))
     length = grid.tile[0]
     run = dr.arange(types.UInt, grid.tiles * grid.pixels // length)
     owner = lists.sizes.image_of(run // (grid.pixels // length))

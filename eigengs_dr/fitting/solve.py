@@ -21,7 +21,7 @@ from ..gaussian.gaussians import Gaussians, whole
 from ..raster.adjoint import adjoint
 from ..raster.binning.lists import TileLists
 from ..raster.binning.tiles import Grid
-from ..raster.kernels import channel_sums, sum_by_image, sum_lanes
+from ..raster.kernels import channel_sums, difference, image_of, sum_by_image
 from ..raster.parameters import (
     detached_shape,
     gather_run,
@@ -135,9 +135,7 @@ def _begin(
     """
     assert model.target is not None
     channels, grid, types = len(x[0]), lists.grid, types_of(model.target)
-    error, lanes = apply(shape, x, lists, cutoff, model)
-    squares = sum_lanes(lanes, lists)
-    dr.eval(error, squares)  # together: later, the sums would render again
+    error, squares = apply(shape, x, lists, cutoff, model)
     color, diagonal = weigh(shape, error, channels, lists, cutoff, model.curvatures(grid))
     inverse = preconditioner(diagonal, channels)
     inverse = held_background(inverse) if held else inverse
@@ -235,8 +233,7 @@ def _advance(
 
     Return x, ``q = H A p``, and ``alpha = rz / <A p, q>``.
     """
-    q, lanes = apply(shape, p, lists, cutoff, Quadratic(None, curvature))
-    lengths = sum_lanes(lanes, lists)
+    q, lengths = apply(shape, p, lists, cutoff, Quadratic(None, curvature))
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, lengths, strict=True)]
     dr.eval(alpha)
@@ -263,12 +260,12 @@ def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) ->
 def apply(
     shape: list, x: Unknowns, lists: TileLists, cutoff: float, model: Quadratic
 ) -> tuple[Float, list]:
-    """Return ``H (A x - D)``, and for each lane the sums of ``h (A x - D)^2``.
+    """Return ``H (A x - D)``, and for each channel the sums of ``h (A x - D)^2``, of every image.
 
     A model without a target has ``D = 0``.
     """
-    packed = pack_parameters([*shape, *x[0]])
-    return model.compare(packed, x[1], lists, kernel_radius(cutoff))
+    image = image_of(pack_parameters([*shape, *x[0]]), x[1], lists, kernel_radius(cutoff))
+    return difference(image, lists, model.target, model.curvature)
 
 
 def apply_transposed(

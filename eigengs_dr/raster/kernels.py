@@ -164,6 +164,14 @@ def forward(
     return image
 
 
+def image_of(packed: Float, start: list, lists: TileLists, radius: float) -> Float:
+    """Return `forward`, evaluated by itself: one program for all that need the image."""
+    dr.eval(packed, start)
+    image = forward(packed, start, lists, radius)
+    dr.eval(image)
+    return image
+
+
 def residual(
     packed: Float,
     start: list,
@@ -228,6 +236,41 @@ def residual(
     return delta, squares
 
 
+def difference(
+    image: Float, lists: TileLists, target: Float | None, curvature: Float | None = None
+) -> tuple[Float, list]:
+    """Compare an image from `image_of` with another one, as `residual` does; a lane owns a pixel.
+
+    Returns
+    -------
+    delta : Float, shape (tiles * pixels * channels,)
+    squares : list of Float, shape (images,)
+        For each channel, the sums of ``h e^2`` over the pixels of each image.
+    """
+    types, grid = types_of(image), lists.grid
+    number = grid.tiles * grid.pixels
+    pixel, channels = dr.arange(types.UInt, number), dr.width(image) // number
+
+    def load(values: Float) -> list:
+        return gather_run(types, values, pixel, dr.width(values) // number, True)
+
+    errors = load(image)
+    if target is not None:
+        errors = [s - t for s, t in zip(errors, load(target), strict=True)]
+    if grid.overhangs:
+        inside = pixels_inside(types, grid) > 0
+        errors = [dr.select(inside, e, 0) for e in errors]
+    deltas = errors
+    if curvature is not None:
+        factors = load(curvature)
+        deltas = [e * factors[k * len(factors) // channels] for k, e in enumerate(errors)]
+    delta = dr.empty(types.Float, number * channels)
+    dr.scatter(delta, types.FloatX(deltas), pixel)
+    squares = [e * d for e, d in zip(errors, deltas, strict=True)]
+    dr.eval(delta, squares)  # together: later, the sums would read all again
+    return delta, [sum_by_image(s, grid) for s in squares]
+
+
 def _inside(blocks: _Blocks, sizes: GridArrays) -> list:
     """Return whether each pixel of a block lies in the image."""
     return [
@@ -235,6 +278,16 @@ def _inside(blocks: _Blocks, sizes: GridArrays) -> list:
         for j in range(blocks.size[1])
         for i in range(blocks.size[0])
     ]
+
+
+def pixels_inside(types: ArrayTypes, grid: Grid) -> Float:
+    """Return 1 for pixels inside the images and 0 for overhanging pixels, in tile layout."""
+    sizes = grid.in_arrays(types)
+    index = dr.arange(types.UInt, grid.tiles * grid.pixels)
+    column, row = sizes.first_pixel(index // grid.pixels)
+    x = types.Float(column + index % grid.tile[0])
+    y = types.Float(row + index // grid.tile[0] % grid.tile[1])
+    return dr.select((x < sizes.width) & (y < sizes.height), types.Float(1), 0)
 
 
 def sum_lanes(values: list, lists: TileLists) -> list:

@@ -447,16 +447,6 @@ def to_tiles(types: ArrayTypes, image: Values, grid: Grid) -> Float:
     return result
 
 
-def pixels_inside(types: ArrayTypes, grid: Grid) -> Float:
-    """Return 1 for pixels inside the images and 0 for overhanging pixels, in tile layout."""
-    sizes = grid.in_arrays(types)
-    index = dr.arange(types.UInt, grid.tiles * grid.pixels)
-    column, row = sizes.first_pixel(index // grid.pixels)
-    x = types.Float(column + index % grid.tile[0])
-    y = types.Float(row + index // grid.tile[0] % grid.tile[1])
-    return dr.select((x < sizes.width) & (y < sizes.height), types.Float(1), 0)
-
-
 def batch_to_tiles(types: ArrayTypes, images: Values) -> Float:
     """Upload images (M, height, width, channels) in tile layout, image after image.
 

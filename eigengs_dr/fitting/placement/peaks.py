@@ -21,6 +21,7 @@ from ...backend.recording import record
 from ...backend.types import Float, Rows, UInt
 from ...raster.binning.tiles import TILE, Grid, GridArrays
 from ...raster.parameters import gather_run
+from ..solve import for_channels
 
 SIDE = TILE[0]
 """Width and height of a tile in pixels."""
@@ -62,25 +63,20 @@ class Canvas:
         column, row = self.corner(index >> 4)
         return column + self.types.Int(index & 3), row + self.types.Int((index >> 2) & 3)
 
-    def rows(self, image: Float, down: int = 0, right: int = 0) -> list:
-        """Return the values of rows of 4 pixels, 0 outside the image; a lane owns a row.
-
-        They lie `down` pixels below the row of the lane, at most 4, and `right` rows beside it.
-        """
-        types, sizes, length = self.types, self.sizes, SIDE * self.channels(image)
-        lane = dr.arange(types.UInt, self.grid.tiles * SIDE)
-        column, row = self.corner(lane >> 2)
-        beyond = types.Int(lane & 3) + down
-        row, column = row + beyond, column + right * SIDE
+    def read(self, image: Float, right: int = 0, down: int = 0) -> list:
+        """Return the channels of the pixels beside all pixels, 0 outside the image."""
+        types, pixel = self.types, dr.arange(self.types.UInt, self.grid.tiles * PIXELS)
+        x, y = self.pixels(pixel)
+        column, row = x + right, y + down
         width, height = self.sides()
-        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        tiles = (beyond >> 2) * (sizes.nx - 1)  # those from its own tile to the one above or below
-        place = types.Int(lane) + (tiles + right) * SIDE + down
-        return gather_run(types, image, types.UInt(place), length, inside)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        tiles = ((row >> 2) - (y >> 2)) * self.sizes.nx + (column >> 2) - (x >> 2)
+        place = (tiles + types.Int(pixel >> 4)) * PIXELS + (row & 3) * SIDE + (column & 3)
+        return gather_run(types, image, types.UInt(place), self.channels(image), inside)
 
     def store(self, values: list) -> Float:
-        """Write the values of all rows of 4 pixels, by pixels and channels; return the image."""
-        number = self.grid.tiles * SIDE
+        """Write the channels of all pixels; return the image, evaluated."""
+        number = self.grid.tiles * PIXELS
         result = dr.empty(self.types.Float, number * len(values))
         dr.scatter(result, self.types.FloatX(values), dr.arange(self.types.UInt, number))
         dr.eval(result)
@@ -97,7 +93,8 @@ steps)."""
 RADIUS = math.ceil(2.5 * SIZE)
 """Pixels up to which the weights reach along an axis; with a third more, peaks gain 0.00 dB."""
 
-_WEIGHTS = [math.exp(-0.5 * (k / SIZE) ** 2) for k in range(-RADIUS, RADIUS + 1)]
+REACH = range(-RADIUS, RADIUS + 1)
+_WEIGHTS = [math.exp(-0.5 * (k / SIZE) ** 2) for k in REACH]
 
 TAPS = [w / sum(v * v for v in _WEIGHTS) for w in _WEIGHTS]
 """The weights along an axis, divided by the sum of their squares: they give the colour c."""
@@ -165,44 +162,25 @@ def _maxima(canvas: Canvas, slope: Float, curvature: Float) -> tuple[Float, Floa
 
     It is 0 at all other pixels, and without its factor ``<w, w> / 2``.
     """
-    channels, values = canvas.channels(slope), canvas.channels(curvature)
-    length = SIDE * channels
-    near = [v for right in (-1, 0, 1) for v in canvas.rows(slope, right=right)]
-    near = near[length - RADIUS * channels :]
-    along = canvas.store([_weighted(near[k::channels]) for k in range(length)])
-    rows = [canvas.rows(along, down) for down in range(-RADIUS, RADIUS + 1)]
-    blurred = [_weighted(column) for column in map(list, zip(*rows, strict=True))]
-    factors = canvas.rows(curvature)
-    factors = [factors[k * values // channels] for k in range(length)]
+    along = canvas.store(_blurred([canvas.read(slope, right=k) for k in REACH]))
+    blurred = _blurred([canvas.read(along, down=k) for k in REACH])
+    factors = for_channels(canvas.read(curvature), len(blurred))
     colors = [dr.select(h > 0, b / h, 0) for b, h in zip(blurred, factors, strict=True)]
-    terms = [c * b for c, b in zip(colors, blurred, strict=True)]
-    gains = canvas.store([sum(terms[n * channels : (n + 1) * channels]) for n in range(SIDE)])
-    squares = [
-        [v for right in (-1, 0, 1) for v in canvas.rows(gains, down, right)] for down in (-1, 0, 1)
-    ]
-    maxima = canvas.store([_if_maximum(squares, SIDE + n) for n in range(SIDE)])
-    return canvas.store(colors), maxima
-
-
-def _weighted(values: list) -> Float:
-    """Return the sum of the first values, times `TAPS`."""
-    total = values[0] * TAPS[0]
-    for value, tap in zip(values[1:], TAPS[1:], strict=False):
-        total = dr.fma(value, tap, total)
-    return total
-
-
-def _if_maximum(rows: list, x: int) -> Float:
-    """Return the value x of the middle row if it is the largest of 3x3; 0 otherwise.
-
-    Of equal ones, it is the first.
-    """
-    center, largest = rows[1][x], True
+    gains = canvas.store([sum(c * b for c, b in zip(colors, blurred, strict=True))])
+    [center], largest = canvas.read(gains), True
     for k in range(9):
-        other = rows[k // 3][x + k % 3 - 1]
-        if k != 4:
+        [other] = canvas.read(gains, k % 3 - 1, k // 3 - 1)
+        if k != 4:  # of equal ones, the first is the largest
             largest &= center > other if k < 4 else center >= other
-    return dr.select(largest, center, 0)
+    return canvas.store(colors), canvas.store([dr.select(largest, center, 0)])
+
+
+def _blurred(near: list) -> list:
+    """Return the sums of the channels of pixels in a line, times `TAPS`."""
+    total = [v * TAPS[0] for v in near[0]]
+    for values, tap in zip(near[1:], TAPS[1:], strict=True):
+        total = [dr.fma(v, tap, t) for v, t in zip(values, total, strict=True)]
+    return total
 
 
 def _ranked(place: UInt, gain: Float, canvas: Canvas, count: int) -> tuple[UInt, UInt, UInt]:

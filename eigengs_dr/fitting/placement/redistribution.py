@@ -27,7 +27,7 @@ from ...backend.recording import record
 from ...backend.types import Float, Singles
 from ...gaussian.gaussians import Gaussians, whole
 from ...raster.binning.lists import TileLists
-from ...raster.kernels import forward, sum_by_image, sum_lanes
+from ...raster.kernels import image_of, sum_by_image
 from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ...raster.render import batch_to_tiles, bin_gaussians
 from ..objective import Pixels, Quadratic
@@ -98,9 +98,7 @@ class Owners:
 def _sum_weights(shape: list, values: Float, lists: TileLists, cutoff: float) -> Float:
     """Return ``sum_n values_n w_n(x)`` in tile layout; evaluated."""
     packed = pack_parameters([*shape, values])
-    image = forward(packed, [type(values)(0)], lists, kernel_radius(cutoff))
-    dr.eval(image)
-    return image
+    return image_of(packed, [type(values)(0)], lists, kernel_radius(cutoff))
 
 
 def _mean_by_image(values: Float, lists: TileLists) -> Float:
@@ -156,8 +154,7 @@ def squares_by_channel(gaussians: Gaussians, objective: Pixels) -> list:
     colors = whole(gaussians.color, gaussians), list(gaussians.background)
     shape, cutoff = detached_shape(gaussians), gaussians.cutoff
     with dr.suspend_grad():
-        _, lanes = apply(shape, colors, lists, cutoff, objective.model)
-        return sum_lanes(lanes, lists)
+        return apply(shape, colors, lists, cutoff, objective.model)[1]
 
 
 def density_ratio(owners: Owners, error: Float, bending: Float) -> Float:
