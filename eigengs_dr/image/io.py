@@ -22,6 +22,8 @@ from .pixels import (
     ImageError,
     check_encoding,
     encoding_of,
+    is_bitmap,
+    is_tensor,
     peak_of,
     reason_of,
     to_floats,
@@ -195,8 +197,52 @@ def check_image(
     """
     encoded = read_image(image, keep_grey, encoding)
     light = encoded.encoding == "linear"
-    pixels = read_floats(encoded, keep_grey, copy and not light).pixels
-    return by_strips(to_coded, pixels) if light else pixels
+    return codes_of(read_floats(encoded, keep_grey, copy and not light))
+
+
+def codes_of(image: EncodedImage) -> NDArray[np.float32]:
+    """Return checked pixels as sRGB codes, above 1 for light above 1."""
+    return by_strips(to_coded, image.pixels) if image.encoding == "linear" else image.pixels
+
+
+def read_photo(photo: object, encoding: str | None = None) -> EncodedImage:
+    """Read a photo that may be a rendering, as float32; its encoding is not changed.
+
+    Numbers of a list, an array or a tensor are linear light if they are floats, as those of
+    `mitsuba.render`, and sRGB codes if they are whole; other photos are what they say. For
+    parameters and errors see `check_image`.
+    """
+    check_encoding(encoding)
+    declared = (str, os.PathLike, EncodedImage)
+    if not (isinstance(photo, declared) or is_picture(photo) or is_bitmap(photo)):
+        photo = _array_of(photo)
+        if encoding is None and isinstance(photo, np.ndarray) and photo.dtype.kind == "f":
+            encoding = "linear"
+            _refuse_bytes(photo)
+    return read_floats(photo, copy=False, encoding=encoding)
+
+
+def _array_of(photo: object) -> Any:
+    """Return numbers as an array of NumPy; rows of unequal length unchanged, for their error."""
+    if is_tensor(photo):
+        import drjit as dr
+
+        photo = dr.detach(photo)
+    try:
+        return np.asanyarray(photo)
+    except ValueError:
+        return photo
+
+
+def _refuse_bytes(photo: NDArray[np.floating]) -> None:
+    """Refuse floats that are whole numbers up to 255, which would be light far above white."""
+    if not photo.size or not 2 < photo.max() <= 255 or photo.min() == photo.max():
+        return
+    if (photo == np.rint(photo)).all():
+        raise ImageError(
+            f"image: floats are whole numbers up to {photo.max():g}; divide by 255 and pass "
+            "encoding='srgb', or pass encoding='linear' for light"
+        )
 
 
 def check_data(image: object, copy: bool = True) -> NDArray[np.float32]:

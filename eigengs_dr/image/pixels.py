@@ -92,8 +92,8 @@ def encoding_of(image: object, encoding: str | None = None) -> str | None:
     check_encoding(encoding)
     if encoding is not None:
         return encoding
-    if hasattr(image, "srgb_gamma") and hasattr(image, "component_format"):  # a mitsuba.Bitmap
-        return "srgb" if image.srgb_gamma() else "linear"
+    if is_bitmap(image):
+        return "srgb" if image.srgb_gamma() else "linear"  # type: ignore[attr-defined]
     is_tensor = type(image).__module__.startswith("drjit.")
     if is_tensor and tuple(getattr(image, "shape", ()))[2:] == (3,):
         warn(
@@ -101,6 +101,11 @@ def encoding_of(image: object, encoding: str | None = None) -> str | None:
             "from mitsuba.render, or encoding='srgb'; eigengs_dr.picture_of needs none"
         )
     return None
+
+
+def is_bitmap(image: object) -> bool:
+    """Return whether an image is a ``mitsuba.Bitmap``, without importing Mitsuba."""
+    return hasattr(image, "srgb_gamma") and hasattr(image, "component_format")
 
 
 def peak_of(dtype: np.dtype) -> int:
