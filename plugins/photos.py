@@ -20,6 +20,7 @@ from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.gaussian.channels import usual_space
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.io import read_photo
+from eigengs_dr.image.notes import series
 from eigengs_dr.image.pixels import ImageError, check_encoding, reason_of
 from eigengs_dr.image.space import space_of
 
@@ -151,10 +152,11 @@ def photo_loss(
             f"photo_loss: integrator is {integrator!r}; give a loaded one, such as "
             "mi.load_dict({'type': 'prb'})"
         )
-    targets = [
-        _check_photo(number, photo, sensor.film().crop_size(), encoding)
-        for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
-    ]
+    with series():
+        targets = [
+            _check_photo(number, photo, sensor.film().crop_size(), encoding)
+            for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
+        ]
     judged = sorted({k * len(targets) // JUDGED for k in range(JUDGED)})
     generator = np.random.default_rng(seed)
     shares = [held_out * (number in judged) for number in range(len(targets))]

@@ -5,24 +5,26 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.doors import takes_numbers
-from ..backend.messages import warn
 from ..backend.types import ArrayLike
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats import BITS, SUFFIXES, write_file
+from .notes import ABOVE_WHITE, tell
 from .pixels import (
     MAX_PIXEL,
+    WHITE,
     EncodedImage,
     ImageError,
     check_encoding,
     encoding_of,
     is_bitmap,
+    is_drjit,
     is_tensor,
     peak_of,
     reason_of,
@@ -142,7 +144,7 @@ def pixels_of(image: object) -> Any:
         raise ImageError(f"image: {error}") from None
     pixels, transparent = over_background(pixels, alpha)
     if transparent:
-        warn(f"image: {transparency_note(alpha)}")
+        tell("image", transparency_note(alpha))
     return pixels
 
 
@@ -205,21 +207,46 @@ def codes_of(image: EncodedImage) -> NDArray[np.float32]:
     return by_strips(to_coded, image.pixels) if image.encoding == "linear" else image.pixels
 
 
-def read_photo(photo: object, encoding: str | None = None) -> EncodedImage:
+def read_photo(photo: object, encoding: str | None = None, arrays: str = "linear") -> EncodedImage:
     """Read a photo that may be a rendering, as float32; its encoding is not changed.
 
-    Numbers of a list, an array or a tensor are linear light if they are floats, as those of
-    `mitsuba.render`, and sRGB codes if they are whole; other photos are what they say. For
-    parameters and errors see `check_image`.
+    Floats in a tensor of Dr.Jit are linear light, as those of `mitsuba.render`; floats in a list
+    or another array are what `arrays` says; whole numbers are sRGB codes; other photos are what
+    they say. For parameters and errors see `check_image`.
     """
     check_encoding(encoding)
     declared = (str, os.PathLike, EncodedImage)
     if not (isinstance(photo, declared) or is_picture(photo) or is_bitmap(photo)):
+        is_rendering = is_drjit(photo)
         photo = _array_of(photo)
         if encoding is None and isinstance(photo, np.ndarray) and photo.dtype.kind == "f":
-            encoding = "linear"
-            _refuse_bytes(photo)
+            encoding = "linear" if is_rendering else arrays
+            if encoding == "linear":
+                _refuse_bytes(photo)
     return read_floats(photo, copy=False, encoding=encoding)
+
+
+class Codes(NamedTuple):
+    """sRGB codes of an image of a family that was checked, (H, W, 3); above 1 is light above 1."""
+
+    pixels: NDArray[np.float32]
+
+
+def check_member(
+    image: object, encoding: str | None = None, name: str = "image"
+) -> NDArray[np.float32]:
+    """Return an image of a family in sRGB, which may be the array itself.
+
+    A rendering is read as `read_photo` does; floats in other arrays are sRGB. Light above white
+    keeps its codes, with a warning: the spaces of families end at white.
+    """
+    if isinstance(image, Codes):
+        return image.pixels
+    encoded = read_photo(image, encoding, arrays="srgb")
+    pixels = codes_of(encoded)
+    if encoded.encoding == "linear" and pixels.max() > WHITE:
+        tell(str(image) if isinstance(image, (str, os.PathLike)) else name, ABOVE_WHITE)
+    return pixels
 
 
 def _array_of(photo: object) -> Any:

@@ -30,6 +30,7 @@ from ..fitting.problem import Problem
 from ..image.color import MAX_CHANNELS
 from ..image.io import codes_of, read_photo
 from ..image.metrics import psnr_from_mse
+from ..image.notes import series
 from ..image.pixels import ImageError, check_encoding
 from ..image.space import DATA
 from .lights import LightTable, check_lights, functions_at, read_lights, solve_table
@@ -104,7 +105,8 @@ def read_photos(
         raise ValueError(f"there are {len(photos)} photos, but {len(directions)} lights")
     if len(photos) < MIN_LIGHTS:
         raise ValueError(f"there are {len(photos)} photos; a model needs at least {MIN_LIGHTS}")
-    return _stacked(photos, directions, encoding)
+    with series():
+        return _stacked(photos, directions, encoding)
 
 
 def _stacked(photos: Sequence[object], lights: Doubles, encoding: str | None) -> Photos:
