@@ -74,7 +74,7 @@ def series() -> Iterator[None]:
         else:
             for note, (first, *others) in noted.items():
                 images = "image" if len(others) == 1 else "images"
-                more = f"; so for {len(others)} other {images}" if others else ""
+                more = f"; the same holds for {len(others)} other {images}" if others else ""
                 warn(f"{first}: {note}{more}")
 
 

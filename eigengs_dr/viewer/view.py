@@ -137,6 +137,8 @@ def view(
             "Relightable"
         )
     check_encoding(encoding)
+    if encoding and image is None:
+        raise ValueError("encoding is for the pixels of an image; leave it out, or give one")
     model = source if isinstance(source, EigenGS) else None
     lights = describe_lights(source) if isinstance(source, Relightable) else None
     if isinstance(source, Relightable):
