@@ -25,7 +25,6 @@ from .pixels import (
     encoding_of,
     is_bitmap,
     is_drjit,
-    is_tensor,
     peak_of,
     reason_of,
     to_floats,
@@ -251,10 +250,6 @@ def check_member(
 
 def _array_of(photo: object) -> Any:
     """Return numbers as an array of NumPy; rows of unequal length unchanged, for their error."""
-    if is_tensor(photo):
-        import drjit as dr
-
-        photo = dr.detach(photo)
     try:
         return np.asanyarray(photo)
     except ValueError:

@@ -73,9 +73,7 @@ def series() -> Iterator[None]:
             tell_all(noted)
         else:
             for note, (first, *others) in noted.items():
-                images = "image" if len(others) == 1 else "images"
-                more = f"; the same holds for {len(others)} other {images}" if others else ""
-                warn(f"{first}: {note}{more}")
+                warn(f"{first}: {note}" + (f"; so for {len(others)} more" if others else ""))
 
 
 PROFILE_LEVELS = (0, 64, 128, 192, 255)
@@ -85,8 +83,12 @@ PROFILE_TOLERANCE = 4
 """Largest difference, in levels of 255, between colour profiles that count as equal."""
 
 
+EXIF_SPACES = {2: "Adobe RGB", 65535: "Adobe RGB or another space"}
+"""Values of the tag ColorSpace that are not sRGB; the DCF option R03, Adobe RGB, has the second."""
+
+
 @lru_cache(64)  # images of one camera share a profile
-def profile_note(profile: bytes, encoding: str) -> Notes:
+def profile_note(profile: bytes, encoding: str, exif_space: object = None) -> Notes:
     """Return a warning if an ICC profile differs from sRGB, or from linear light.
 
     Parameters
@@ -95,9 +97,12 @@ def profile_note(profile: bytes, encoding: str) -> Notes:
         Empty if there is no profile.
     encoding : {"srgb", "linear"}
         The assumed encoding of the pixels.
+    exif_space : int, optional
+        The tag ColorSpace of EXIF, which counts if there is no profile.
     """
     if not profile:
-        return ()
+        name = EXIF_SPACES.get(exif_space) if encoding == "srgb" else None  # type: ignore[call-overload]
+        return (f"its colours are {name} by EXIF, not sRGB, which is ignored",) if name else ()
     from PIL import Image, ImageCms
 
     try:
@@ -129,18 +134,6 @@ def primaries_note(primaries: Sequence[float], tolerance: float) -> Notes:
     if np.abs(np.subtract(primaries, REC709)).max() <= tolerance:
         return ()
     return ("its primaries are not those of sRGB, which is ignored",)
-
-
-EXIF_SPACES = {2: "Adobe RGB", 65535: "Adobe RGB or another space"}
-"""Values of the tag ColorSpace that are not sRGB; the DCF option R03, Adobe RGB, has the second."""
-
-
-def exif_note(space: object, profile: object, encoding: str = "srgb") -> Notes:
-    """Return a warning about the colour space in EXIF, if no profile says more."""
-    name = EXIF_SPACES.get(space) if isinstance(space, int) else None
-    if name is None or profile or encoding != "srgb":
-        return ()
-    return (f"its colours are {name} by its EXIF data, not sRGB, which is ignored",)
 
 
 GAIN_MAP: Notes = ("its gain map, for light above white, is left out",)

@@ -21,15 +21,7 @@ from numpy.typing import NDArray
 
 from ..storage.memory import check_content
 from .formats import HAS_HEIF, HEIF_SUFFIXES, STARTS
-from .notes import (
-    GAIN_MAP,
-    depth_notes,
-    exif_note,
-    png_notes,
-    primaries_note,
-    profile_note,
-    tell,
-)
+from .notes import GAIN_MAP, depth_notes, png_notes, primaries_note, profile_note, tell
 from .pixels import EncodedImage, ImageError, peak_of, reason_of, scale_to_white
 from .strips import Pixels, by_strips
 
@@ -286,8 +278,8 @@ def _header(path: Path, file: oiio.ImageInput) -> Header:
     encoding = "linear" if str(spec.format) in FLOATS else "srgb"
     size, orientation = (spec.width, spec.height), spec.getattribute("Orientation")
     profile = spec.getattribute("ICCProfile")
-    notes = profile_note(b"" if profile is None else bytes(profile), encoding)
-    notes += exif_note(spec.getattribute("Exif:ColorSpace"), profile, encoding)
+    space = spec.getattribute("Exif:ColorSpace")
+    notes = profile_note(b"" if profile is None else bytes(profile), encoding, space)
     if kind == "openexr":
         size = spec.full_width, spec.full_height
         notes += _exr_notes(spec)
@@ -634,10 +626,8 @@ def _picture_header(path: Path) -> Header:
         exif: Any = {} if image.format == "PNG" else image.getexif()
         is_turned = exif.get(ORIENTATION, 1) in TRANSPOSED
         width, height = image.size[::-1] if is_turned else image.size
-        profile = image.info.get("icc_profile") or b""
-        notes = profile_note(profile, "srgb")
-        if exif:
-            notes += exif_note(exif.get_ifd(EXIF).get(COLOR_SPACE), profile)
+        space = exif.get_ifd(EXIF).get(COLOR_SPACE) if exif else None
+        notes = profile_note(image.info.get("icc_profile") or b"", "srgb", space)
         # The other pictures of an MPO file are a gain map or previews.
         frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
         notes += depth_notes(path, image) + _frames_note(frames)

@@ -171,7 +171,7 @@ def test_light_above_white_in_a_family_gets_a_word(family, model):
     for call in (model[0].project, model[1].project, model[1].encode):
         assert [word in text for text in warned(call, bright[0], encoding="linear")[1]] == [True]
     rows, texts = warned(model[1].encode_many, bright, encoding="linear")
-    assert len(texts) == 1 and word in texts[0] and "2 other images" in texts[0]
+    assert len(texts) == 1 and word in texts[0] and "2 more" in texts[0]
     assert eg.render(rows[0].result).numpy().max() > 1.2
 
 
@@ -216,7 +216,7 @@ def test_a_colour_space_in_exif_gets_one_word_for_a_series(noted, model):
     for name, call in calls.items():
         [text] = warned(call)[1]
         assert text.startswith(str(files[0])) and "Adobe RGB" in text, name
-        assert "11 other images" in text, name
+        assert "11 more" in text, name
 
 
 def test_train_says_a_note_once_and_keeps_its_encoding(noted):
