@@ -19,9 +19,9 @@ from eigengs_dr.backend.types import ArrayLike
 from eigengs_dr.fitting.loss import Loss
 from eigengs_dr.gaussian.channels import usual_space
 from eigengs_dr.image.color import to_linear
-from eigengs_dr.image.io import read_floats
+from eigengs_dr.image.io import read_photo
+from eigengs_dr.image.notes import series
 from eigengs_dr.image.pixels import ImageError, check_encoding, reason_of
-from eigengs_dr.image.read import is_picture
 from eigengs_dr.image.space import space_of
 
 from .environment import texels_of
@@ -152,10 +152,11 @@ def photo_loss(
             f"photo_loss: integrator is {integrator!r}; give a loaded one, such as "
             "mi.load_dict({'type': 'prb'})"
         )
-    targets = [
-        _check_photo(number, photo, sensor.film().crop_size(), encoding)
-        for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
-    ]
+    with series():
+        targets = [
+            _check_photo(number, photo, sensor.film().crop_size(), encoding)
+            for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
+        ]
     judged = sorted({k * len(targets) // JUDGED for k in range(JUDGED)})
     generator = np.random.default_rng(seed)
     shares = [held_out * (number in judged) for number in range(len(targets))]
@@ -442,11 +443,7 @@ def _check_photo(number: int, photo: Any, size: Sequence[int], encoding: str | N
     is_file = isinstance(photo, (str, os.PathLike))
     name = f"photo {number} ({os.fspath(photo)})" if is_file else f"photo {number}"
     try:
-        if not (is_file or is_picture(photo) or isinstance(photo, mi.Bitmap)):
-            photo = np.asanyarray(dr.detach(photo) if dr.is_array_v(photo) else photo)
-            if photo.dtype.kind == "f":
-                encoding = encoding or "linear"
-        image = read_floats(photo, encoding=encoding)
+        image = read_photo(photo, encoding)
     except (ValueError, OSError, TypeError, RuntimeError) as error:  # PyTorch: the last two
         reason = reason_of(error).removeprefix("image: ").removeprefix(f"{photo}: ")
         raise ImageError(f"photo_loss: {name}: {reason}") from error

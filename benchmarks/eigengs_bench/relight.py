@@ -116,6 +116,7 @@ def gaussians(task: Task, pixels: int, seen: Lit, unseen: Lit) -> Row:
     """Fit a model, and pack it with several budgets."""
     height, width = unseen.photos.shape[1:3]
     options: Any = {"gaussians": height * width // pixels, "iterations": task.iterations}
+    options["encoding"] = "srgb"
     model = eg.Relightable.fit(*seen, **options, backend=task.backend, progress=False)
     points, count = [], model.planes.channels
 
@@ -211,7 +212,7 @@ def fixed(functions: Callable[[Array], Array], seen: Lit, unseen: Lit) -> Row:
 
 def defaults(seen: Lit, unseen: Lit) -> Row:
     """Take the defaults of relight: 9 principal components, RBF between lights, JPEG 95."""
-    found = find_planes(read_photos(*seen), PLANES[0])
+    found = find_planes(read_photos(*seen, "srgb"), PLANES[0])
     values = found.table.values
     spline = RBFInterpolator(seen.lights[:, :2], values.reshape(len(values), -1), smoothing=1e-3)
     factors = spline(unseen.lights[:, :2]).reshape(-1, *values.shape[1:])
@@ -223,7 +224,7 @@ def components(kind: str, tuned: bool, seen: Lit, unseen: Lit) -> Row:
     """Code our planes and our table, as pixels: with any number of planes, at any quality."""
     rows = []
     for count in PLANES:
-        found = find_planes(read_photos(*seen), count)
+        found = find_planes(read_photos(*seen, "srgb"), count)
         size = found.table.values.size + 6 * len(seen.lights)
         factors = found.table.at(unseen.lights)
         rows.append(_measured(found.images, factors, unseen, size, kind, tuned))

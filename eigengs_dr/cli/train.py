@@ -39,6 +39,7 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
 @options.choice("--preset", ["default", "eigengs"], "Solve for weights, or train like the paper.")
 @options.number("--iterations", "Steps of the preset eigengs.  [default: 15000]", minimum=1)
 @options.choice("--space", ["ycbcr", "rgb"], "Colour space of the components.")
+@options.encoding
 @options.number("--seed", "Random seed.", 0, minimum=0)
 @options.value("--preview", "FILE", options.path, "Picture of the components.")
 @options.value(
@@ -172,6 +173,7 @@ def _train_on_lights(
                 gaussians=choices["gaussians"],
                 planes=planes,
                 seed=choices["seed"],
+                encoding=choices["encoding"],
                 backend=run.backend,
                 progress=lambda done, total, row: show("planes", done, total),
                 **({} if steps is None else {"iterations": steps}),

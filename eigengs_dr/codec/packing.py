@@ -125,6 +125,8 @@ def pack(
         raise ValueError(f"{output}: pack writes {SUFFIX} files; use this suffix, or save()")
     require_writable(output)  # before the work
     check_encoding(encoding)
+    if encoding and image is None:
+        raise ValueError("pack: encoding is for the pixels of an image; leave it out, or give one")
     if not 0 < max_psnr_drop <= MAX_PSNR:
         raise ValueError(
             f"pack: max_psnr_drop is {max_psnr_drop}; it must be above 0 and at most "

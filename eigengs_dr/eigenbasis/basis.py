@@ -14,8 +14,9 @@ from ..backend.doors import shows_progress, takes_numbers
 from ..backend.messages import to_html, warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..image.folder import TrainingImages
-from ..image.io import check_image
-from ..image.pixels import check_size
+from ..image.io import check_member
+from ..image.notes import series
+from ..image.pixels import check_encoding, check_size
 from ..image.resize import resample
 from ..image.space import space_of, to_planes
 from .files import ENERGY_TOLERANCE, read_basis, write_basis
@@ -75,6 +76,7 @@ class Eigenbasis:
         progress: Any = None,
         client: object = None,
         checkpoint: str | os.PathLike[str] | None = None,
+        encoding: str | None = None,
     ) -> Eigenbasis:
         """Compute the eigenbasis of a family of images in one pass.
 
@@ -108,6 +110,9 @@ class Eigenbasis:
             An existing folder for this call only, which stores results of tasks, so that the same
             call can be continued after an interruption; the caller deletes it. By default a
             temporary folder.
+        encoding : {"srgb", "linear"}, optional
+            What the pixels of all images are, see `eigengs_dr.fit`. By default a tensor of Dr.Jit
+            holds linear light, as those of `mitsuba.render`, and floats of other arrays are sRGB.
 
         Raises
         ------
@@ -120,12 +125,15 @@ class Eigenbasis:
         Warns
         -----
         UserWarning
-            If images are skipped, cropped or too few, or `components` is too low for the energy.
+            If images are skipped, cropped, too few or brighter than white, or `components` is too
+            low for the energy.
         """
         size, limits = check_size(size), check_components(components, energy)
         ranks = [rank_for(k) for k in limits]
-        stream = Stream(size, space, ranks, block_length(size), progress)
-        states = find_states(images, stream, client, checkpoint)
+        check_encoding(encoding)
+        stream = Stream(size, space, ranks, block_length(size), progress, encoding)
+        with series():
+            states = find_states(images, stream, client, checkpoint)
         count, shape = states[0].count, (size[1], size[0])
         if energy is None and count <= max(limits):
             images_give = "1 image gives" if count == 1 else f"{count} images give"
@@ -159,13 +167,14 @@ class Eigenbasis:
         """Height in pixels."""
         return self.mean.shape[1]
 
-    def project(self, image: ArrayLike) -> tuple[Singles, ...]:
+    def project(self, image: ArrayLike, encoding: str | None = None) -> tuple[Singles, ...]:
         """Return the coefficients w_j of an image, a tuple of C float32 arrays of shape (k_c,).
 
         The image, (H, W, 3), (H, W, 1) or (H, W), may have any size and is resampled to the basis.
-        The method raises `ImageError` if `eigengs_dr.image.io.check_image` rejects the array.
+        For its encoding see `from_images`. The method warns about light above white, and raises
+        `ImageError` if `eigengs_dr.image.io.check_image` rejects the array.
         """
-        return self._coefficients(self._centred(image))
+        return self._coefficients(self._centred(image, encoding))
 
     def reconstruct(self, coefficients: Sequence[ArrayLike]) -> Singles:
         """Return the image for C arrays of coefficients, shape (k_c,), as `project` returns them.
@@ -190,7 +199,9 @@ class Eigenbasis:
         pairs = zip(self.eigenvalues, self.variance, strict=True)
         return tuple(np.minimum(np.cumsum(v) / (total or 1), 1) for v, total in pairs)
 
-    def truncation_curve(self, images: Iterable[ArrayLike] | None = None) -> TruncationCurve:
+    def truncation_curve(
+        self, images: Iterable[ArrayLike] | None = None, encoding: str | None = None
+    ) -> TruncationCurve:
         """Return the mean PSNR of images as a function of the number of components.
 
         ``basis.truncated(basis.truncation_curve(images).rank_for_psnr(30))`` reaches 30 dB.
@@ -200,10 +211,14 @@ class Eigenbasis:
         images : iterable of array_like, optional
             At least one image as for `project` (otherwise ValueError), preferably not from the
             training. By default, the curve of the training images follows from the eigenvalues.
+        encoding : {"srgb", "linear"}, optional
+            See `from_images`.
         """
         if images is None:
+            refuse_encoding(encoding, "the curve follows from the eigenvalues")
             return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean.size)
-        rows = [self._residuals(image) for image in images]
+        with series():
+            rows = [self._residuals(image, encoding) for image in images]
         if not rows:
             raise ValueError("there are no images to measure the basis on; pass at least one")
         residuals = [np.stack(channel) for channel in zip(*rows, strict=True)]
@@ -239,9 +254,9 @@ class Eigenbasis:
         """
         return cls(**read_basis(path))
 
-    def _centred(self, image: ArrayLike) -> Singles:
+    def _centred(self, image: ArrayLike, encoding: str | None) -> Singles:
         """Resample and convert an image, and subtract the mean; shape (C, H, W)."""
-        pixels = resample(check_image(image), self.width, self.height)
+        pixels = resample(check_member(image, encoding), self.width, self.height)
         planes = to_planes(pixels, self.space) - self.mean.reshape(len(self.mean), -1)
         return planes.reshape(self.mean.shape)
 
@@ -249,12 +264,18 @@ class Eigenbasis:
         pairs = zip(self.components, planes, strict=True)
         return tuple(np.tensordot(components, plane) for components, plane in pairs)
 
-    def _residuals(self, image: ArrayLike) -> list[Doubles]:
+    def _residuals(self, image: ArrayLike, encoding: str | None) -> list[Doubles]:
         """Return the squared error of each channel after 0, 1, ..., k_c components."""
-        planes = self._centred(image)
+        planes = self._centred(image, encoding)
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
         pairs = zip(lengths, self._coefficients(planes), strict=True)
         return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
+
+
+def refuse_encoding(encoding: str | None, reason: str) -> None:
+    """Raise ValueError if an encoding is given where no pixels are read."""
+    if encoding is not None:
+        raise ValueError(f"encoding is for the pixels of images, and {reason}; leave it out")
 
 
 def check_components(

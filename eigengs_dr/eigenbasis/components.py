@@ -17,7 +17,7 @@ from ..backend.types import Doubles, Record, Singles
 from ..fitting.place import grid_of
 from ..gaussian.gaussians import Gaussians, concatenate, with_colors
 from ..image.metrics import psnr_from_mse
-from ..image.pixels import check_size
+from ..image.pixels import check_encoding, check_size
 from ..image.space import FAMILY_SPACES, space_of
 from ..paper.joint_training import Band, State, joint_shapes, joint_weights, train_jointly
 from .basis import Eigenbasis, check_components
@@ -47,6 +47,8 @@ class TrainOptions:
         See `eigengs_dr.EigenGS.fit`.
     space : {"ycbcr", "rgb"}
         Space of the components.
+    encoding : {"srgb", "linear"} or None
+        What the pixels of the images are, see `eigengs_dr.Eigenbasis.from_images`.
 
     Raises
     ------
@@ -64,11 +66,13 @@ class TrainOptions:
     iterations: int | None = None
     space: str = "ycbcr"
     seed: int = 0
+    encoding: str | None = None
 
     def __post_init__(self) -> None:
         for name, value in plain_numbers(vars(self), TrainOptions.__annotations__).items():
             object.__setattr__(self, name, value)
         check_components(self.components, self.energy)
+        check_encoding(self.encoding)
         if self.target_psnr is not None:
             check_target(self.target_psnr)
             if self.energy is not None:

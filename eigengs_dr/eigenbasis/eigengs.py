@@ -20,8 +20,8 @@ from ..backend.doors import door, shows_progress, takes_numbers
 from ..backend.messages import to_html
 from ..backend.types import ArrayLike, Doubles, Record, Singles
 from ..gaussian.gaussians import Gaussians, with_colors
-from ..image.io import check_image
-from ..image.pixels import EncodedImage
+from ..image.io import Codes, check_member
+from ..image.pixels import EncodedImage, check_encoding
 from ..image.resize import resample
 from .files import read_model, write_model
 from .truncation import TruncationCurve, curve_from_eigenvalues, name_components
@@ -88,6 +88,7 @@ class EigenGS:
         iterations: int | None = None,
         backend: str | None = None,
         progress: Any = None,
+        encoding: str | None = None,
     ) -> EigenGS:
         """Fit one set of Gaussians to the mean image and all components of an eigenbasis.
 
@@ -111,6 +112,8 @@ class EigenGS:
         progress : bool or callable, optional
             By default a bar, in a terminal or a notebook, after two seconds; False shows none. A
             function is called as ``progress(step, steps, {})`` after every round of training.
+        encoding : {"srgb", "linear"}, optional
+            What the pixels of images are, see `eigengs_dr.Eigenbasis.from_images`.
 
         Raises
         ------
@@ -119,11 +122,13 @@ class EigenGS:
         BackendError
             If the backend does not work.
         """
-        from .basis import Eigenbasis
+        from .basis import Eigenbasis, refuse_encoding
         from .components import TrainOptions, fit_model
 
         if not isinstance(basis, Eigenbasis):
-            basis = Eigenbasis.from_images(basis, progress=False)
+            basis = Eigenbasis.from_images(basis, progress=False, encoding=encoding)
+        else:
+            refuse_encoding(encoding, "a basis holds none")
         options = TrainOptions(
             size=(basis.width, basis.height),
             gaussians=gaussians,
@@ -160,7 +165,9 @@ class EigenGS:
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
     @door
-    def project(self, image: ArrayLike, target_psnr: float | None = None) -> tuple[Singles, ...]:
+    def project(
+        self, image: ArrayLike, target_psnr: float | None = None, encoding: str | None = None
+    ) -> tuple[Singles, ...]:
         """Compute the coefficients of an image by least squares on the rendered components.
 
         The function solves ``min_a |Psi~ a - (I - Psi~_0)|^2``. If the Gaussians render the
@@ -174,6 +181,8 @@ class EigenGS:
         target_psnr : float, optional
             Use the fewest components that reach this PSNR, in dB, for the image at the size of the
             model; see `eigengs_dr.eigenbasis.truncation.TruncationCurve`. By default all.
+        encoding : {"srgb", "linear"}, optional
+            What the pixels are, see `eigengs_dr.Eigenbasis.from_images`.
 
         Returns
         -------
@@ -188,9 +197,10 @@ class EigenGS:
         Warns
         -----
         UserWarning
-            If all components miss the target; the result then has all of them.
+            If all components miss the target; the result then has all of them. If the image is
+            brighter than white.
         """
-        return self.encoder.project(check_image(image, copy=False), target_psnr)
+        return self.encoder.project(check_member(image, encoding), target_psnr)
 
     @door
     def reconstruct(
@@ -227,6 +237,7 @@ class EigenGS:
         colors: str = "exact",
         mean: str = "gaussians",
         target_psnr: float | None = None,
+        encoding: str | None = None,
     ) -> Gaussians:
         """Encode an image as Gaussians with its native size, without optimisation.
 
@@ -244,6 +255,9 @@ class EigenGS:
             `dense_mean`.
         target_psnr : float, optional
             Use the fewest components that reach this PSNR; only with "projected", see `project`.
+        encoding : {"srgb", "linear"}, optional
+            What the pixels are, see `eigengs_dr.Eigenbasis.from_images`. Light above white is kept
+            in renderings and files of floats, with a warning: displays and textures clamp it.
 
         Raises
         ------
@@ -251,7 +265,7 @@ class EigenGS:
             As for `project`; also if an option is unknown, or a target is combined with exact
             colours.
         """
-        pixels = check_image(image, copy=False)
+        pixels = check_member(image, encoding)
         check_coding(colors, mean, target_psnr)
         columns = self.encoder.columns(pixels, colors, mean == "dense", target_psnr)
         return self._colored(columns, (pixels.shape[1], pixels.shape[0]))
@@ -267,6 +281,7 @@ class EigenGS:
         colors: str = "exact",
         mean: str = "gaussians",
         target_psnr: float | None = None,
+        encoding: str | None = None,
         progress: Any = None,
         client: object = None,
     ) -> list[ImageRow]:
@@ -277,7 +292,7 @@ class EigenGS:
         images, output, overwrite, progress, client
             See `eigengs_dr.fit_many`. Without an output folder, ``ImageRow.result`` is a
             `Gaussians`; rows have no PSNR.
-        colors, mean, target_psnr
+        colors, mean, target_psnr, encoding
             See `encode`. The Gaussians are bit-identical to those of `encode`.
 
         Returns
@@ -294,10 +309,13 @@ class EigenGS:
         from ..many.run import Job, run_images
 
         check_coding(colors, mean, target_psnr)
+        check_encoding(encoding)
         work = partial(_encode_all, model=self, options=(colors, mean, target_psnr))
-        options = {"colors": colors, "mean": mean, "target_psnr": target_psnr}
+        options = {"colors": colors, "mean": mean, "target_psnr": target_psnr, "encoding": encoding}
         options |= {"model": fingerprint(self)}
-        job = Job(work, options=options, given=list(options))
+        job = Job(
+            work, read=partial(_read, encoding=encoding), options=options, given=list(options)
+        )
         return run_images(images, output, overwrite, job, progress, client)
 
     def _colored(self, columns: Doubles, size: tuple[int, int] | None) -> Gaussians:
@@ -352,7 +370,13 @@ def _encode_all(
     images: list[EncodedImage], model: EigenGS, options: tuple[str, str, float | None]
 ) -> list[Gaussians]:
     """Encode images, in this process or on a worker."""
-    return [model.encode(image, *options) for image in images]
+    return [model.encode(Codes(image.pixels), *options) for image in images]
+
+
+def _read(image: Any, name: str, encoding: str | None) -> EncodedImage:
+    """Read an image. An array is copied, because its owner may overwrite it."""
+    pixels = check_member(image, encoding, f"image {name}")
+    return EncodedImage(pixels if isinstance(image, Path | str) else pixels.copy(), "srgb")
 
 
 @cache  # files of the package do not change

@@ -28,6 +28,7 @@ from ..backend.messages import warn
 from ..backend.types import Doubles, Singles, Values
 from ..cluster import executor_for
 from ..image.folder import ReadProgress, TrainingImages, list_images, read_blocks
+from ..image.notes import NotedImages, kept_notes, tell_all
 from ..image.pixels import ImageError
 from ..image.remote import is_url
 from ..storage.checkpoint import read_arrays, write_arrays
@@ -278,6 +279,7 @@ class Stream(NamedTuple):
         Number of images of a block.
     progress : callable, optional
         See `eigengs_dr.Eigenbasis.from_images`; used in this process only.
+    encoding : {"srgb", "linear"}, optional
     """
 
     size: tuple[int, int]
@@ -285,6 +287,7 @@ class Stream(NamedTuple):
     ranks: Sequence[int]
     length: int
     progress: ReadProgress | None = None
+    encoding: str | None = None
 
 
 def find_states(
@@ -340,7 +343,8 @@ def _merge_shards(images: Images, stream: Stream, client: object, folder: Path) 
     )
     waiting: dict[int, list[EigenState]] = {}
     with closing(completed(executor_for(client), make_shard, tasks, stream)) as ended:
-        for (k, part), (states, notes) in ended:
+        for (k, part), (states, noted, notes) in ended:
+            tell_all(noted)
             for note in notes:
                 warn(note)
             waiting[k] = states
@@ -363,14 +367,16 @@ def _merge_shards(images: Images, stream: Stream, client: object, folder: Path) 
     return result
 
 
-def make_shard(task: tuple[int, Images], stream: Stream) -> tuple[list[EigenState], list[str]]:
-    """Compute the states of a shard of images, and return its warnings; this runs on a worker.
+def make_shard(
+    task: tuple[int, Images], stream: Stream
+) -> tuple[list[EigenState], NotedImages, list[str]]:
+    """Compute the states of a shard, and return notes and other warnings; this runs on a worker.
 
     If no file of a shard can be read, its states are empty; an invalid array is an error.
     """
     _, images = task
     notes = []
-    with warnings.catch_warnings(record=True) as caught:
+    with kept_notes() as noted, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
             states = _find_states_of_part(images, stream)
@@ -379,14 +385,14 @@ def make_shard(task: tuple[int, Images], stream: Stream) -> tuple[list[EigenStat
                 raise
             states = [empty_state(stream.size) for _ in stream.ranks]
             notes.append(str(error))
-    return states, notes + [str(note.message) for note in caught]
+    return states, noted, notes + [str(note.message) for note in caught]
 
 
 def _find_states_of_part(images: Images, stream: Stream) -> list[EigenState]:
     """Compute the state of each channel, block by block."""
-    size, space, ranks, length, progress = stream
+    size, space, ranks, length, progress, encoding = stream
     states = [empty_state(size) for _ in ranks]
-    with closing(read_blocks(images, size, space, length, progress)) as blocks:
+    with closing(read_blocks(images, size, space, length, progress, encoding)) as blocks:
         for block in blocks:
             for c, rank in enumerate(ranks):
                 states[c] = merge(states[c], block[:, c], rank)

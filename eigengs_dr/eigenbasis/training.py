@@ -14,10 +14,11 @@ import numpy as np
 
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import warn
-from ..backend.types import Record, Singles
+from ..backend.types import Record
 from ..image.folder import list_images
-from ..image.io import ImageError, check_image
+from ..image.io import Codes, ImageError, check_member
 from ..image.metrics import psnr
+from ..image.notes import series
 from ..image.remote import is_url
 from ..image.resize import center_crop
 from ..paper.joint_training import State
@@ -99,7 +100,11 @@ def train_model(
     names = [path if isinstance(path, str) else path.name for path in images]
     steps = settings.training_steps
     record = {**asdict(settings), "iterations": steps, "folder": str(folder)}
-    with open_checkpoint(output, record, names) as checkpoint, defer_interrupts() as interrupted:
+    with (
+        open_checkpoint(output, record, names) as checkpoint,
+        defer_interrupts() as interrupted,
+        series(),
+    ):
         if names != checkpoint.files:
             warn(
                 f"{folder}: the images have changed since this training began; it continues with "
@@ -175,6 +180,7 @@ def _basis(files: list[Path | str], run: _Run) -> Eigenbasis:
         lambda done, total, row: run.report("components", done, len(files)),
         run.client,
         checkpoint.folder,
+        settings.encoding,
     )
     if settings.target_psnr is not None:
         if (curve := _curve(basis, run)) is None:
@@ -227,7 +233,7 @@ def _evaluate(model: EigenGS, basis: Eigenbasis, run: _Run) -> dict[str, float]:
             "psnr_init": render(model.encode(image, "projected")).numpy(),
             "psnr_solved": render(model.encode(image, "exact")).numpy(),
         }
-        rows.append({name: psnr(image, picture, "ycbcr") for name, picture in pictures.items()})
+        rows.append({name: psnr(image.pixels, p, "ycbcr") for name, p in pictures.items()})
     if errors:
         skipped = f"{len(errors)} of {len(run.held_out)} held-out images were skipped"
         warn(f"{skipped}, for example {errors[0]}")
@@ -236,16 +242,17 @@ def _evaluate(model: EigenGS, basis: Eigenbasis, run: _Run) -> dict[str, float]:
 
 def _readable(
     basis: Eigenbasis, run: _Run, errors: list[str] | None = None, stage: str = ""
-) -> Iterator[Singles]:
+) -> Iterator[Codes]:
     """Read the held-out images at the size of a basis; skip those that cannot be read."""
     for done, path in enumerate(run.held_out):
         if stage:
             run.progress(done, len(run.held_out), {"stage": stage})
         run.stop_if_interrupted()
         try:
-            image = center_crop(check_image(path, copy=False), basis.width, basis.height)
+            image = check_member(path, run.settings.encoding)
+            image = center_crop(image, basis.width, basis.height)
         except (ImageError, OSError) as error:
             if errors is not None:
                 errors.append(str(error))
         else:
-            yield image
+            yield Codes(image)

@@ -22,7 +22,7 @@ from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usua
 from ..gaussian.gaussians import Gaussians, one_image
 from ..image.io import check_data, check_image, read_image
 from ..image.metrics import MAX_PSNR
-from ..image.pixels import EncodedImage, ImageError
+from ..image.pixels import WHITE, EncodedImage, ImageError
 from ..image.space import DATA, YCBCR, Space, space_of
 from .loss import LossObjective
 from .measure import Measured, Row, psnrs
@@ -40,9 +40,6 @@ the path or the address of a file."""
 
 Spaces: TypeAlias = "str | Mapping[str, str] | None"
 """The space of a picture, or those of several maps by name; data have one channel."""
-
-WHITE = 1.001
-"""Largest sRGB code of light that counts as bounded by white; renderings exceed 1 by rounding."""
 
 MIN_MSE = (1 / 255) ** 2 / 12
 """Mean squared error of rounding to 8 bits: maps below it do not get more weight."""

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from ..backend.messages import warn
 from ..backend.types import PathLike, Record, Values
 from .formats import READ_SUFFIXES, UNREAD_SUFFIXES
-from .io import check_image
-from .pixels import ImageError, check_size
+from .io import check_member
+from .notes import NotedImages, kept_notes, tell_all
+from .pixels import ImageError, check_size, is_bitmap, is_drjit
 from .remote import is_url, list_urls
 from .resize import center_crop
 from .space import FAMILY_SPACES, space_of, to_planes
@@ -164,6 +165,7 @@ def read_blocks(
     space: str,
     length: int,
     progress: ReadProgress | None = None,
+    encoding: str | None = None,
 ) -> Generator[NDArray[np.float32], None, None]:
     """Read images in blocks, in the order of the source.
 
@@ -175,8 +177,8 @@ def read_blocks(
     ----------
     source : path, array or iterable
         A folder or its URL, an array of images (n, H, W, 3) or (n, H, W), or an iterable of files,
-        URLs, arrays of images, or RGB images (H, W, 3). Pixels as for
-        `eigengs_dr.image.io.check_image`. An iterator may overwrite an array when the next one is
+        URLs, arrays of images, RGB images (H, W, 3), or ``mitsuba.Bitmap``. Pixels as for
+        `eigengs_dr.image.io.check_member`. An iterator may overwrite an array when the next one is
         requested.
     size : (int, int)
         Width and height in pixels. Images of another size are centre-cropped and resized.
@@ -186,6 +188,8 @@ def read_blocks(
         Largest number of images in a block.
     progress : callable, optional
         ``progress(done, total, {})`` after every image; `total` is None for an iterator.
+    encoding : {"srgb", "linear"}, optional
+        The encoding of all pixels.
 
     Yields
     ------
@@ -210,14 +214,14 @@ def read_blocks(
     space = space_of(space, FAMILY_SPACES)
     if isinstance(source, str | os.PathLike):
         source = list_images(source)
-    elif isinstance(source, np.ndarray):
-        source = [source]
+    elif isinstance(source, np.ndarray) or is_drjit(source):
+        source = [source]  # type: ignore[list-item]
     total = None
     if isinstance(source, Sequence):
         total = sum(1 if _is_file(item) else len(_images(item)) for item in source)
     images = read_ahead(
         enumerate(_singles(source)),
-        partial(_prepare, size=size, space=space),
+        partial(_prepare, size=size, space=space, encoding=encoding),
         lambda numbered: _is_file(numbered[1]),
         lambda image: 0 if image.planes is None else image.planes.nbytes,
     )
@@ -294,24 +298,34 @@ def read_ahead(
         Results in the order of the items. At most `MAX_WAITING`, and about `MAX_WAITING_BYTES`,
         wait.
     """
-    waiting: deque[Future[Read]] = deque()
+    waiting: deque[Future[tuple[Read, NotedImages]]] = deque()
     largest = 0
     pool = ThreadPoolExecutor(THREADS, thread_name_prefix="decode")
+
+    def read_noted(item: Item) -> tuple[Read, NotedImages]:
+        with kept_notes() as noted:
+            return read(item), noted
+
+    def first() -> Read:
+        result, noted = waiting.popleft().result()
+        tell_all(noted)  # in the thread and the order of the caller
+        return result
+
     try:
         for item in items:
             if is_file(item):
-                waiting.append(pool.submit(read, item))
+                waiting.append(pool.submit(read_noted, item))
             else:
                 waiting.append(Future())
-                waiting[-1].set_result(read(item))
+                waiting[-1].set_result(read_noted(item))
             limit = MAX_WAITING_BYTES // largest if largest else THREADS
             while len(waiting) > min(max(1, limit), MAX_WAITING):
-                result = waiting.popleft().result()
+                result = first()
                 largest = max(largest, bytes_of(result))
                 yield result
                 del result  # frees the memory before waiting for the next one
         while waiting:
-            yield waiting.popleft().result()
+            yield first()
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -325,12 +339,14 @@ def _singles(source: Iterable[FileOrImage]) -> Iterator[FileOrImage]:
             yield from _images(item)
 
 
-def _prepare(numbered: tuple[int, Any], size: tuple[int, int], space: str) -> PreparedImage:
+def _prepare(
+    numbered: tuple[int, Any], size: tuple[int, int], space: str, encoding: str | None
+) -> PreparedImage:
     """Read, crop and convert one image."""
     place, item = numbered
     loaded = _is_file(item)
     try:
-        image = check_image(item, copy=not loaded)
+        image = check_member(item, encoding, f"image {place} of the source")
     except (ImageError, OSError) as error:
         if not loaded:
             raise ImageError(f"image {place} of the source{str(error)[len('image') :]}") from None
@@ -348,9 +364,11 @@ def _is_file(item: object) -> bool:
     return isinstance(item, str | os.PathLike)
 
 
-def _images(item: object) -> Sequence[Values]:
-    """Return the images of an array as a sequence."""
-    if not isinstance(item, np.ndarray) or item.ndim not in (3, 4):
+def _images(item: Any) -> Sequence[Values]:
+    """Return the images of an array as a sequence; a `mitsuba.Bitmap` is one."""
+    if is_bitmap(item):
+        return [item]
+    if not (isinstance(item, np.ndarray) or is_drjit(item)) or item.ndim not in (3, 4):
         kind = f"shape {item.shape}" if isinstance(item, np.ndarray) else type(item).__name__
         raise ImageError(f"images: got {kind}, expected (n, H, W, 3) or (n, H, W); pass arrays")
     # A last axis of length 1 or 3 holds channels: no grey image is so narrow.

@@ -5,23 +5,26 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.doors import takes_numbers
-from ..backend.messages import warn
 from ..backend.types import ArrayLike
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats import BITS, SUFFIXES, write_file
+from .notes import ABOVE_WHITE, tell
 from .pixels import (
     MAX_PIXEL,
+    WHITE,
     EncodedImage,
     ImageError,
     check_encoding,
     encoding_of,
+    is_bitmap,
+    is_drjit,
     peak_of,
     reason_of,
     to_floats,
@@ -140,7 +143,7 @@ def pixels_of(image: object) -> Any:
         raise ImageError(f"image: {error}") from None
     pixels, transparent = over_background(pixels, alpha)
     if transparent:
-        warn(f"image: {transparency_note(alpha)}")
+        tell("image", transparency_note(alpha))
     return pixels
 
 
@@ -195,8 +198,73 @@ def check_image(
     """
     encoded = read_image(image, keep_grey, encoding)
     light = encoded.encoding == "linear"
-    pixels = read_floats(encoded, keep_grey, copy and not light).pixels
-    return by_strips(to_coded, pixels) if light else pixels
+    return codes_of(read_floats(encoded, keep_grey, copy and not light))
+
+
+def codes_of(image: EncodedImage) -> NDArray[np.float32]:
+    """Return checked pixels as sRGB codes, above 1 for light above 1."""
+    return by_strips(to_coded, image.pixels) if image.encoding == "linear" else image.pixels
+
+
+def read_photo(photo: object, encoding: str | None = None, arrays: str = "linear") -> EncodedImage:
+    """Read a photo that may be a rendering, as float32; its encoding is not changed.
+
+    Floats in a tensor of Dr.Jit are linear light, as those of `mitsuba.render`; floats in a list
+    or another array are what `arrays` says; whole numbers are sRGB codes; other photos are what
+    they say. For parameters and errors see `check_image`.
+    """
+    check_encoding(encoding)
+    declared = (str, os.PathLike, EncodedImage)
+    if not (isinstance(photo, declared) or is_picture(photo) or is_bitmap(photo)):
+        is_rendering = is_drjit(photo)
+        photo = _array_of(photo)
+        if encoding is None and isinstance(photo, np.ndarray) and photo.dtype.kind == "f":
+            encoding = "linear" if is_rendering else arrays
+            if encoding == "linear":
+                _refuse_bytes(photo)
+    return read_floats(photo, copy=False, encoding=encoding)
+
+
+class Codes(NamedTuple):
+    """sRGB codes of an image of a family that was checked, (H, W, 3); above 1 is light above 1."""
+
+    pixels: NDArray[np.float32]
+
+
+def check_member(
+    image: object, encoding: str | None = None, name: str = "image"
+) -> NDArray[np.float32]:
+    """Return an image of a family in sRGB, which may be the array itself.
+
+    A rendering is read as `read_photo` does; floats in other arrays are sRGB. Light above white
+    keeps its codes, with a warning: the spaces of families end at white.
+    """
+    if isinstance(image, Codes):
+        return image.pixels
+    encoded = read_photo(image, encoding, arrays="srgb")
+    pixels = codes_of(encoded)
+    if encoded.encoding == "linear" and pixels.max() > WHITE:
+        tell(str(image) if isinstance(image, (str, os.PathLike)) else name, ABOVE_WHITE)
+    return pixels
+
+
+def _array_of(photo: object) -> Any:
+    """Return numbers as an array of NumPy; rows of unequal length unchanged, for their error."""
+    try:
+        return np.asanyarray(photo)
+    except ValueError:
+        return photo
+
+
+def _refuse_bytes(photo: NDArray[np.floating]) -> None:
+    """Refuse floats that are whole numbers up to 255, which would be light far above white."""
+    if not photo.size or not 2 < photo.max() <= 255 or photo.min() == photo.max():
+        return
+    if (photo == np.rint(photo)).all():
+        raise ImageError(
+            f"image: floats are whole numbers up to {photo.max():g}; divide by 255 and pass "
+            "encoding='srgb', or pass encoding='linear' for light"
+        )
 
 
 def check_data(image: object, copy: bool = True) -> NDArray[np.float32]:

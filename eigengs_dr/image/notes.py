@@ -1,12 +1,15 @@
 """Warnings about properties of image files that are not applied: colours that are not sRGB, depths.
 
-A colour profile counts as sRGB if it converts a grid of colours as sRGB does.
+A colour profile counts as sRGB if it converts a grid of colours as sRGB does. A series of images
+has one warning for each note.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -14,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..backend.messages import warn
 from .color import to_coded
 
 if TYPE_CHECKING:
@@ -23,6 +27,55 @@ if TYPE_CHECKING:
 Notes = tuple[str, ...]
 """Warnings; empty if there is nothing to say."""
 
+NotedImages = dict[str, dict[str, None]]
+"""The names of the images that have a note, in order, by the note."""
+
+_noted: ContextVar[NotedImages | None] = ContextVar("noted", default=None)
+"""The notes of the open series, if there is one."""
+
+
+def tell(name: str, note: str) -> None:
+    """Warn about an image: at once, or at the end of the series to which it belongs."""
+    noted = _noted.get()
+    if noted is None:
+        warn(f"{name}: {note}")
+    else:
+        noted.setdefault(note, {})[name] = None
+
+
+@contextmanager
+def kept_notes() -> Iterator[NotedImages]:
+    """Keep the notes of a block, instead of warning."""
+    noted: NotedImages = {}
+    token = _noted.set(noted)
+    try:
+        yield noted
+    finally:
+        _noted.reset(token)
+
+
+def tell_all(noted: NotedImages) -> None:
+    """Tell notes that were kept, such as those of a thread or a worker."""
+    for note, names in noted.items():
+        for name in names:
+            tell(name, note)
+
+
+@contextmanager
+def series() -> Iterator[None]:
+    """Warn once for each note of the images of a block: name the first, count the others."""
+    noted: NotedImages = {}
+    try:
+        with kept_notes() as noted:
+            yield
+    finally:
+        if _noted.get() is not None:  # a longer series goes on
+            tell_all(noted)
+        else:
+            for note, (first, *others) in noted.items():
+                warn(f"{first}: {note}" + (f"; so for {len(others)} more" if others else ""))
+
+
 PROFILE_LEVELS = (0, 64, 128, 192, 255)
 """Levels of red, green and blue at which a colour profile is compared with sRGB."""
 
@@ -30,8 +83,12 @@ PROFILE_TOLERANCE = 4
 """Largest difference, in levels of 255, between colour profiles that count as equal."""
 
 
+EXIF_SPACES = {2: "Adobe RGB", 65535: "Adobe RGB or another space"}
+"""Values of the tag ColorSpace that are not sRGB; the DCF option R03, Adobe RGB, has the second."""
+
+
 @lru_cache(64)  # images of one camera share a profile
-def profile_note(profile: bytes, encoding: str) -> Notes:
+def profile_note(profile: bytes, encoding: str, exif_space: object = None) -> Notes:
     """Return a warning if an ICC profile differs from sRGB, or from linear light.
 
     Parameters
@@ -40,9 +97,12 @@ def profile_note(profile: bytes, encoding: str) -> Notes:
         Empty if there is no profile.
     encoding : {"srgb", "linear"}
         The assumed encoding of the pixels.
+    exif_space : int, optional
+        The tag ColorSpace of EXIF, which counts if there is no profile.
     """
     if not profile:
-        return ()
+        name = EXIF_SPACES.get(exif_space) if encoding == "srgb" else None  # type: ignore[call-overload]
+        return (f"its colours are {name} by EXIF, not sRGB, which is ignored",) if name else ()
     from PIL import Image, ImageCms
 
     try:
@@ -75,6 +135,10 @@ def primaries_note(primaries: Sequence[float], tolerance: float) -> Notes:
         return ()
     return ("its primaries are not those of sRGB, which is ignored",)
 
+
+GAIN_MAP: Notes = ("its gain map, for light above white, is left out",)
+
+ABOVE_WHITE = "its light above white is kept, but displays and textures clamp it"
 
 TRANSFERS = {8: "linear light", 14: "Rec. 2020", 15: "Rec. 2020", 16: "PQ", 18: "HLG"}
 """Transfer functions of ITU-T H.273 that differ much from sRGB."""

@@ -26,6 +26,9 @@ MIN_PIXEL, MAX_PIXEL = -0.5, 1.5
 """Accepted range of sRGB pixels: resampled images overshoot [0, 1], but pixels in 0..255 are an
 error."""
 
+WHITE = 1.001
+"""Largest sRGB code of light that counts as bounded by white; renderings exceed 1 by rounding."""
+
 MAX_LIGHT = 1e9
 """Largest absolute value of light and of data, with 1 as white; squared errors stay well within the
 range of single precision."""
@@ -92,15 +95,24 @@ def encoding_of(image: object, encoding: str | None = None) -> str | None:
     check_encoding(encoding)
     if encoding is not None:
         return encoding
-    if hasattr(image, "srgb_gamma") and hasattr(image, "component_format"):  # a mitsuba.Bitmap
-        return "srgb" if image.srgb_gamma() else "linear"
-    is_tensor = type(image).__module__.startswith("drjit.")
-    if is_tensor and tuple(getattr(image, "shape", ()))[2:] == (3,):
+    if is_bitmap(image):
+        return "srgb" if image.srgb_gamma() else "linear"  # type: ignore[attr-defined]
+    if is_drjit(image) and tuple(getattr(image, "shape", ()))[2:] == (3,):
         warn(
             "the encoding of a Dr.Jit tensor is not known; pass encoding='linear' for light, e.g. "
             "from mitsuba.render, or encoding='srgb'; eigengs_dr.picture_of needs none"
         )
     return None
+
+
+def is_drjit(value: object) -> bool:
+    """Return whether a value is an array or a tensor of Dr.Jit, without importing it."""
+    return type(value).__module__.startswith("drjit.")
+
+
+def is_bitmap(image: object) -> bool:
+    """Return whether an image is a ``mitsuba.Bitmap``, without importing Mitsuba."""
+    return hasattr(image, "srgb_gamma") and hasattr(image, "component_format")
 
 
 def peak_of(dtype: np.dtype) -> int:

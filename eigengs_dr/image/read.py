@@ -14,15 +14,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.messages import warn
 from ..storage.memory import check_content
 from .formats import HAS_HEIF, HEIF_SUFFIXES, STARTS
-from .notes import depth_notes, png_notes, primaries_note, profile_note
+from .notes import GAIN_MAP, depth_notes, png_notes, primaries_note, profile_note, tell
 from .pixels import EncodedImage, ImageError, peak_of, reason_of, scale_to_white
 from .strips import Pixels, by_strips
 
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
 TRANSPOSED = range(5, 9)
 """EXIF orientations that swap width and height."""
 
-ORIENTATION = 0x0112
-"""Tag of the orientation in EXIF."""
+ORIENTATION, EXIF, COLOR_SPACE = 0x0112, 0x8769, 0xA001
+"""Tags of EXIF: the orientation, the main folder, the colour space in it."""
 
 
 class Header(NamedTuple):
@@ -102,7 +101,10 @@ def read_header(path: Path) -> Header:
         if not _format_of(path):
             return _picture_header(path)
         with _opened(path) as file:
-            return _header(path, file)
+            if not _has_gain_map(file):
+                return _header(path, file)
+        header = _picture_header(path)
+        return header._replace(notes=header.notes + GAIN_MAP)
 
 
 def decode(path: Path, header: Header, keep_grey: bool, name: str = "") -> EncodedImage:
@@ -120,10 +122,10 @@ def decode(path: Path, header: Header, keep_grey: bool, name: str = "") -> Encod
             )
         pixels, alpha = _pixels(path, header) if kind else _picture(path)
     for note in header.notes:
-        warn(f"{name or path}: {note}")
+        tell(name or str(path), note)
     pixels, transparent = over_background(pixels, alpha)
     if transparent:
-        warn(f"{name or path}: {transparency_note(alpha)}")
+        tell(name or str(path), transparency_note(alpha))
     return EncodedImage(pixels, header.encoding)
 
 
@@ -276,7 +278,8 @@ def _header(path: Path, file: oiio.ImageInput) -> Header:
     encoding = "linear" if str(spec.format) in FLOATS else "srgb"
     size, orientation = (spec.width, spec.height), spec.getattribute("Orientation")
     profile = spec.getattribute("ICCProfile")
-    notes = profile_note(b"" if profile is None else bytes(profile), encoding)
+    space = spec.getattribute("Exif:ColorSpace")
+    notes = profile_note(b"" if profile is None else bytes(profile), encoding, space)
     if kind == "openexr":
         size = spec.full_width, spec.full_height
         notes += _exr_notes(spec)
@@ -308,6 +311,11 @@ def _header(path: Path, file: oiio.ImageInput) -> Header:
 
 FLOATS = ("half", "float", "double")
 """OpenImageIO's names of floats, which are light."""
+
+
+def _has_gain_map(file: oiio.ImageInput) -> bool:
+    """Return whether OpenImageIO makes light of codes, as it does for JPEG with a gain map."""
+    return file.format_name() in ("jpeg", "png") and str(file.spec().format) in FLOATS
 
 
 def _colors_of(spec: oiio.ImageSpec) -> int:
@@ -428,6 +436,8 @@ def _pixels(path: Path, header: Header) -> tuple[Pixels, str]:
             spec = file.spec()
             if _is_palette(spec):
                 raise _Unread("its palette has other levels")
+            if _has_gain_map(file):
+                raise _Unread("its codes cannot be read")
             samples = file.read_image(file.current_subimage(), 0, 0, spec.nchannels, spec.format)
             reason = file.geterror().strip()
             if samples is None or reason:  # a JPEG file that is cut has both
@@ -613,11 +623,14 @@ def _picture_header(path: Path) -> Header:
         transparent = image.has_transparency_data
         channels = 1 if image.mode in GREY_MODES else 3
         # The EXIF data of a PNG file may lie behind its pixels.
-        exif = {} if image.format == "PNG" else image.getexif()
+        exif: Any = {} if image.format == "PNG" else image.getexif()
         is_turned = exif.get(ORIENTATION, 1) in TRANSPOSED
         width, height = image.size[::-1] if is_turned else image.size
-        notes = profile_note(image.info.get("icc_profile") or b"", "srgb")
-        notes += depth_notes(path, image) + _frames_note(getattr(image, "n_frames", 1))
+        space = exif.get_ifd(EXIF).get(COLOR_SPACE) if exif else None
+        notes = profile_note(image.info.get("icc_profile") or b"", "srgb", space)
+        # The other pictures of an MPO file are a gain map or previews.
+        frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
+        notes += depth_notes(path, image) + _frames_note(frames)
     needed = TRANSPARENT_BYTES[channels] if transparent else OPAQUE_BYTES[channels]
     return Header(width, height, channels, needed, notes=notes)
 

@@ -511,7 +511,7 @@ def space_of(name: object, spaces: Sequence[Space] = SPACES) -> Space:
 
 def to_planes(image: Image, space: str) -> Image:
     """Convert an sRGB image (H, W, 3) to a space of a family, (3, H * W): each channel by rows."""
-    planes = np.ascontiguousarray(image.reshape(-1, 3).T)
+    planes = np.array(image.reshape(-1, 3).T, order="C")  # never the image itself
     if space_of(space, FAMILY_SPACES).identical:
         return planes
     # Not a matrix product, because BLAS threads would compete with the decoding threads.

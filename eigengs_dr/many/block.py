@@ -39,13 +39,12 @@ from ..fitting.placement.adaptive import (
     shift_of,
 )
 from ..fitting.placement.redistribution import Owners, density_ratio, error_by_pixel
-from ..fitting.problem import WHITE
 from ..fitting.solve import solve
 from ..fitting.state import State, begin
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
 from ..image.color import to_linear
-from ..image.pixels import ImageError
+from ..image.pixels import WHITE, ImageError
 from ..image.space import DATA, YCBCR, Affine, Extent, Space
 from ..raster.render import batch_to_tiles
 from .grid import Block

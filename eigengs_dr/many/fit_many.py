@@ -13,6 +13,7 @@ from ..fitting.control import Diverged
 from ..fitting.fit import Fit, fit_images
 from ..fitting.options import FitOptions, refuse_unknown
 from ..fitting.start import load_start, set_in
+from ..image.io import check_data, read_floats
 from ..image.pixels import EncodedImage
 from ..image.space import YCBCR
 from .manifest import ImageRow, Images, fingerprint
@@ -135,13 +136,19 @@ def fit_many(
     job = Job(
         partial(_fit_group, options=settings),
         partial(_may_join, options=settings),
-        not (settings.space or YCBCR).is_color,
-        settings.encoding,
+        partial(_read, options=settings),
         settings.iterations,
         _settings_of(settings),
         list(options),
     )
     return run_images(images, output, overwrite, job, progress, client, recursive)
+
+
+def _read(image: Any, name: str, options: FitOptions) -> EncodedImage:
+    """Read an image, or data. An array is copied, because its owner may overwrite it."""
+    if not (options.space or YCBCR).is_color:
+        return EncodedImage(check_data(image), "srgb")
+    return read_floats(image, encoding=options.encoding)
 
 
 def _settings_of(settings: FitOptions) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -37,7 +37,8 @@ from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write_set
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import read_ahead
-from ..image.io import check_data, read_floats
+from ..image.io import read_floats
+from ..image.notes import NotedImages, kept_notes, series, tell_all
 from ..image.pixels import EncodedImage
 from ..storage.atomic import refuse_url, require_writable
 from .manifest import ImageRow, Images, Manifest, RowProgress, RunImage, list_sources, open_manifest
@@ -102,10 +103,8 @@ class Job(NamedTuple):
     may_join : callable
         ``may_join(group, image)`` returns whether an image may join a group that is not empty; by
         default none may.
-    keep_grey : bool
-        Whether the images are data, so that grey ones keep one channel.
-    encoding : {"srgb", "linear"} or None
-        See `eigengs_dr.image.io.check_image`.
+    read : callable
+        ``read(image, name)`` reads an image, whose warnings name it so if it is no file.
     steps : int
         Number of descent steps per image, as a measure of the work.
     options : dict or None
@@ -116,8 +115,7 @@ class Job(NamedTuple):
 
     work: Callable[[list[EncodedImage]], list[Fit] | list[Gaussians]]
     may_join: Callable[[list[EncodedImage], EncodedImage], bool] | None = None
-    keep_grey: bool = False
-    encoding: str | None = None
+    read: Callable[[Any, str], EncodedImage] = lambda image, name: read_floats(image)
     steps: int = 0
     options: Record | None = None
     given: Collection[str] = ()
@@ -165,6 +163,7 @@ def run_images(
         if output is not None:
             opened = open_manifest(make_folder(output), job.options, job.given, overwrite)
             manifest = stack.enter_context(opened)
+        stack.enter_context(series())
         try:
             run_pieces(sources, find, work, end)
         except KeyboardInterrupt:
@@ -251,9 +250,7 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
 def _decode(source: RunImage, job: Job) -> Decoded:
     """Read one image. An array is copied, because its owner may overwrite it."""
     try:
-        if job.keep_grey:
-            return source, EncodedImage(check_data(source.image), "srgb")
-        return source, read_floats(source.image, encoding=job.encoding)
+        return source, job.read(source.image, source.name)
     except FAILURES as error:
         return source, error
 
@@ -398,7 +395,8 @@ def run_on_workers(
     for last, tasks in enumerate(chunks):
         with closing(executor.map(run_chunk, tasks, (job, keep, Path.cwd()))) as ended:
             for chunk, result, lost in ended:
-                rows, notes = result or ([_lost(source, lost) for source in chunk], [])
+                rows, noted, notes = result or ([_lost(s, lost) for s in chunk], {}, [])
+                tell_all(noted)
                 for text in notes:
                     warn(text)
                 for source, (row, is_transient) in zip(chunk, rows, strict=True):
@@ -419,13 +417,13 @@ def _lost(source: RunImage, lost: str) -> ChunkRow:
 
 def run_chunk(
     chunk: list[RunImage], shared: tuple[Job, bool, Path]
-) -> tuple[list[ChunkRow], list[str]]:
-    """Process the images of a chunk on a worker; return their rows and the warnings.
+) -> tuple[list[ChunkRow], NotedImages, list[str]]:
+    """Process the images of a chunk on a worker; return their rows, notes and other warnings.
 
     Names in the rows are as the user gave them, relative to the folder of the client.
     """
     job, keep, folder = shared
-    with warnings.catch_warnings(record=True) as caught:
+    with kept_notes() as noted, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         ended = list(run_here((_absolute(source, folder) for source in chunk), job))
     rows = []
@@ -434,7 +432,8 @@ def run_chunk(
         result = row.result if keep and not row.error else None
         row = replace(row, input=source.path, output=source.output, result=result)
         rows.append((row, is_transient))
-    return rows, [str(n.message) for n in caught if issubclass(n.category, UserWarning)]
+    texts = [str(n.message) for n in caught if issubclass(n.category, UserWarning)]
+    return rows, noted, texts
 
 
 def _absolute(source: RunImage, folder: Path) -> RunImage:

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..backend.messages import warn
 from ..backend.types import Record, Values
 from ..gaussian.file import MAX_SET_SIDE
 from ..image.formats import raise_reason
 from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
+from ..image.notes import tell
 from ..image.pixels import encoding_of
 from ..image.read import decode, has_windows, read_header, read_window, transparency_note
 from ..image.remote import is_copied
@@ -180,7 +180,7 @@ def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixe
     if has_windows(path, header):
         shown = (transparency_note(header.alpha),) if header.alpha != "none" else ()
         for note in header.notes + shown:
-            warn(f"{path}: {note}")
+            tell(str(path), note)
         return shape, absolute, header.encoding
     header.check_memory(path, as_floats=False)
     pixels, encoding = decode(path, header, keep_grey)  # 8-bit files are not converted to floats

@@ -5,8 +5,9 @@ components give few planes: photo and colour j is about ``mean_j + sum_k V_jk (X
 V are orthonormal, so a squared error of a plane is a squared error of the photos, and the planes
 are fitted as the channels of one image.
 
-Photos count in sRGB codes. Of six sets of real photos, planes of codes show left-out lights 0.5 to
-5.6 dB closer in codes than planes of linear light (12 planes, every 8th of the lights left out).
+Photos count in sRGB codes, whose curve goes on above white. Of six sets of real photos, planes of
+codes show left-out lights 0.5 to 5.6 dB closer in codes than planes of linear light (12 planes,
+every 8th of the lights left out).
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ from ..fitting.objective import Channels, Target
 from ..fitting.options import FitOptions
 from ..fitting.problem import Problem
 from ..image.color import MAX_CHANNELS
-from ..image.io import check_image
+from ..image.io import codes_of, read_photo
 from ..image.metrics import psnr_from_mse
-from ..image.pixels import ImageError
+from ..image.notes import series
+from ..image.pixels import ImageError, check_encoding
 from ..image.space import DATA
 from .lights import LightTable, check_lights, functions_at, read_lights, solve_table
 
@@ -62,7 +64,7 @@ class Photos(NamedTuple):
     Attributes
     ----------
     rows : ndarray of float32, shape (3 n, H W)
-        A row for each photo and colour, in sRGB codes.
+        A row for each photo and colour, in sRGB codes; light above white has codes above 1.
     size : (int, int)
         Width and height in pixels.
     lights : ndarray of float64, shape (n, 3)
@@ -73,8 +75,13 @@ class Photos(NamedTuple):
     lights: Doubles
 
 
-def read_photos(photos: Any, lights: ArrayLike | str | os.PathLike[str] | None = None) -> Photos:
+def read_photos(
+    photos: Any,
+    lights: ArrayLike | str | os.PathLike[str] | None = None,
+    encoding: str | None = None,
+) -> Photos:
     """Read photos and their lights; for parameters and errors see `Relightable.fit`."""
+    check_encoding(encoding)
     is_folder = isinstance(photos, (str, os.PathLike))
     if lights is None:
         if not is_folder:
@@ -98,14 +105,15 @@ def read_photos(photos: Any, lights: ArrayLike | str | os.PathLike[str] | None =
         raise ValueError(f"there are {len(photos)} photos, but {len(directions)} lights")
     if len(photos) < MIN_LIGHTS:
         raise ValueError(f"there are {len(photos)} photos; a model needs at least {MIN_LIGHTS}")
-    return _stacked(photos, directions)
+    with series():
+        return _stacked(photos, directions, encoding)
 
 
-def _stacked(photos: Sequence[object], lights: Doubles) -> Photos:
+def _stacked(photos: Sequence[object], lights: Doubles, encoding: str | None) -> Photos:
     """Read photos into one array."""
     rows, shape = np.empty((0, 0), np.float32), (0, 0, 0)
     for k, photo in enumerate(photos):
-        pixels = check_image(photo, copy=False)
+        pixels = codes_of(read_photo(photo, encoding))
         if k == 0:
             shape = pixels.shape
             rows = np.empty((3 * len(photos), shape[0] * shape[1]), np.float32)
@@ -128,7 +136,8 @@ class Planes(NamedTuple):
         Scaled so that the sum of their mean squared errors is that of the photos.
     table : LightTable
     psnr_held_out : float
-        Mean PSNR in dB of photos that were left out, from planes of the others.
+        Mean PSNR in dB of photos that were left out, from planes of the others; its peak is white,
+        also where light is above it.
     """
 
     images: Singles

@@ -61,7 +61,7 @@ class Relightable:
         The factors of the planes for every light.
     psnr_held_out : float
         Mean PSNR in dB, in sRGB, of photos that were left out: from planes of the others, before
-        they become Gaussians.
+        they become Gaussians. The peak is white, also for photos of brighter light.
 
     Notes
     -----
@@ -86,6 +86,7 @@ class Relightable:
         planes: int | None = None,
         iterations: int = 300,
         seed: int = 0,
+        encoding: str | None = None,
         backend: str | None = None,
         progress: Any = None,
     ) -> Relightable:
@@ -95,7 +96,9 @@ class Relightable:
         ----------
         photos : path-like, or sequence of images or paths, or array_like of shape (n, H, W, 3)
             At least 4 photos of one size from one camera. A folder holds the photos that the list
-            of lights names.
+            of lights names. Numbers of a list, an array or a tensor of Dr.Jit are linear light if
+            they are floats, as those of `mitsuba.render`, and sRGB codes if they are whole; other
+            photos are what they say. Light may be brighter than white.
         lights : array_like of shape (n, 3), or path-like, optional
             The direction of the light of each photo, of any length; or a list ``.lp`` of names and
             directions. By default the only such file in the folder.
@@ -105,6 +108,9 @@ class Relightable:
             Number of planes. By default as many as left-out lights need.
         iterations : int, optional
             Number of steps of the fit of the planes.
+        encoding : {"srgb", "linear"}, optional
+            What the numbers of all photos are, instead: "srgb" for arrays of
+            `eigengs_dr.load_image`, "linear" for developed files of integers.
         seed, backend, progress : optional
             See `eigengs_dr.fit`.
 
@@ -119,7 +125,7 @@ class Relightable:
             At Ctrl-C or SIGTERM during the fit of the planes; its ``result`` is the model of the
             best set so far.
         """
-        read = read_photos(photos, lights)
+        read = read_photos(photos, lights, encoding)
         most = most_planes(len(read.lights))
         if planes is not None and not 1 <= planes <= most:
             raise ValueError(f"planes is {planes}; {len(read.lights)} photos have 1 to {most}")
@@ -157,7 +163,9 @@ class Relightable:
         -------
         Gaussians
             On the means and shapes of the planes; in the space "rgb", and for an environment in
-            "linear", or "radiance" if it is brighter than white.
+            "linear", or "radiance" if it is brighter than white. In "rgb", light above white has
+            codes above 1: renderings and files of floats keep it, a display and a
+            ``gaussian_texture`` clamp it.
 
         Raises
         ------
@@ -197,7 +205,7 @@ class Relightable:
         for factors, light in zip(self.table.at(lights).astype(np.float32), radiance, strict=True):
             if light.any():
                 codes = shown @ factors[:, :-1].T + factors[:, -1]
-                total += to_linear(np.clip(codes, 0, 1)) * light.astype(np.float32)
+                total += to_linear(np.maximum(codes, 0)) * light.astype(np.float32)
         space = LINEAR.above_white if total.max() > 1 else LINEAR
         start = with_colors(self.planes, np.zeros((len(self.planes) + 1, 3)), space)
         return solve(start, Pixels.plain(total, start, space.weight(total)))

@@ -23,7 +23,7 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
-from ..image.io import displayed
+from ..image.io import Codes, displayed
 from ..image.pixels import check_encoding
 from ..image.resize import resample
 from ..raster.render import picture_of
@@ -137,6 +137,8 @@ def view(
             "Relightable"
         )
     check_encoding(encoding)
+    if encoding and image is None:
+        raise ValueError("encoding is for the pixels of an image; leave it out, or give one")
     model = source if isinstance(source, EigenGS) else None
     lights = describe_lights(source) if isinstance(source, Relightable) else None
     if isinstance(source, Relightable):
@@ -299,10 +301,10 @@ def describe_model(
         channels.append(channel | {"weights": to_text(kept / scales[:, None], "<f2")})
     photo = None
     if image is not None:
-        color, background = decoded(model.encode(image))
+        color, background = decoded(model.encode(Codes(image)))
         scores = [  # coefficients in standard deviations
             (values[: len(d)] / np.maximum(d, np.finfo(float).tiny ** 0.5)).tolist()
-            for values, d in zip(model.project(image), deviations, strict=True)
+            for values, d in zip(model.project(Codes(image)), deviations, strict=True)
         ]
         photo = {"color": to_text(color), "background": background.tolist(), "scores": scores}
     return {"matrix": space.to_rgb.tolist(), "channels": channels, "photo": photo}

@@ -15,7 +15,8 @@ LIGHTS = directions(30)
 
 @pytest.fixture(scope="module")
 def model():
-    return eg.Relightable.fit(photos(LIGHTS), LIGHTS, gaussians=80, iterations=60, progress=False)
+    options = {"gaussians": 80, "iterations": 60, "encoding": "srgb", "progress": False}
+    return eg.Relightable.fit(photos(LIGHTS), LIGHTS, **options)
 
 
 def picture(model, light):
@@ -139,7 +140,8 @@ def test_what_cannot_be_a_model_is_refused(tmp_path):
 
 def test_photos_that_do_not_depend_on_the_light():
     same = np.repeat(photos(LIGHTS)[:1], 8, axis=0)
-    model = eg.Relightable.fit(same, LIGHTS[:8], gaussians=80, iterations=20, progress=False)
+    options = {"gaussians": 80, "iterations": 20, "encoding": "srgb", "progress": False}
+    model = eg.Relightable.fit(same, LIGHTS[:8], **options)
     assert model.planes.channels <= 3 and 90 < model.psnr_held_out <= 100
     assert eg.psnr(same[0], picture(model, LIGHTS[20])) > 25
 

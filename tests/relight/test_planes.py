@@ -17,9 +17,8 @@ LIGHTS = directions(30)
 
 @pytest.fixture(scope="module")
 def model():
-    return eg.Relightable.fit(
-        photos(LIGHTS), LIGHTS, gaussians=80, planes=4, iterations=20, progress=False
-    )
+    options = {"gaussians": 80, "planes": 4, "iterations": 20, "progress": False}
+    return eg.Relightable.fit(photos(LIGHTS), LIGHTS, encoding="srgb", **options)
 
 
 @pytest.fixture

@@ -176,7 +176,8 @@ def relight() -> list[Row]:
     z, turn = np.linspace(0.98, 0.3, 40), np.arange(40) * 2.4
     ring = np.sqrt(1 - z**2)
     lights = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)
-    model = eg.Relightable.fit(np.stack([photo(light) for light in lights]), lights)
+    photos = np.stack([photo(light) for light in lights])
+    model = eg.Relightable.fit(photos, lights, encoding="srgb")
     unseen = {"left": (-0.8, 0, 0.6), "above": (0, 0.6, 0.8), "right": (0.8, 0, 0.6)}
     return [
         {f"light {name}": photo(np.array(light)) for name, light in unseen.items()},
