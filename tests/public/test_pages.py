@@ -39,7 +39,10 @@ ELSEWHERE = {
 """What no test runs, and why."""
 
 SMALLER = [
-    (r"\b\d[\d_]{3,}\b", lambda number: str(min(200, int(number[0].replace("_", "")) // 50))),
+    (
+        r"\b\d[\d_]{3,}\b",
+        lambda number: str(min(200, max(40, int(number[0].replace("_", "")) // 50))),
+    ),
     (r"\b256\b", "32"),
     (r"\b(240|300)\b", "40"),
     (r"(local:|n_workers=|Pool\()4", r"\g<1>1"),
