@@ -1,11 +1,9 @@
 """What type checkers and editors see of the package: the programs of the manual pass mypy."""
 
-import builtins
 import os
 import re
 import shutil
 import subprocess
-import symtable
 import sys
 from pathlib import Path
 
@@ -16,46 +14,19 @@ FOLDER = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(FOLDER.glob("*.md")), *sorted(FOLDER.glob("*/*.md"))]
 BLOCK = re.compile(r"^ *```python\n(.*?)^ *```", re.M | re.S)
 
-IMPORTED = """
-import numpy as np
-from numpy.typing import NDArray
-import eigengs_dr as eg
-"""
-OF_A_PAGE = {
-    "mi": "import mitsuba as mi",
-    "texture_of": "from eigengs_dr.plugins import texture_of",
-    "result": "result: eg.Fit",
-    "model": "model: eg.EigenGS",
-    "gaussians": "gaussians: eg.Gaussians",
-    "frames": "frames: list[NDArray[np.float32]]",
-    "images": "images: list[NDArray[np.float32]]",
-    "files": "files: list[str]",
-    "fit_one": "def fit_one(file: str) -> None: ...",
-}
-"""What pages take from their reader; other names are images."""
-
 SETTINGS = """
 [mypy]
 strict = true
-untyped_calls_exclude = distributed, drjit
+untyped_calls_exclude = distributed, drjit, mitsuba
 [mypy-scipy.*,torch.*]
 ignore_missing_imports = true
 """
-"""These four packages come without types, or with few."""
+"""These packages come without types, or with few."""
 
 
 def program_of(page):
-    """The blocks of a page as one program that knows the names which the page takes from users."""
-    code = "\n".join(BLOCK.findall(page.read_text()))
-    whole = symtable.symtable(code, str(page), "exec")
-    tables = [whole]
-    for table in tables:
-        tables += table.get_children()
-    used = {s.get_name() for t in tables for s in t.get_symbols() if s.is_global() or t is whole}
-    made = {s.get_name() for s in whole.get_symbols() if s.is_assigned() or s.is_imported()}
-    taken = sorted(used - made - {"eg", "np", *dir(builtins)})
-    context = [OF_A_PAGE.get(name, f"{name}: NDArray[np.float32]") for name in taken]
-    return "\n".join([IMPORTED, *context, code])
+    """The blocks of a page as one program."""
+    return "\n".join(BLOCK.findall(page.read_text()))
 
 
 def errors_of_mypy(folder, installed, files):
