@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
+from ..storage.memory import open_regular
+
 TYPE_CHECKING = False  # imported first; `typing` takes long
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,6 +29,6 @@ empty."""
 
 
 def is_packed(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file is a packed set; raise `OSError` if it cannot be opened."""
-    with open(path, "rb") as file:
+    """Return whether a file is a packed set; for errors see `open_regular`."""
+    with open_regular(path) as file:
         return file.read(len(MAGIC)) == MAGIC

@@ -15,7 +15,6 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,11 +26,20 @@ from ..fitting.objective import Channels, Target
 from ..fitting.options import FitOptions
 from ..fitting.problem import Problem
 from ..image.color import MAX_CHANNELS
-from ..image.io import check_image
+from ..image.io import check_image, read_file
 from ..image.metrics import psnr_from_mse
 from ..image.pixels import ImageError
 from ..image.space import DATA
-from .lights import LightTable, check_lights, functions_at, read_lights, solve_table
+from ..storage.memory import check_usable
+from .lights import (
+    LightTable,
+    check_lights,
+    check_spread,
+    find_lists,
+    functions_at,
+    read_lights,
+    solve_table,
+)
 
 MAX_PLANES = 32
 """Largest number of planes that is tried. On six sets of real photos, the PSNR of left-out lights
@@ -76,20 +84,24 @@ class Photos(NamedTuple):
 def read_photos(photos: Any, lights: ArrayLike | str | os.PathLike[str] | None = None) -> Photos:
     """Read photos and their lights; for parameters and errors see `Relightable.fit`."""
     is_folder = isinstance(photos, (str, os.PathLike))
+    if not is_folder:
+        photos = _listed(photos)
     if lights is None:
         if not is_folder:
             raise ValueError("photos need lights: give their directions (n, 3), or an .lp file")
-        found = sorted(Path(photos).glob("*.[lL][pP]"))
-        if len(found) != 1:
+        lists = find_lists(photos)
+        if len(lists) != 1:
             raise ValueError(
-                f"{photos}: holds {len(found)} files of lights (.lp), expected one; give its name "
+                f"{photos}: holds {len(lists)} files of lights (.lp), expected one; give its name "
                 "as lights"
             )
-        lights = found[0]
+        lights = lists[0]
+    files = photos if is_folder else [p for p in photos if isinstance(p, (str, os.PathLike))]
     if isinstance(lights, (str, os.PathLike)):
-        names, directions = read_lights(lights)
-        if is_folder:
-            photos = [Path(photos) / name for name in names]
+        if not is_folder and files and len(files) < len(photos):
+            raise ValueError("photos are files and arrays; with an .lp file, give one kind of both")
+        named, directions = read_lights(lights, files or None)
+        photos = named if files else photos
     elif is_folder:
         raise ValueError(f"{photos}: a folder needs an .lp file, which names its photos")
     else:
@@ -98,19 +110,37 @@ def read_photos(photos: Any, lights: ArrayLike | str | os.PathLike[str] | None =
         raise ValueError(f"there are {len(photos)} photos, but {len(directions)} lights")
     if len(photos) < MIN_LIGHTS:
         raise ValueError(f"there are {len(photos)} photos; a model needs at least {MIN_LIGHTS}")
+    check_spread(directions)
     return _stacked(photos, directions)
+
+
+def _listed(photos: Any) -> list[Any]:
+    """Return photos as a list; each file may occur once."""
+    if isinstance(photos, (bytes, dict, set, frozenset)) or not hasattr(photos, "__iter__"):
+        kind = type(photos).__name__
+        raise TypeError(f"photos: is of type {kind}; give a folder, or a list of files or images")
+    photos = list(photos)
+    files = [os.fspath(photo) for photo in photos if isinstance(photo, (str, os.PathLike))]
+    if len(set(files)) < len(files):
+        twice = next(file for k, file in enumerate(files) if file in files[:k])
+        raise ValueError(f"photos: {twice} is given for several lights; give each a photo")
+    return photos
 
 
 def _stacked(photos: Sequence[object], lights: Doubles) -> Photos:
     """Read photos into one array."""
     rows, shape = np.empty((0, 0), np.float32), (0, 0, 0)
     for k, photo in enumerate(photos):
+        if isinstance(photo, (str, os.PathLike)):
+            photo = read_file(photo, upright=False)  # lights belong to pixels as they are stored
         pixels = check_image(photo, copy=False)
         if k == 0:
             shape = pixels.shape
+            what = f"{len(photos)} photos of {shape[1]}x{shape[0]} pixels"
+            check_usable(pixels.nbytes * (len(photos) + 1), what, "scale them down or give fewer")
             rows = np.empty((3 * len(photos), shape[0] * shape[1]), np.float32)
         if pixels.shape != shape:
-            name = photo if isinstance(photo, (str, os.PathLike)) else f"photo {k + 1}"
+            name = photos[k] if isinstance(photos[k], (str, os.PathLike)) else f"photo {k + 1}"
             raise ImageError(
                 f"{name}: is {pixels.shape[1]}x{pixels.shape[0]}, but the first photo is "
                 f"{shape[1]}x{shape[0]}; scale them to one size"
