@@ -15,10 +15,12 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..backend.messages import warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..eigenbasis.incremental import largest_eigenpairs, orient, product
 from ..fitting.fit import Fit, fit_problem
@@ -29,6 +31,8 @@ from ..image.color import MAX_CHANNELS
 from ..image.io import check_image, read_file
 from ..image.metrics import psnr_from_mse
 from ..image.pixels import ImageError
+from ..image.read import read_header
+from ..image.remote import is_copied
 from ..image.space import DATA
 from ..storage.memory import check_usable
 from .lights import (
@@ -128,11 +132,21 @@ def _listed(photos: Any) -> list[Any]:
 
 
 def _stacked(photos: Sequence[object], lights: Doubles) -> Photos:
-    """Read photos into one array."""
+    """Read photos into one array: lights belong to the pixels that files store.
+
+    A camera that looks straight down writes any orientation, and programs that find lights ignore
+    it, so that it may differ from photo to photo.
+    """
+    turned = [photo for photo in photos if _is_turned(photo)]
+    if turned:
+        warn(
+            f"{turned[0]}: an orientation is not applied, in {len(turned)} of {len(photos)} "
+            "photos: lights belong to the pixels as they are stored"
+        )
     rows, shape = np.empty((0, 0), np.float32), (0, 0, 0)
     for k, photo in enumerate(photos):
         if isinstance(photo, (str, os.PathLike)):
-            photo = read_file(photo, upright=False)  # lights belong to pixels as they are stored
+            photo = read_file(os.fspath(photo), upright=False)
         pixels = check_image(photo, copy=False)
         if k == 0:
             shape = pixels.shape
@@ -147,6 +161,14 @@ def _stacked(photos: Sequence[object], lights: Doubles) -> Photos:
             )
         rows[3 * k : 3 * k + 3] = pixels.reshape(-1, 3).T
     return Photos(rows, (shape[1], shape[0]), lights)
+
+
+def _is_turned(photo: object) -> bool:
+    """Return whether a photo is a file whose EXIF orientation turns it."""
+    if not isinstance(photo, (str, os.PathLike)) or is_copied(photo):
+        return False
+    header = read_header(Path(photo), upright=False)
+    return header.orientation != 1 and not header.upright
 
 
 class Planes(NamedTuple):

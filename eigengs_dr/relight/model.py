@@ -95,10 +95,12 @@ class Relightable:
         ----------
         photos : path-like, or sequence of images or paths, or array_like of shape (n, H, W, 3)
             At least 4 photos of one size from one camera. A folder holds the photos that the list
-            of lights names.
+            of lights names. Files are read as stored: an EXIF orientation is ignored, with a
+            warning, because lights belong to those pixels.
         lights : array_like of shape (n, 3), or path-like, optional
             The direction of the light of each photo, of any length; or a list ``.lp`` of names and
-            directions. By default the only such file in the folder.
+            directions. By default the only such file in the folder. A list is paired with files by
+            name, and with arrays in order.
         gaussians : int, optional
             Number of Gaussians, by default one for 16 pixels.
         planes : int, optional
@@ -111,8 +113,9 @@ class Relightable:
         Raises
         ------
         ValueError
-            If photos and lights do not match, a light is below the horizon, or an option is out of
-            range; an `ImageError` if a photo cannot be used.
+            If photos and lights do not match, a light is below the horizon, all lights are one, the
+            photos take more memory than there is, or an option is out of range; an `ImageError` if
+            a photo cannot be used.
         OSError
             If a file cannot be opened.
         Interrupted
