@@ -8,8 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-from ..storage.memory import open_regular
-
 TYPE_CHECKING = False  # imported first; `typing` takes long
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,5 +28,7 @@ empty."""
 
 def is_packed(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is a packed set; for errors see `open_regular`."""
+    from ..storage.memory import open_regular
+
     with open_regular(path) as file:
         return file.read(len(MAGIC)) == MAGIC
