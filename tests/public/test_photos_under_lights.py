@@ -41,10 +41,10 @@ def test_files_in_any_order_get_the_light_that_the_list_names(folder):
 
 
 def test_files_may_differ_from_the_list_in_case_and_suffix(folder):
-    names = (folder / "dirs.lp").read_text()
+    names, expected = (folder / "dirs.lp").read_text(), fit(folder)
     (folder / "dirs.lp").write_text(names.replace("img", "IMG").replace("png", "NEF"))
     files = sorted(folder.glob("*.png"))
-    assert np.allclose(fit(files, folder / "dirs.lp").lights, LIGHTS)
+    assert_alike(fit(files, folder / "dirs.lp"), expected)
 
 
 def test_files_that_the_list_does_not_name_are_refused(folder):
