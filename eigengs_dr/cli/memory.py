@@ -8,7 +8,7 @@ from ..fitting.control import Surplus
 from ..fitting.options import FitOptions
 from ..image.space import YCBCR
 from ..many.windows import image_size
-from ..storage.memory import usable_memory
+from ..storage.memory import check_usable
 
 BASE_BYTES = 165e6
 """Memory of Python, libLLVM and the compiled programs. This and the constants below follow the
@@ -93,15 +93,10 @@ def check_memory(path: Path | str, settings: FitOptions, has_blocks: bool) -> st
     gaussians = (
         settings.first_try(pixels, channels) if settings.goal else settings.count_for(pixels)
     )
-    needed, usable = estimate_memory(width, height, channels, gaussians), usable_memory()
-    line = (
-        f"{gaussians:,} Gaussians on {width}x{height} pixels take about {needed / 1e9:.1f} GB "
-        "of memory"
-    )
-    if usable is not None and needed > usable:
-        blocks = "fit it with --blocks 1024, " if has_blocks else ""
-        raise ValueError(
-            f"{path}: {line}, but this process may use {usable / 1e9:.1f} GB; "
-            f"{blocks}scale the image down or use fewer Gaussians"
-        )
+    needed = estimate_memory(width, height, channels, gaussians)
+    what = f"{gaussians:,} Gaussians on {width}x{height} pixels"
+    blocks = "fit it with --blocks 1024, " if has_blocks else ""
+    advice = f"{blocks}scale the image down or use fewer Gaussians"
+    check_usable(needed, f"{path}: {what}", advice)
+    line = f"{what} take about {needed / 1e9:.1f} GB of memory"
     return line if needed >= REPORTED_BYTES else None

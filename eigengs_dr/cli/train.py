@@ -159,7 +159,7 @@ def _train_on_lights(
             raise click.UsageError("--components is one number with --lights: that of planes")
     [output] = name_outputs([folder], output, [".npz"])
     [picture] = name_pictures([folder], preview)
-    photos = [Path(folder) / name for name in read_lights(lights)[0]]
+    photos, directions = read_lights(lights, folder)
     check_outputs([output, picture, run.report], [lights, *photos])
     lock_outputs(output)
     select(run.backend)
@@ -168,8 +168,8 @@ def _train_on_lights(
     try:
         with bar(run.quiet) as show:
             model = eg.Relightable.fit(
-                folder,
-                lights,
+                photos,
+                directions,
                 gaussians=choices["gaussians"],
                 planes=planes,
                 seed=choices["seed"],

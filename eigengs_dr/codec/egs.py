@@ -28,7 +28,7 @@ from ..gaussian.packed import MAGIC
 from ..image.color import MAX_CHANNELS
 from ..image.space import SPACES, Space
 from ..storage.atomic import atomic_write
-from ..storage.memory import check_content
+from ..storage.memory import check_content, open_regular
 from ..storage.npz import BadValue
 from .gaussian_model import MIN_RICH_COUNT, GaussianCoder, SectionModel
 from .quantization import Steps, Symbols, dequantize
@@ -268,7 +268,7 @@ def section_counts(path: str | os.PathLike[str]) -> list[int]:
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a file, and put its name into errors."""
-    with open(path, "rb") as file, file_errors(path):
+    with open_regular(path) as file, file_errors(path):
         yield file
 
 

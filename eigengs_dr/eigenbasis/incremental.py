@@ -32,6 +32,7 @@ from ..image.notes import NotedImages, kept_notes, tell_all
 from ..image.pixels import ImageError
 from ..image.remote import is_url
 from ..storage.checkpoint import read_arrays, write_arrays
+from ..storage.memory import check_usable
 
 BLOCK_BYTES = 768 << 20
 """Size of a block of images in bytes."""
@@ -306,12 +307,25 @@ def find_states(
     """
     images: Any = list_images(source) if isinstance(source, (str, os.PathLike)) else source
     countable = is_countable(images)
+    _check_usable(stream, len(images) if countable else None)
     if client is not None and not countable:
         raise ValueError("the source is not a list of files or images; a cluster needs a list")
     if client is None and not (countable and len(images) > SHARD):
         return _find_states_of_part(images, stream)
     with nullcontext(checkpoint) if checkpoint else TemporaryDirectory() as folder:
         return _merge_shards(images, stream, client, Path(folder))
+
+
+def _check_usable(stream: Stream, count: int | None) -> None:
+    """Refuse components that take more memory than there is: a block, all rows, and a merge."""
+    width, height = stream.size
+    rows = [min(rank, count or rank) for rank in stream.ranks]
+    images = 3 * min(stream.length, count or stream.length)
+    check_usable(
+        4 * width * height * (images + sum(rows) + max(rows)),
+        f"components of images of {width}x{height} pixels",
+        "choose a smaller size or fewer components",
+    )
 
 
 def is_countable(source: object) -> bool:

@@ -27,6 +27,8 @@ empty."""
 
 
 def is_packed(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file is a packed set; raise `OSError` if it cannot be opened."""
-    with open(path, "rb") as file:
+    """Return whether a file is a packed set; for errors see `open_regular`."""
+    from ..storage.memory import open_regular
+
+    with open_regular(path) as file:
         return file.read(len(MAGIC)) == MAGIC

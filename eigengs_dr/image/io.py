@@ -42,7 +42,9 @@ from .space import Space
 from .strips import Pixels, by_strips
 
 
-def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]:
+def load_image(
+    path: str | Path, keep_grey: bool = False, upright: bool = True
+) -> NDArray[np.float32]:
     """Read an image file as RGB.
 
     The function replicates grey, converts palette, CMYK and YCbCr, and applies the orientation. It
@@ -58,6 +60,9 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
         ``cluster``.
     keep_grey : bool, optional
         Return one channel if the file is grey and opaque.
+    upright : bool, optional
+        If false, an EXIF orientation is ignored: the pixels are those that the file stores, as in
+        photos for `Relightable.fit`.
 
     Returns
     -------
@@ -82,11 +87,14 @@ def load_image(path: str | Path, keep_grey: bool = False) -> NDArray[np.float32]
     OSError
         If a URL cannot be read.
     """
-    return read_file(path, keep_grey).pixels
+    return read_file(path, keep_grey, upright=upright).pixels
 
 
 def read_file(
-    path: str | Path, keep_grey: bool = False, encoding: str | None = None
+    path: str | Path,
+    keep_grey: bool = False,
+    encoding: str | None = None,
+    upright: bool = True,
 ) -> EncodedImage:
     """Read an image file as `load_image` does, and return its encoding too.
 
@@ -94,17 +102,19 @@ def read_file(
     """
     check_encoding(encoding)
     if not is_copied(path):
-        return _read_local(Path(path), str(path), keep_grey, encoding)
+        return _read_local(Path(path), str(path), keep_grey, encoding, upright)
     with local_copy(str(path)) as file:
         try:
-            return _read_local(file, str(path), keep_grey, encoding)
+            return _read_local(file, str(path), keep_grey, encoding, upright)
         except ImageError as error:
             raise ImageError(str(error).replace(str(file), str(path))) from None
 
 
-def _read_local(path: Path, name: str, keep_grey: bool, encoding: str | None) -> EncodedImage:
+def _read_local(
+    path: Path, name: str, keep_grey: bool, encoding: str | None, upright: bool
+) -> EncodedImage:
     """Read a file that warnings refer to as `name`."""
-    header = read_header(path)
+    header = read_header(path, upright)
     header.check_memory(path)
     decoded = decode(path, header, keep_grey, name)
     encoding = encoding or decoded.encoding

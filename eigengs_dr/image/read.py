@@ -42,7 +42,7 @@ class Header(NamedTuple):
     Attributes
     ----------
     width, height : int
-        Size in pixels, after the orientation is applied.
+        Size in pixels, after the orientation is applied if `upright`.
     channels : int
         1 for grey, 3 for colours; alpha does not count.
     bytes_per_pixel : int
@@ -51,12 +51,14 @@ class Header(NamedTuple):
         Bits of a value that OpenImageIO decodes.
     encoding : {"srgb", "linear"}
     orientation : int
-        EXIF orientation of the pixels that OpenImageIO decodes; Pillow turns them itself.
+        EXIF orientation of the pixels as they are stored; 1 for those that Pillow turns itself.
     alpha : {"none", "straight", "associated", "light"}
         Whether the last decoded channel is alpha. Colours may already be multiplied by it, as sRGB
         ("associated") or as light, which is then shown over black ("light").
     notes : tuple of str
         Warnings about the file.
+    upright : bool
+        Whether `decode` applies the orientation.
     """
 
     width: int
@@ -68,6 +70,7 @@ class Header(NamedTuple):
     orientation: int = 1
     alpha: str = "none"
     notes: tuple[str, ...] = ()
+    upright: bool = True
 
     def check_memory(self, path: Path, as_floats: bool = True) -> None:
         """Reject a file whose pixels take too much memory; see `check_content`.
@@ -89,8 +92,14 @@ class _Unread(Exception):
     """OpenImageIO cannot read a file."""
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path, upright: bool = True) -> Header:
     """Return the header of an image file; no pixel is decoded.
+
+    Parameters
+    ----------
+    path : Path
+    upright : bool, optional
+        Whether the EXIF orientation counts. The order of pixels in a Radiance file always does.
 
     Raises
     ------
@@ -99,11 +108,11 @@ def read_header(path: Path) -> Header:
     """
     with _image_errors(path):
         if not _format_of(path):
-            return _picture_header(path)
+            return _picture_header(path, upright)
         with _opened(path) as file:
             if not _has_gain_map(file):
-                return _header(path, file)
-        header = _picture_header(path)
+                return _header(path, file, upright)
+        header = _picture_header(path, upright)
         return header._replace(notes=header.notes + GAIN_MAP)
 
 
@@ -120,7 +129,7 @@ def decode(path: Path, header: Header, keep_grey: bool, name: str = "") -> Encod
                 "holds one channel, not R, G and B; read it as data (keep_grey=True, "
                 "--space data), or export it as RGB"
             )
-        pixels, alpha = _pixels(path, header) if kind else _picture(path)
+        pixels, alpha = _pixels(path, header) if kind else _picture(path, header.upright)
     for note in header.notes:
         tell(name or str(path), note)
     pixels, transparent = over_background(pixels, alpha)
@@ -267,7 +276,7 @@ def _is_reduced(spec: oiio.ImageSpec) -> bool:
     return bool((spec.getattribute("tiff:subfiletype") or 0) & 5)
 
 
-def _header(path: Path, file: oiio.ImageInput) -> Header:
+def _header(path: Path, file: oiio.ImageInput, upright: bool) -> Header:
     """Return the header of an open file; reject kinds that are not pictures by name."""
     spec, kind = file.spec(), file.format_name()
     if kind == "tiff":
@@ -286,7 +295,7 @@ def _header(path: Path, file: oiio.ImageInput) -> Header:
         if file.seek_subimage(1, 0):
             raise ImageError("holds several parts; save one as a file of its own")
     elif kind == "hdr":
-        orientation, more = _radiance(path)
+        (orientation, more), upright = _radiance(path), True
         notes += more
     elif kind == "png":
         notes += png_notes(spec) + _frames_note(_png_frames(path))
@@ -299,14 +308,15 @@ def _header(path: Path, file: oiio.ImageInput) -> Header:
             notes += (f"{others} of {spec.nchannels} channels are no colours, and are left out",)
         notes += _frames_note(_count_images(file))
     orientation = orientation if orientation in range(1, 9) else 1
-    width, height = size[::-1] if orientation in TRANSPOSED else size
+    width, height = size[::-1] if upright and orientation in TRANSPOSED else size
     stored, depth = spec.pixel_bytes(True), 8 * spec.format.size()
     needed = stored if encoding == "linear" else 2 * stored  # decoders hold a second copy
     if _display(spec) != _data(spec):
         needed += math.ceil(stored * spec.width * spec.height / max(1, math.prod(size)))
     if alpha in ("straight", "associated"):
         needed = max(needed, stored + 4 * colors)
-    return Header(width, height, colors, needed, depth, encoding, orientation, alpha, notes)
+    pixels = (colors, needed, depth, encoding, orientation, alpha)
+    return Header(width, height, *pixels, notes, upright)
 
 
 FLOATS = ("half", "float", "double")
@@ -445,12 +455,13 @@ def _pixels(path: Path, header: Header) -> tuple[Pixels, str]:
             pixels = _to_colors(samples.reshape(spec.height, spec.width, -1), spec)
             if file.format_name() == "openexr":
                 pixels = _in_display(pixels, spec)
-        return oriented(pixels, header.orientation), header.alpha
+        orientation = header.orientation if header.upright else 1
+        return oriented(pixels, orientation), header.alpha
     except _Unread as error:
         from PIL import UnidentifiedImageError
 
         try:
-            pixels, alpha = _picture(path)
+            pixels, alpha = _picture(path, header.upright)
         except UnidentifiedImageError:
             raise error from None
         if 8 * pixels.dtype.itemsize < header.depth or header.alpha == "associated":
@@ -617,14 +628,15 @@ def _opened_picture(path: Path) -> Iterator[Image]:
         yield image
 
 
-def _picture_header(path: Path) -> Header:
+def _picture_header(path: Path, upright: bool) -> Header:
     """Return the header of a file that Pillow reads."""
     with _opened_picture(path) as image:
         transparent = image.has_transparency_data
         channels = 1 if image.mode in GREY_MODES else 3
         # The EXIF data of a PNG file may lie behind its pixels.
         exif: Any = {} if image.format == "PNG" else image.getexif()
-        is_turned = exif.get(ORIENTATION, 1) in TRANSPOSED
+        orientation = exif.get(ORIENTATION, 1)
+        is_turned = upright and orientation in TRANSPOSED
         width, height = image.size[::-1] if is_turned else image.size
         space = exif.get_ifd(EXIF).get(COLOR_SPACE) if exif else None
         notes = profile_note(image.info.get("icc_profile") or b"", "srgb", space)
@@ -632,16 +644,26 @@ def _picture_header(path: Path) -> Header:
         frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
         notes += depth_notes(path, image) + _frames_note(frames)
     needed = TRANSPARENT_BYTES[channels] if transparent else OPAQUE_BYTES[channels]
-    return Header(width, height, channels, needed, notes=notes)
+    if upright or orientation not in range(1, 9):
+        orientation = 1
+    return Header(
+        width, height, channels, needed, orientation=orientation, notes=notes, upright=upright
+    )
 
 
-def _picture(path: Path) -> tuple[Pixels, str]:
-    """Return the pixels of a file with its EXIF orientation applied, and what their alpha is."""
+def _picture(path: Path, upright: bool) -> tuple[Pixels, str]:
+    """Return the pixels of a file, upright or as stored, and what their alpha is."""
     from PIL import ImageOps
 
     with _opened_picture(path) as image:
-        ImageOps.exif_transpose(image, in_place=True)  # copies only if the image is turned
-        return picture_pixels(image)
+        if upright:
+            ImageOps.exif_transpose(image, in_place=True)  # copies only if the image is turned
+            return picture_pixels(image)
+        stored = image.info.get("original_orientation") or image.getexif().get(ORIENTATION, 1)
+        pixels, alpha = picture_pixels(image)
+        if image.getexif().get(ORIENTATION, 1) == 1:  # Pillow turns TIFF, and pillow-heif HEIC
+            pixels = oriented(pixels, {6: 8, 8: 6}.get(stored, stored))
+        return pixels, alpha
 
 
 def picture_pixels(image: Image) -> tuple[Pixels, str]:

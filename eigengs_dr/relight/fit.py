@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..backend.messages import warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..eigenbasis.incremental import largest_eigenpairs, orient, product
 from ..fitting.fit import Fit, fit_problem
@@ -28,12 +29,23 @@ from ..fitting.objective import Channels, Target
 from ..fitting.options import FitOptions
 from ..fitting.problem import Problem
 from ..image.color import MAX_CHANNELS
-from ..image.io import codes_of, read_photo
+from ..image.io import codes_of, read_file, read_photo
 from ..image.metrics import psnr_from_mse
 from ..image.notes import series
 from ..image.pixels import ImageError, check_encoding
+from ..image.read import read_header
+from ..image.remote import is_copied
 from ..image.space import DATA
-from .lights import LightTable, check_lights, functions_at, read_lights, solve_table
+from ..storage.memory import check_usable
+from .lights import (
+    LightTable,
+    check_lights,
+    check_spread,
+    find_lists,
+    functions_at,
+    read_lights,
+    solve_table,
+)
 
 MAX_PLANES = 32
 """Largest number of planes that is tried. On six sets of real photos, the PSNR of left-out lights
@@ -83,20 +95,24 @@ def read_photos(
     """Read photos and their lights; for parameters and errors see `Relightable.fit`."""
     check_encoding(encoding)
     is_folder = isinstance(photos, (str, os.PathLike))
+    if not is_folder:
+        photos = _listed(photos)
     if lights is None:
         if not is_folder:
             raise ValueError("photos need lights: give their directions (n, 3), or an .lp file")
-        found = sorted(Path(photos).glob("*.[lL][pP]"))
-        if len(found) != 1:
+        lists = find_lists(photos)
+        if len(lists) != 1:
             raise ValueError(
-                f"{photos}: holds {len(found)} files of lights (.lp), expected one; give its name "
+                f"{photos}: holds {len(lists)} files of lights (.lp), expected one; give its name "
                 "as lights"
             )
-        lights = found[0]
+        lights = lists[0]
+    files = photos if is_folder else [p for p in photos if isinstance(p, (str, os.PathLike))]
     if isinstance(lights, (str, os.PathLike)):
-        names, directions = read_lights(lights)
-        if is_folder:
-            photos = [Path(photos) / name for name in names]
+        if not is_folder and files and len(files) < len(photos):
+            raise ValueError("photos are files and arrays; with an .lp file, give one kind of both")
+        named, directions = read_lights(lights, files or None)
+        photos = named if files else photos
     elif is_folder:
         raise ValueError(f"{photos}: a folder needs an .lp file, which names its photos")
     else:
@@ -105,26 +121,62 @@ def read_photos(
         raise ValueError(f"there are {len(photos)} photos, but {len(directions)} lights")
     if len(photos) < MIN_LIGHTS:
         raise ValueError(f"there are {len(photos)} photos; a model needs at least {MIN_LIGHTS}")
+    check_spread(directions)
     with series():
         return _stacked(photos, directions, encoding)
 
 
+def _listed(photos: Any) -> list[Any]:
+    """Return photos as a list; each file may occur once."""
+    if isinstance(photos, (bytes, dict, set, frozenset)) or not hasattr(photos, "__iter__"):
+        kind = type(photos).__name__
+        raise TypeError(f"photos: is of type {kind}; give a folder, or a list of files or images")
+    photos = list(photos)
+    files = [os.fspath(photo) for photo in photos if isinstance(photo, (str, os.PathLike))]
+    if len(set(files)) < len(files):
+        twice = next(file for k, file in enumerate(files) if file in files[:k])
+        raise ValueError(f"photos: {twice} is given for several lights; give each a photo")
+    return photos
+
+
 def _stacked(photos: Sequence[object], lights: Doubles, encoding: str | None) -> Photos:
-    """Read photos into one array."""
+    """Read photos into one array: lights belong to the pixels that files store.
+
+    A camera that looks straight down writes any orientation, and programs that find lights ignore
+    it, so that it may differ from photo to photo.
+    """
+    turned = [photo for photo in photos if _is_turned(photo)]
+    if turned:
+        warn(
+            f"{turned[0]}: an orientation is not applied, in {len(turned)} of {len(photos)} "
+            "photos: lights belong to the pixels as they are stored"
+        )
     rows, shape = np.empty((0, 0), np.float32), (0, 0, 0)
     for k, photo in enumerate(photos):
+        if isinstance(photo, (str, os.PathLike)):
+            photo = read_file(os.fspath(photo), encoding=encoding, upright=False)
         pixels = codes_of(read_photo(photo, encoding))
         if k == 0:
             shape = pixels.shape
+            what = f"{len(photos)} photos of {shape[1]}x{shape[0]} pixels"
+            check_usable(pixels.nbytes * (len(photos) + 1), what, "scale them down or give fewer")
             rows = np.empty((3 * len(photos), shape[0] * shape[1]), np.float32)
         if pixels.shape != shape:
-            name = photo if isinstance(photo, (str, os.PathLike)) else f"photo {k + 1}"
+            name = photos[k] if isinstance(photos[k], (str, os.PathLike)) else f"photo {k + 1}"
             raise ImageError(
                 f"{name}: is {pixels.shape[1]}x{pixels.shape[0]}, but the first photo is "
                 f"{shape[1]}x{shape[0]}; scale them to one size"
             )
         rows[3 * k : 3 * k + 3] = pixels.reshape(-1, 3).T
     return Photos(rows, (shape[1], shape[0]), lights)
+
+
+def _is_turned(photo: object) -> bool:
+    """Return whether a photo is a file whose EXIF orientation turns it."""
+    if not isinstance(photo, (str, os.PathLike)) or is_copied(photo):
+        return False
+    header = read_header(Path(photo), upright=False)
+    return header.orientation != 1 and not header.upright
 
 
 class Planes(NamedTuple):

@@ -6,7 +6,9 @@ camera, as in the files ``.lp`` of RTI (reflectance transformation imaging).
 
 from __future__ import annotations
 
+import codecs
 import os
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,7 +19,11 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import ArrayTypes, upload
-from ..backend.types import ArrayLike, Doubles, Float
+from ..backend.messages import printable, warn
+from ..backend.types import ArrayLike, Doubles, Float, PathLike
+from ..image.pixels import ImageError
+from ..image.remote import is_url
+from ..storage.memory import open_regular
 from ..storage.npz import BadValue
 
 HORIZON = -0.02
@@ -33,30 +39,42 @@ KINDS = ("thin_plate", "hsh")
 """Ways to interpolate between lights, see `LightTable`."""
 
 
-def read_lights(path: str | os.PathLike[str]) -> tuple[list[str], Doubles]:
-    """Read the names of photos and the directions of their lights from an ``.lp`` file.
+def read_lights(path: PathLike, photos: Any = None) -> tuple[list[Any], Doubles]:
+    """Read photos and the directions of their lights from an ``.lp`` file.
 
-    The first line holds the number of photos; each other line holds a name, and x, y and z.
+    The first line holds the number of photos; each other line holds a name, and x, y and z. The
+    file is UTF-8, or UTF-16 with a byte order mark.
+
+    Parameters
+    ----------
+    path : path-like
+    photos : path-like or sequence of path-like, optional
+        The folder of the photos, or the photos in any order.
 
     Returns
     -------
-    names : list of str
-        Without folders, which are those of the machine that wrote the file.
+    photos : list
+        The paths that the file names, in its order; without `photos`, names without folders. Of
+        the folders in a name, which are those of the machine that wrote the file, only those count
+        that the folder of photos holds too, or that tell photos apart.
     lights : ndarray of float64, shape (n, 3)
         See `check_lights`.
+
+    Warns
+    -----
+    UserWarning
+        If the first line is another number, and every line names one of `photos`.
 
     Raises
     ------
     ValueError
-        If the file is no such list; one line names the file and the line.
+        If the file is no such list, does not name `photos`, or names one twice; one line names the
+        file and the line. An `ImageError` if a photo is not in the folder.
     OSError
         If the file cannot be opened.
     """
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: is no text; give a list of lights, .lp") from None
-    rows = [(k + 2, line.rsplit(maxsplit=3)) for k, line in enumerate(lines[1:]) if line.strip()]
+    lines = _lines(path)
+    rows = [(k, line.rsplit(maxsplit=3)) for k, line in enumerate(lines[1:], 2) if line.strip()]
     names, lights = [], []
     for number, row in rows:
         try:
@@ -64,16 +82,114 @@ def read_lights(path: str | os.PathLike[str]) -> tuple[list[str], Doubles]:
             lights.append([float(x), float(y), float(z)])
         except ValueError:
             raise ValueError(
-                f"{path}: line {number} is {' '.join(row)[:40]!r}; expected a name, x, y and z"
+                f"{path}: line {number} is {printable(' '.join(row)[:40])!r}; expected a name, x, "
+                "y and z, with decimal points"
             ) from None
-        names.append(name.replace("\\", "/").rpartition("/")[2])
-    if not lines or lines[0].strip() != str(len(rows)):
-        given = lines[0].strip()[:20] if lines else ""
+        names.append(_parts(name) or [name])
+    count = lines[0].strip()
+    is_right = count.isdecimal() and count.lstrip("0") == str(len(rows))
+    note = f"{path}: the first line is {printable(count[:20])!r}, but {len(rows)} photos follow"
+    if not is_right and (photos is None or not rows or not count.isdecimal()):
+        raise ValueError(f"{note}; it must hold their number")
+    directions = check_lights(lights, str(path))
+    if photos is None:
+        named: list[Any] = ["/".join(parts) for parts in names]
+    elif isinstance(photos, (str, os.PathLike)):
+        named = _in_folder(Path(photos), names, path)
+    else:
+        named = _paired(photos, names, path)
+    if len(set(named)) < len(named):
+        twice = next(name for k, name in enumerate(named) if name in named[:k])
         raise ValueError(
-            f"{path}: the first line is {given!r}, but {len(rows)} photos follow; it must hold "
-            "their number"
+            f"{path}: names {printable(str(twice))} for several lights; give each light a photo of "
+            "its own"
         )
-    return names, check_lights(lights, str(path))
+    if not is_right:
+        warn(f"{note}; all of them are taken")
+    return [parts[-1] for parts in names] if photos is None else named, directions
+
+
+def find_lists(folder: PathLike) -> list[Path]:
+    """Return the lists of lights in a folder, without hidden files."""
+    files = sorted(Path(folder).glob("*.[lL][pP]"))
+    return [file for file in files if file.name[0] != "." and file.is_file()]
+
+
+MAX_LIST_BYTES = 1 << 24
+"""Largest size of a list of lights."""
+
+MAX_DEPTH = 8
+"""Number of names at the end of a path that are compared."""
+
+
+def _lines(path: PathLike) -> list[str]:
+    """Return the lines of a list; bytes of a code page become Python's surrogate escapes."""
+    with open_regular(path, once=True) as file:
+        content = file.read(MAX_LIST_BYTES + 1)
+    if len(content) > MAX_LIST_BYTES:
+        limit = MAX_LIST_BYTES >> 20
+        raise ValueError(f"{path}: has more than {limit} MB; give a list of lights, .lp")
+    is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    kind, errors = ("utf-16", "strict") if is_wide else ("utf-8-sig", "surrogateescape")
+    try:
+        text = content.decode(kind, errors)
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        line = text[: text.index("\0")].count("\n") + 1
+        raise ValueError(
+            f"{path}: is no text (line {line}); give a list of lights, .lp, saved as UTF-8"
+        )
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def _parts(name: PathLike) -> list[str]:
+    """Return the folders and the name of a path of any system; those above it are left out."""
+    text = os.fspath(name)
+    if is_url(text):
+        text = text.partition("::")[0].partition("?")[0]
+    return [part for part in text.replace("\\", "/").split("/") if part not in ("", ".", "..")]
+
+
+def _in_folder(folder: Path, names: list[list[str]], path: PathLike) -> list[Path]:
+    """Return the photos of a list by as many of its folders as there are in the folder."""
+    for depth in range(MAX_DEPTH, 0, -1):
+        files = [_existing(folder, "/".join(parts[-depth:])) for parts in names]
+        if all(files):
+            return [file for file in files if file]
+    missing = printable("/".join(names[files.index(None)]))
+    raise ImageError(f"{folder}: has no file {missing}, which {path} names; check the names")
+
+
+def _existing(folder: Path, name: str) -> Path | None:
+    """Return the file of a name as macOS composes its letters or Windows encodes them, or None."""
+    spellings = [name, *(unicodedata.normalize(form, name) for form in ("NFC", "NFD"))]
+    spellings.append(name.encode("utf-8", "surrogateescape").decode("cp1252", "replace"))
+    return next((folder / s for s in spellings if os.path.isfile(folder / s)), None)
+
+
+def _paired(photos: Sequence[PathLike], names: list[list[str]], path: PathLike) -> list[PathLike]:
+    """Return photos in the order of a list: by their names, or else without case and suffix."""
+
+    def key(parts: list[str], depth: int, is_exact: bool) -> str:
+        name = unicodedata.normalize("NFC", "/".join(parts[-depth:]))
+        return name if is_exact else os.path.splitext(name)[0].casefold()
+
+    for is_exact in (True, False):
+        for depth in range(1, MAX_DEPTH + 1):
+            keys = [key(parts, depth, is_exact) for parts in names]
+            given = {key(_parts(photo), depth, is_exact): photo for photo in photos}
+            if len(set(keys)) == len(keys) == len(photos) and given.keys() == set(keys):
+                return [given[k] for k in keys]
+    known = {parts[-1] for parts in names}
+    other = next((p for p in photos if _parts(p)[-1:] and _parts(p)[-1] not in known), None)
+    reason = "some have one name" if other is None else f"it does not name {other}"
+    if len(photos) != len(names):
+        reason = f"there are {len(photos)} photos, but {len(names)} lights"
+    raise ValueError(
+        f"{path}: cannot be paired with the photos by name ({printable(reason)}); give the photos "
+        "that it names, each once"
+    )
 
 
 def check_lights(lights: ArrayLike, name: str = "lights") -> Doubles:
@@ -84,7 +200,12 @@ def check_lights(lights: ArrayLike, name: str = "lights") -> Doubles:
     ValueError
         If there are none, a value is not finite, or a light is below the horizon, z < 0.
     """
-    given = np.array(lights, np.float64)
+    try:
+        given = np.array(lights, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name}: are no array of numbers; give directions of shape (n, 3)"
+        ) from None
     if given.ndim != 2 or given.shape[1] != 3 or not 1 <= len(given) <= MAX_LIGHTS:
         raise ValueError(
             f"{name}: lights have shape {given.shape}; expected (n, 3) with n up to {MAX_LIGHTS}"
@@ -104,6 +225,33 @@ def check_lights(lights: ArrayLike, name: str = "lights") -> Doubles:
             "from the object to the camera and must not be negative"
         )
     return np.asarray(unit)
+
+
+FLAT = np.sin(np.radians(1))
+"""Root mean square of the distances of unit vectors from a line or a plane that is not taken for
+noise of the measurement."""
+
+
+def check_spread(lights: Doubles) -> None:
+    """Check that directions (n, 3) of length 1, n > 2, tell what an object shows under others.
+
+    Raises
+    ------
+    ValueError
+        If they are all one direction.
+
+    Warns
+    -----
+    UserWarning
+        If they lie on one arc over the object, such as those of a lamp on a rail.
+    """
+    _, across, aside = np.linalg.svd(lights, compute_uv=False) / np.sqrt(len(lights))
+    if across < FLAT:
+        raise ValueError(
+            "lights: all come from one direction; a model needs photos under several lights"
+        )
+    if aside < FLAT:
+        warn("lights: all lie on one arc over the object; what other lights show is a guess")
 
 
 @dataclass(frozen=True, eq=False)

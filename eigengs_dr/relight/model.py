@@ -96,12 +96,15 @@ class Relightable:
         ----------
         photos : path-like, or sequence of images or paths, or array_like of shape (n, H, W, 3)
             At least 4 photos of one size from one camera. A folder holds the photos that the list
-            of lights names. Numbers of a list, an array or a tensor of Dr.Jit are linear light if
-            they are floats, as those of `mitsuba.render`, and sRGB codes if they are whole; other
-            photos are what they say. Light may be brighter than white.
+            of lights names. Files are read as stored: an EXIF orientation is ignored, with a
+            warning, because lights belong to those pixels. Numbers of a list, an array or a tensor
+            of Dr.Jit are linear light if they are floats, as those of `mitsuba.render`, and sRGB
+            codes if they are whole; other photos are what they say. Light may be brighter than
+            white.
         lights : array_like of shape (n, 3), or path-like, optional
             The direction of the light of each photo, of any length; or a list ``.lp`` of names and
-            directions. By default the only such file in the folder.
+            directions. By default the only such file in the folder. A list is paired with files by
+            name, and with arrays in order.
         gaussians : int, optional
             Number of Gaussians, by default one for 16 pixels.
         planes : int, optional
@@ -117,8 +120,9 @@ class Relightable:
         Raises
         ------
         ValueError
-            If photos and lights do not match, a light is below the horizon, or an option is out of
-            range; an `ImageError` if a photo cannot be used.
+            If photos and lights do not match, a light is below the horizon, all lights are one, the
+            photos take more memory than there is, or an option is out of range; an `ImageError` if
+            a photo cannot be used.
         OSError
             If a file cannot be opened.
         Interrupted

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
 
 SETTING = "EIGENGS_DR_MAX_FILE_MB"
 """Environment variable: megabytes of memory that the content of one file may take."""
@@ -24,7 +26,8 @@ def usable_memory(root: Path = Path("/")) -> int | None:
     """Return the bytes of memory that this process may use, or None if they are unknown.
 
     This is the memory of the machine, or less in a container or in a job of a batch system: Linux
-    limits the memory of a control group (version 1 or 2) and of its parents.
+    limits the memory of a control group (version 1 or 2) and of its parents; and Unix the addresses
+    of a process (``ulimit -v``).
 
     Parameters
     ----------
@@ -35,7 +38,16 @@ def usable_memory(root: Path = Path("/")) -> int | None:
         installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):  # Windows has no `sysconf`
         return None
-    return min([installed, *_group_limits(root)])
+    return min([installed, *_address_limits(), *_group_limits(root)])
+
+
+def _address_limits() -> Iterator[int]:
+    """Yield the limit of the addresses of this process, if there is one."""
+    import resource  # Windows has none
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY:
+        yield limit
 
 
 def _group_limits(root: Path) -> Iterator[int]:
@@ -86,6 +98,38 @@ def check_content(path: str | os.PathLike[str], needed: int) -> None:
             f"{path}: takes {needed / 1e6:,.0f} MB in memory, the limit is {limit / 1e6:,.0f} MB; "
             f"if you trust the file, set {SETTING}={(needed >> 20) + 1}"
         )
+
+
+def check_usable(needed: float, what: str, advice: str) -> None:
+    """Raise ValueError, in one line, if something takes more memory than `usable_memory`.
+
+    Parameters
+    ----------
+    needed : float
+        Bytes.
+    what : str
+        What takes them, in the plural.
+    advice : str
+        What to do.
+    """
+    usable = usable_memory()
+    if usable is not None and needed > usable:
+        raise ValueError(
+            f"{what} take about {needed / 1e9:.1f} GB of memory, but this process may use "
+            f"{usable / 1e9:.1f} GB; {advice}"
+        )
+
+
+def open_regular(path: str | os.PathLike[str], once: bool = False) -> BinaryIO:
+    """Open a file for reading; raise ValueError for a device or a pipe, which may have no end.
+
+    With `once`, a pipe that this process holds, such as ``/dev/stdin``, is opened too.
+    """
+    kind = os.stat(path).st_mode
+    is_held = once and stat.S_ISFIFO(kind) and os.fspath(path).startswith(("/dev/", "/proc/"))
+    if not (is_held or stat.S_ISREG(kind) or stat.S_ISDIR(kind)):  # `open` refuses a folder
+        raise ValueError(f"{path}: is a device or a pipe; give a file")
+    return open(path, "rb")
 
 
 def download_limit() -> int:

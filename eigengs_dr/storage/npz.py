@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..backend.types import Arrays, Record, Values
 from .atomic import atomic_write
-from .memory import check_content
+from .memory import check_content, open_regular
 
 MAX_ENTRIES = 1 << 26
 """Largest number of elements of one array; a file that claims more is refused."""
@@ -137,7 +137,7 @@ def _opened(
     path: str | os.PathLike[str], name: str = "eigengs_dr", version: int | None = None
 ) -> Iterator[zipfile.ZipFile]:
     """Open a file of a format and a version; turn every error in the block into one line."""
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         try:
             with _archive(file) as archive:
                 if version is not None:

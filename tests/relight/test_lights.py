@@ -110,7 +110,7 @@ def test_a_damaged_list_is_refused_in_one_line(tmp_path, text, message):
 
 def test_a_list_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "dirs.lp"
-    path.write_bytes(b"\xff\xfe\x00photo")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n\x00\x00photo")
     with pytest.raises(ValueError, match="no text"):
         read_lights(path)
 
