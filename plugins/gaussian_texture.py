@@ -86,7 +86,7 @@ def gaussian_texture() -> type:
 
         def parameters_changed(self, keys: list[str]) -> None:
             if not keys or "to_uv" in keys:
-                properties.check_invertible(self.to_uv)
+                properties.check_invertible(self.to_uv, self.plugin)
                 self.transform = mi.Transform3f(self.to_uv)
                 dr.make_opaque(self.transform)  # another transform compiles no other programs
             super().parameters_changed(keys)

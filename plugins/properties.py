@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -15,7 +16,9 @@ from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
-from eigengs_dr.relight.model import Relightable, holds_lights
+from eigengs_dr.relight.lights import KINDS, LightTable, check_table
+from eigengs_dr.relight.model import Relightable, check_brightest, holds_lights
+from eigengs_dr.storage.npz import BadValue
 
 from .lookup import MEMORIES, Memory
 from .parameters import (
@@ -108,6 +111,61 @@ def source_of(props: mi.Properties) -> TextureParameters:
     return source
 
 
+def lit_planes(props: mi.Properties) -> tuple[LightTable, float, mi.Properties]:
+    """Read the model of a ``gaussian_relightable``: ``model``, or the arrays of `material_of`.
+
+    Returns
+    -------
+    table : LightTable
+    brightest : float
+    planes : mitsuba.Properties
+        Those of the texture of its planes, a channel for each.
+
+    Raises
+    ------
+    ValueError
+        If none or both are given, or a file or an array is invalid.
+    """
+    plugin = props.plugin_name()
+    planes = mi.Properties(plugin)
+    planes.set_id(props.id())
+    planes["raw"] = True
+    if ("model" in props) == ("lights" in props):
+        raise ValueError(
+            f"{plugin}: give one of model (a saved Relightable) or lights, values, mean, factor, "
+            f"... (see material_of); got {'both' if 'model' in props else 'none'}"
+        )
+    keys = ["wrap_mode", "to_uv", "prefilter", "memory"]
+    if "model" in props:
+        planes["planes"] = path(props, "model")
+        model = Relightable.load(planes["planes"], backend_of(mi.variant()))
+        table, brightest = model.table, model.brightest
+    else:
+        keys += [*FIELDS, "width", "height", "space", "cutoff"]
+        table, brightest = _table_from_arrays(props)
+    for key in keys:
+        if key in props:
+            planes[key] = props[key]
+    return table, brightest, planes
+
+
+def _table_from_arrays(props: mi.Properties) -> tuple[LightTable, float]:
+    """Read the table of lights and the brightest code from the properties of `material_of`."""
+    plugin = props.plugin_name()
+    missing = [key for key in ("values", "kind", "smoothing", "color") if key not in props]
+    if missing:
+        raise ValueError(f"{plugin}: {missing[0]} is missing; see material_of")
+    lights, values = (np.array(props[key], np.float64) for key in ("lights", "values"))
+    kind = _read(props, "kind", "", str, f"one of {', '.join(KINDS)}")
+    smoothing = _read(props, "smoothing", 0.0, float, "a number")
+    table = LightTable(lights, values, kind, smoothing)
+    try:
+        brightest = check_brightest(_read(props, "brightest", 1.0, float, "a number"))
+        return check_table(table, np.array(props["color"]).shape[-1]), brightest
+    except BadValue as error:
+        raise ValueError(f"{plugin}: {error}") from None
+
+
 def _from_arrays(props: mi.Properties, backend: str | None) -> Gaussians:
     """Read a set from the properties of `texture_of`."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
@@ -175,6 +233,19 @@ def light_scale(props: mi.Properties) -> float:
     return value
 
 
+def check_scale(scale: mi.Float, plugin: str) -> None:
+    """Raise `ValueError` if a factor of light that has changed is not one, see `light_scale`.
+
+    Frozen functions are not checked: they cannot read numbers.
+    """
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return
+    values = dr.detach(scale).numpy().tolist()
+    if len(values) != 1 or not 0 <= values[0] < math.inf:
+        value = values[0] if len(values) == 1 else f"of {len(values)} numbers"
+        raise ValueError(f"{plugin}: scale is {value}; it must be one finite number, at least 0")
+
+
 def check_light(gaussians: Gaussians, plugin: str) -> None:
     """Raise `ValueError` if a set is not light from all directions."""
     if gaussians.channels not in (1, 3) or not gaussians.space.is_color:
@@ -218,9 +289,7 @@ def wrap_mode(props: mi.Properties) -> str:
     """Read ``wrap_mode``, one of `WRAPS`."""
     wrap = str(props.get("wrap_mode", "repeat"))
     if wrap not in WRAPS:
-        raise ValueError(
-            f"gaussian_texture: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
-        )
+        raise _mistake(props, "wrap_mode", wrap, f"one of {', '.join(WRAPS)}")
     return wrap
 
 
@@ -249,17 +318,17 @@ def to_uv(props: mi.Properties) -> mi.ScalarTransform3f:
     if matrix.ndim == 3:  # of arrays of Dr.Jit
         if matrix.shape[2] != 1:
             raise ValueError(
-                f"gaussian_texture: to_uv holds {matrix.shape[2]} transforms; it must hold one"
+                f"{props.plugin_name()}: to_uv holds {matrix.shape[2]} transforms; it must hold one"
             )
         matrix = matrix[..., 0]
     rows = [[*row[:2], row[-1]] for row in matrix[:2]]
     return mi.ScalarTransform3f([*rows, [0, 0, 1]])
 
 
-def check_invertible(transform: mi.ScalarTransform3f) -> None:
+def check_invertible(transform: mi.ScalarTransform3f, plugin: str) -> None:
     """Raise `ValueError` if a transform of uv is not finite, or maps the plane to a line."""
     matrix = np.array(transform.matrix, np.float64)
     linear = matrix[:2, :2]
     area, size = abs(np.linalg.det(linear)), np.square(linear).sum()
     if not (np.isfinite(matrix).all() and area > 1e-9 * size):
-        raise ValueError("gaussian_texture: to_uv maps the plane to a line; it must be invertible")
+        raise ValueError(f"{plugin}: to_uv maps the plane to a line; it must be invertible")
