@@ -233,17 +233,23 @@ def light_scale(props: mi.Properties) -> float:
     return value
 
 
+def number_of(array: mi.Float, name: str, plugin: str) -> float:
+    """Return the number that a parameter holds; raise `ValueError` if it holds none or several."""
+    numbers = dr.detach(array).numpy().tolist()
+    if len(numbers) != 1:
+        raise ValueError(f"{plugin}: {name} holds {len(numbers)} numbers; it must hold one")
+    return float(numbers[0])
+
+
 def check_scale(scale: mi.Float, plugin: str) -> None:
     """Raise `ValueError` if a factor of light that has changed is not one, see `light_scale`.
 
-    Frozen functions are not checked: they cannot read numbers.
+    A frozen function, in which numbers cannot be read, is not checked.
     """
-    if dr.flag(dr.JitFlag.FreezingScope):
-        return
-    values = dr.detach(scale).numpy().tolist()
-    if len(values) != 1 or not 0 <= values[0] < math.inf:
-        value = values[0] if len(values) == 1 else f"of {len(values)} numbers"
-        raise ValueError(f"{plugin}: scale is {value}; it must be one finite number, at least 0")
+    if not dr.flag(dr.JitFlag.FreezingScope):
+        value = number_of(scale, "scale", plugin)
+        if not 0 <= value < math.inf:
+            raise ValueError(f"{plugin}: scale is {value}; it must be finite, and at least 0")
 
 
 def check_light(gaussians: Gaussians, plugin: str) -> None:
@@ -262,7 +268,10 @@ def check_light(gaussians: Gaussians, plugin: str) -> None:
 
 def check_rotation(transform: mi.AffineTransform4f) -> None:
     """Raise `ValueError` if a transform of directions is not a rotation, perhaps mirrored."""
-    matrix = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
+    matrix = np.array(transform.matrix, np.float64)
+    if matrix.size != 16:
+        raise ValueError("gaussian_environment: to_world holds several transforms; give one")
+    matrix = matrix.reshape(4, 4)[:3, :3]
     if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
         raise ValueError(
             "gaussian_environment: to_world scales or shears directions; it must be a rotation"
