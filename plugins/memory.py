@@ -51,9 +51,11 @@ def resident_bytes(texture: Texture) -> int:
     arrays: dict[tuple, int] = {}
     sampled = 0
     for value in _walk(vars(texture), {}):
-        if isinstance(value, Emission | mi.Texture2f):
-            is_table = isinstance(value, mi.Texture2f)
-            sampled += _texel_bytes(value.tensor()) if is_table else value.bytes
+        if isinstance(value, Emission):
+            sampled += value.bytes
+            continue
+        if isinstance(value, mi.Texture2f):
+            sampled += _texel_bytes(value.tensor())
             continue
         for array in (value, dr.grad(value)) if dr.grad_enabled(value) else (value,):
             arrays[indices_of([dr.detach(array)])] = dr.width(array) * dr.itemsize_v(array)

@@ -16,7 +16,7 @@ from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
-from eigengs_dr.relight.lights import KINDS, LightTable, check_table
+from eigengs_dr.relight.lights import LightTable, check_table
 from eigengs_dr.relight.model import Relightable, check_brightest, holds_lights
 from eigengs_dr.storage.npz import BadValue
 
@@ -32,6 +32,10 @@ from .parameters import (
 
 FILES = ("filename", "model", "planes")
 """Properties that name the file of the Gaussians."""
+
+PLANES = (*FIELDS, "width", "height", "space", "cutoff")
+PLANES += ("wrap_mode", "to_uv", "prefilter", "memory")
+"""Properties of a ``gaussian_relightable`` that are those of the texture of its planes."""
 
 UP = (0.0, 0.0, 1.0)
 """Default light of a relightable model: from the camera."""
@@ -124,46 +128,30 @@ def lit_planes(props: mi.Properties) -> tuple[LightTable, float, mi.Properties]:
     Raises
     ------
     ValueError
-        If none or both are given, or a file or an array is invalid.
+        If a file or an array is invalid.
     """
     plugin = props.plugin_name()
     planes = mi.Properties(plugin)
     planes.set_id(props.id())
     planes["raw"] = True
-    if ("model" in props) == ("lights" in props):
-        raise ValueError(
-            f"{plugin}: give one of model (a saved Relightable) or lights, values, mean, factor, "
-            f"... (see material_of); got {'both' if 'model' in props else 'none'}"
-        )
-    keys = ["wrap_mode", "to_uv", "prefilter", "memory"]
-    if "model" in props:
+    if "lights" not in props:
         planes["planes"] = path(props, "model")
         model = Relightable.load(planes["planes"], backend_of(mi.variant()))
         table, brightest = model.table, model.brightest
     else:
-        keys += [*FIELDS, "width", "height", "space", "cutoff"]
-        table, brightest = _table_from_arrays(props)
-    for key in keys:
+        lights, values, color = (np.array(props[key]) for key in ("lights", "values", "color"))
+        smoothing = _read(props, "smoothing", 0.0, float, "a number")
+        table = LightTable(lights, values, str(props.get("kind", "")), smoothing)
+        brightest = _read(props, "brightest", 1.0, float, "a number")
+        try:
+            table = check_table(table, color.shape[-1])
+            check_brightest(brightest)
+        except BadValue as error:
+            raise ValueError(f"{plugin}: {error}") from None
+    for key in PLANES:
         if key in props:
             planes[key] = props[key]
     return table, brightest, planes
-
-
-def _table_from_arrays(props: mi.Properties) -> tuple[LightTable, float]:
-    """Read the table of lights and the brightest code from the properties of `material_of`."""
-    plugin = props.plugin_name()
-    missing = [key for key in ("values", "kind", "smoothing", "color") if key not in props]
-    if missing:
-        raise ValueError(f"{plugin}: {missing[0]} is missing; see material_of")
-    lights, values = (np.array(props[key], np.float64) for key in ("lights", "values"))
-    kind = _read(props, "kind", "", str, f"one of {', '.join(KINDS)}")
-    smoothing = _read(props, "smoothing", 0.0, float, "a number")
-    table = LightTable(lights, values, kind, smoothing)
-    try:
-        brightest = check_brightest(_read(props, "brightest", 1.0, float, "a number"))
-        return check_table(table, np.array(props["color"]).shape[-1]), brightest
-    except BadValue as error:
-        raise ValueError(f"{plugin}: {error}") from None
 
 
 def _from_arrays(props: mi.Properties, backend: str | None) -> Gaussians:
@@ -181,7 +169,8 @@ def _from_arrays(props: mi.Properties, backend: str | None) -> Gaussians:
 
 def path(props: mi.Properties, key: str) -> str:
     """Return the path of a file by Mitsuba's resolver, which also looks beside the scene."""
-    return str(mi.file_resolver().resolve(props[key]))
+    name = _read(props, key, None, str, "the path of a file")
+    return str(mi.file_resolver().resolve(name))
 
 
 def file_name(props: mi.Properties) -> str:

@@ -35,7 +35,7 @@ from ..raster.render import render
 from ..storage import npz
 from ..storage.npz import BadValue, Field
 from .fit import find_planes, fit_planes, most_planes, read_photos
-from .lights import KINDS, MAX_LIGHTS, LightTable, check_lights, check_table
+from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
 FORMAT, VERSION = "eigengs_dr.relightable", 1
 
@@ -52,9 +52,6 @@ LAYOUT: dict[str, Field] = ARRAYS | {
 
 BRIGHTEST = {"brightest": Field("f8", 0)}
 """An array that older files lack."""
-
-MAX_CODE = 1e6
-"""Largest code of photos in a file: that of light 2e14."""
 
 
 @class_of_doors
@@ -262,16 +259,19 @@ class Relightable:
                 float(members["smoothing"]),
             )
             table = check_table(table, data.arrays["color"].shape[1])
-            brightest = check_brightest(float(members.get("brightest", 1)))
-            planes = Gaussians.from_data(data, backend)
-            return cls(planes, table, float(members["psnr_held_out"]), brightest)
+            figures = [float(members.get(name, 1)) for name in ("psnr_held_out", "brightest")]
+            check_brightest(figures[1])
+            return cls(Gaussians.from_data(data, backend), table, *figures)
 
 
 def check_brightest(code: float) -> float:
     """Return the largest code of photos; raise `BadValue` if it is none."""
-    if not 1 <= code <= MAX_CODE:
-        raise BadValue(f"brightest is {code}, expected 1 to {MAX_CODE:g}")
+    if not 1 <= code <= MAX_FACTOR:
+        raise BadValue(f"brightest is {code}, expected 1 to {MAX_FACTOR:g}")
     return code
+
+
+GIVE = "give one direction, three numbers as lights[0], or an environment: an image (h, w, 3)"
 
 
 def _numbers_of(light: Any) -> NDArray[Any]:
@@ -281,16 +281,9 @@ def _numbers_of(light: Any) -> NDArray[Any]:
     except (ValueError, RuntimeError):  # rows of unequal length
         array = np.array(None)
     if array.ndim == 0 or array.dtype.kind not in "biuf":
-        given = f"is {light!r}" if light is None else f"is of type {type(light).__name__}"
-        raise TypeError(
-            f"light {given}; give one direction, three numbers, or an environment: an array "
-            "(h, w, 3) of numbers or the path of an image"
-        )
-    if array.ndim not in (1, 3) or (array.ndim == 1 and len(array) != 3):
-        raise ValueError(
-            f"light has shape {array.shape}; give one direction, three numbers, as in "
-            "relight(lights[0]); an environment is an image (h, w, 3)"
-        )
+        raise TypeError(f"light is of type {type(light).__name__}; {GIVE} or its path")
+    if array.ndim != 3 and array.shape != (3,):
+        raise ValueError(f"light has shape {array.shape}; {GIVE} or its path")
     return array
 
 
@@ -298,21 +291,18 @@ def _vector_of(light: Any, types: ArrayTypes) -> list[Any]:
     """Return the components of a vector of Dr.Jit; `ValueError` if they are known to be none."""
     shape = dr.shape(light)
     if shape not in ((3,), (3, 1)):
-        raise ValueError(f"light has shape {shape}; give one direction, a vector of three numbers")
+        raise ValueError(f"light has shape {shape}; {GIVE}")
     if len(shape) == 1:  # a tensor, or a flat array
         flat = light.array if dr.is_tensor_v(light) else light
-        light = [dr.gather(type(flat), flat, dr.uint32_array_t(type(flat))(k)) for k in range(3)]
+        light = dr.unravel(types.Float3, types.Float(flat))
     vector = types.Float3([types.Float(v) for v in light])
     recorded = dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope)
-    if not recorded and all(v.state in KNOWN for v in vector):
+    without_program = (dr.VarState.Literal, dr.VarState.Evaluated)
+    if not recorded and all(v.state in without_program for v in vector):
         numbers = [dr.detach(v)[0] for v in vector]
         if not (np.isfinite(numbers).all() and any(numbers)):
             raise ValueError(f"light is {numbers}, which is no direction")
     return list(or_camera(vector))
-
-
-KNOWN = (dr.VarState.Literal, dr.VarState.Evaluated)
-"""States of variables whose numbers cost no program."""
 
 
 def or_camera(light: Any) -> Any:
@@ -406,9 +396,8 @@ def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable
         raise BadValue("the table of lights is truncated; copy the file again")
     kind, planes, count, smoothing, psnr = _HEAD.unpack_from(content)
     sizes = [4 * (planes + 1), 6 * count, 3 * (planes + 1) * count]
-    rest = content[_HEAD.size + sum(sizes) :]
-    whole = len(content) >= _HEAD.size + sum(sizes) and len(rest) in (0, _BRIGHTEST.size)
-    if not whole or planes != data.arrays["color"].shape[1]:
+    rest = len(content) - _HEAD.size - sum(sizes)
+    if rest not in (0, _BRIGHTEST.size) or planes != data.arrays["color"].shape[1]:
         raise BadValue("the table of lights has another size; copy the file again")
     ends = (_HEAD.size + np.cumsum(sizes)).tolist()
     scale = np.frombuffer(content[_HEAD.size : ends[0]], "<f4").astype(np.float64)
@@ -416,5 +405,5 @@ def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable
     rounded = np.frombuffer(content[ends[1] : ends[2]], np.int8).reshape(count, 3, planes + 1)
     name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
     table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
-    brightest = check_brightest(_BRIGHTEST.unpack(rest)[0] if rest else 1.0)
+    brightest = check_brightest(_BRIGHTEST.unpack_from(content, ends[2])[0] if rest else 1.0)
     return Gaussians.from_data(data, backend), table, psnr, brightest

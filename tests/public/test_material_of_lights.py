@@ -344,7 +344,7 @@ def test_an_environment_lights_a_model_as_an_envmap_does(formula):
         ([[0, 0, 1.0]], ValueError, "one direction"),
         (np.ones((8, 16)), ValueError, r"image \(h, w, 3\)"),
         ([0, 1], ValueError, "shape"),
-        (None, TypeError, "light is None"),
+        (None, TypeError, "type NoneType"),
         ([None] * 3, TypeError, "type list"),
         (iter([0, 0, 1]), TypeError, "iterator"),
         (["0", "0", "1"], TypeError, "type list"),
