@@ -44,8 +44,8 @@ def gaussian_texture() -> type:
         coefficients : tensor (C, k), default: 0
             Of the `model` of a family; 0 is the mean image.
         light : vector, default: (0, 0, 1)
-            Of a `model` of lights: towards the light, of any length; x along u, y against v, z
-            towards the camera.
+            Of a `model` of lights: towards the light, of any length; x to the right of the photo,
+            y up, z towards the camera.
         mean : tensor (N, 2)
             x, y in pixels.
         factor : tensor (N, 3)
