@@ -179,14 +179,14 @@ def light_axes(si: mi.SurfaceInteraction3f, planes: Texture) -> tuple[mi.Vector2
     direction of ex, and y is perpendicular to it on the side against ey. So directions keep
     their angles where uv shears the photo or scales it unequally.
 
-    The first axis of the frame goes along u, whatever the frame is relative to: a ``normalmap``
-    gives its material a frame in the axes of the one outside of it.
+    The first axis of the frame goes along u, but inside of a ``bumpmap`` of Mitsuba 3.9, which
+    mixes axes of the world with those of its own frame.
     """
     (_, slope_x), (_, slope_y), _ = planes.point(si.uv)  # against uv in mirrored copies
     transposed = planes.transform.inverse_transpose
     (b00, b01), (b10, b11) = ([transposed[j, i] for j in range(2)] for i in range(2))
     normal = dr.cross(si.dp_du, si.dp_dv)
-    v_side = dr.dot(normal, _outwards(si))
+    v_side = dr.dot(normal, si.sh_frame.n)
     across = dr.mulsign(dr.sqrt(dr.maximum(dr.squared_norm(normal), TINY)), v_side)
     along = mi.Vector2f(
         dr.squared_norm(si.dp_du) * b00 + dr.dot(si.dp_du, si.dp_dv) * b10, across * b10
@@ -200,17 +200,6 @@ def light_axes(si: mi.SurfaceInteraction3f, planes: Texture) -> tuple[mi.Vector2
 
 TINY = 1e-30
 """Square of a length that counts as 0: uv that is constant along a surface has no direction."""
-
-
-def _outwards(si: mi.SurfaceInteraction3f) -> mi.Normal3f:
-    """Return the side of the surface, in the world, on which the shading frame has its normal."""
-    n, s = si.sh_frame.n, si.sh_frame.s
-    u = dr.normalize(si.dp_du - n * dr.dot(n, si.dp_du))
-    # A mirrored mesh has normals against its faces. They count unless the frame is that inside of
-    # a `normalmap`, which is none of the world: most such frames are turned against u.
-    mirrored = (dr.dot(n, si.n) < -0.5) & (dr.dot(s, u) > 0.999)
-    unknown = dr.squared_norm(si.n) == 0  # of an interaction that was made by hand
-    return dr.select(mirrored | unknown, n, si.n)
 
 
 def place_of(light: mi.Vector3f) -> mi.Point2f:

@@ -287,7 +287,9 @@ def wrap_mode(props: mi.Properties) -> str:
     """Read ``wrap_mode``, one of `WRAPS`."""
     wrap = str(props.get("wrap_mode", "repeat"))
     if wrap not in WRAPS:
-        raise _mistake(props, "wrap_mode", wrap, f"one of {', '.join(WRAPS)}")
+        raise ValueError(
+            f"{props.plugin_name()}: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
+        )
     return wrap
 
 
