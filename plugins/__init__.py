@@ -14,7 +14,7 @@ from .cone import pixel_angle
 from .environment import bake_environment, environment_of
 from .follow import follow
 from .memory import resident_bytes
-from .parameters import gaussians_of, keep_in_bounds, texture_of
+from .parameters import gaussians_of, keep_in_bounds, material_of, texture_of
 from .photos import photo_loss
 from .registration import register_plugins
 
@@ -24,6 +24,7 @@ __all__ = [
     "follow",
     "gaussians_of",
     "keep_in_bounds",
+    "material_of",
     "photo_loss",
     "pixel_angle",
     "register_plugins",

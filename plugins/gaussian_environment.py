@@ -111,6 +111,8 @@ def gaussian_environment() -> type:
         def parameters_changed(self, keys: list[str]) -> None:
             super().parameters_changed(keys)
             mi.Emitter.parameters_changed(self, keys)
+            if "scale" in keys:
+                properties.check_scale(self.scale, self.plugin)
             if not keys or "to_world" in keys:
                 properties.check_rotation(self.to_world)
                 dr.make_opaque(self.to_world)

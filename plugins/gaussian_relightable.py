@@ -8,17 +8,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from eigengs_dr.backend.arrays import upload
+from eigengs_dr.backend.arrays import rsqrt, upload
 from eigengs_dr.backend.recording import collector_off, guest
-from eigengs_dr.backend.selection import backend_of
 from eigengs_dr.backend.types import Float, Mask
-from eigengs_dr.image.space import RGB
-from eigengs_dr.relight.model import Relightable
+from eigengs_dr.image.color import clamp, to_linear
 from eigengs_dr.relight.planes import directions
 
 from . import properties
 from .color import luminance, unpolarized, upload_table, upsample
 from .gaussian_texture import gaussian_texture
+from .versions import Texture
 
 RESOLUTION = 32
 """Directions along each side of the octahedron on which factors of planes are tabulated."""
@@ -37,21 +36,27 @@ def gaussian_relightable() -> type:
 
         With the photo P under a light from l, the value towards any direction above the surface is
         ``scale / pi to_linear(P(u, v, l))``, which has the cosine in it: photos are brightest
-        where light falls straight. A light of irradiance pi shows the photo itself.
+        where light falls straight. A light of irradiance pi shows the photo itself. Light of
+        photos above white is kept.
 
         Photos hold the shadows that the object casts on itself, but its highlights are those
         towards the camera of the photos, wherever the camera of the scene stands. The material has
-        one side, and its values are not reciprocal.
+        one side, and its values are not reciprocal: integrators that start at the light, such as
+        ``ptracer``, get ``cos(wo) / cos(wi)`` times the value for the light from `wi`.
+
+        Light comes from the side of the photo that it has on the surface, as `to_uv`, mirrored
+        copies and uv place it there. The axes of the photo are those of `light_axes`.
 
         Parameters
         ----------
         model : string
             A file of a `Relightable`, as ``eigengs-dr train --lights`` writes; relative to the
-            scene. Photos lie over uv as those of a ``gaussian_texture``, row 0 at v = 0.
+            scene. Photos lie over uv as those of a ``gaussian_texture``, row 0 at v = 0. Or the
+            arrays of a model, as `eigengs_dr.plugins.material_of` writes them.
         scale : float, default: 1
             Factor of all values.
         wrap_mode, to_uv, prefilter, memory
-            See ``gaussian_texture``. Photos are not turned by `to_uv`: it may scale and move.
+            See ``gaussian_texture``.
 
         Raises
         ------
@@ -65,10 +70,9 @@ def gaussian_relightable() -> type:
         @guest()  # a thread of Mitsuba, whose caller may hold the lock
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
-            path = properties.path(props, "model")
-            lights = Relightable.load(path, backend_of(mi.variant())).table
+            lights, self.brightest, planes = properties.lit_planes(props)
             self.scale = dr.opaque(mi.Float, properties.light_scale(props))
-            self.planes = texture(_properties_of_planes(path, props))
+            self.planes = texture(planes)
             properties.check_known(props)
             table = lights.at(directions(RESOLUTION)).reshape(RESOLUTION, RESOLUTION, -1)
             self.factors = mi.Texture2f(
@@ -84,6 +88,10 @@ def gaussian_relightable() -> type:
             callback.put("planes", self.planes, mi.ParamFlags.Differentiable)
             callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
 
+        def parameters_changed(self, keys: list[str]) -> None:
+            if "scale" in keys:
+                properties.check_scale(self.scale, self.planes.plugin)
+
         # --- Values --------------------------------------------------------------------------
 
         # Mitsuba calls these while it records a program, see `GaussianTexture`.
@@ -98,11 +106,18 @@ def gaussian_relightable() -> type:
             active = active & self._seen(ctx, si, wo)
             values = self.planes.values(si, active)[: self.planes.channels]  # two get a third
             planes = [*values, mi.Float(1)]
-            table = self.factors.eval(place_of(light_of(si, wo)), active)
+            towards, scale = wo, self.scale / math.pi
+            if ctx.mode == mi.TransportMode.Importance:  # a path from the light to the camera
+                cos_theta = mi.Frame3f.cos_theta
+                scale *= cos_theta(wo) / dr.select(active, cos_theta(si.wi), 1)
+                towards = si.wi
+            x, y = light_axes(si, self.planes)
+            light = mi.Vector3f(dr.dot(x, towards.xy), dr.dot(y, towards.xy), towards.z)
+            table = self.factors.eval(place_of(light), active)
             factors = [table[c * len(planes) : (c + 1) * len(planes)] for c in range(3)]
             codes = [sum(f * p for f, p in zip(fs, planes, strict=True)) for fs in factors]
-            light = mi.Color3f(*RGB.to_lights(codes)) * (self.scale / math.pi)
-            return unpolarized(dr.select(active, self._spectrum(light, si), 0))
+            color = mi.Color3f(*(to_linear(clamp(code, self.brightest)) for code in codes)) * scale
+            return unpolarized(dr.select(active, self._spectrum(color, si), 0))
 
         @collector_off()
         def pdf(
@@ -156,25 +171,35 @@ def gaussian_relightable() -> type:
     return GaussianRelightable
 
 
-def _properties_of_planes(path: str, props: mi.Properties) -> mi.Properties:
-    """Return the properties of the texture of the planes: a channel for each."""
-    texture = mi.Properties("gaussian_texture")
-    texture.set_id(props.id())
-    texture["planes"], texture["raw"] = path, True
-    for key in ("wrap_mode", "to_uv", "prefilter", "memory"):
-        if key in props:
-            texture[key] = props[key]
-    return texture
+def light_axes(si: mi.SurfaceInteraction3f, planes: Texture) -> tuple[mi.Vector2f, mi.Vector2f]:
+    """Return the axes x and y of photos on a surface, in the first two axes of its shading frame.
 
+    With B, the derivative of uv by the place in the photo, columns of the photo grow along
+    ``ex = dp_du B00 + dp_dv B10`` and its rows along ``ey = dp_du B01 + dp_dv B11``. Then x has the
+    direction of ex, and y is perpendicular to it on the side against ey. So directions keep
+    their angles where uv shears the photo or scales it unequally.
 
-def light_of(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Vector3f:
-    """Return a local direction in the axes of photos: x along u, y against v, z along the normal.
-
-    The first axis of the shading frame goes along u. Its second one goes along v, or against it
-    where uv is mirrored.
+    The first axis of the frame goes along u, but inside of a ``bumpmap`` of Mitsuba 3.9, which
+    mixes axes of the world with those of its own frame.
     """
-    along = dr.dot(si.dp_dv, si.sh_frame.t)
-    return mi.Vector3f(wo.x, -dr.mulsign(wo.y, along), wo.z)
+    (_, slope_x), (_, slope_y), _ = planes.point(si.uv)  # against uv in mirrored copies
+    transposed = planes.transform.inverse_transpose
+    (b00, b01), (b10, b11) = ([transposed[j, i] for j in range(2)] for i in range(2))
+    normal = dr.cross(si.dp_du, si.dp_dv)
+    v_side = dr.dot(normal, si.sh_frame.n)
+    across = dr.mulsign(dr.sqrt(dr.maximum(dr.squared_norm(normal), TINY)), v_side)
+    along = mi.Vector2f(
+        dr.squared_norm(si.dp_du) * b00 + dr.dot(si.dp_du, si.dp_dv) * b10, across * b10
+    )
+    square = dr.squared_norm(along)
+    unit = along * rsqrt(dr.maximum(square, TINY))
+    x = dr.mulsign(dr.select(square > TINY, unit, mi.Vector2f(1, 0)), slope_x)
+    mirrored = dr.mulsign(dr.mulsign((b00 * b11 - b01 * b10) * v_side, slope_x), slope_y)
+    return x, dr.mulsign(mi.Vector2f(x.y, -x.x), mirrored)
+
+
+TINY = 1e-30
+"""Square of a length that counts as 0: uv that is constant along a surface has no direction."""
 
 
 def place_of(light: mi.Vector3f) -> mi.Point2f:

@@ -44,8 +44,8 @@ def gaussian_texture() -> type:
         coefficients : tensor (C, k), default: 0
             Of the `model` of a family; 0 is the mean image.
         light : vector, default: (0, 0, 1)
-            Of a `model` of lights: towards the light, of any length; x along u, y against v, z
-            towards the camera.
+            Of a `model` of lights: towards the light, of any length; x to the right of the photo,
+            y up, z towards the camera.
         mean : tensor (N, 2)
             x, y in pixels.
         factor : tensor (N, 3)
@@ -86,7 +86,7 @@ def gaussian_texture() -> type:
 
         def parameters_changed(self, keys: list[str]) -> None:
             if not keys or "to_uv" in keys:
-                properties.check_invertible(self.to_uv)
+                properties.check_invertible(self.to_uv, self.plugin)
                 self.transform = mi.Transform3f(self.to_uv)
                 dr.make_opaque(self.transform)  # another transform compiles no other programs
             super().parameters_changed(keys)

@@ -19,13 +19,13 @@ from .versions import Texture
 
 @door
 def resident_bytes(texture: Texture) -> int:
-    """Return the bytes of the arrays that a texture or an environment holds between renderings.
+    """Return the bytes of the arrays that a plugin holds between renderings.
 
     Parameters
     ----------
-    texture : mitsuba.Texture or mitsuba.Emitter
-        A ``gaussian_texture`` or ``gaussian_environment``, or another plugin, such as a ``bitmap``
-        or an ``envmap``.
+    texture : mitsuba.Texture, mitsuba.Emitter or mitsuba.BSDF
+        A ``gaussian_texture``, ``gaussian_environment`` or ``gaussian_relightable``, or another
+        plugin, such as a ``bitmap`` or an ``envmap``.
 
     Returns
     -------
@@ -54,6 +54,9 @@ def resident_bytes(texture: Texture) -> int:
         if isinstance(value, Emission):
             sampled += value.bytes
             continue
+        if isinstance(value, mi.Texture2f):
+            sampled += _texel_bytes(value.tensor())
+            continue
         for array in (value, dr.grad(value)) if dr.grad_enabled(value) else (value,):
             arrays[indices_of([dr.detach(array)])] = dr.width(array) * dr.itemsize_v(array)
     return sum(arrays.values()) + sampled
@@ -73,14 +76,14 @@ def _table_bytes(envmap: mi.Emitter) -> int:
     return round(7 / 3 * rows * (columns - 1)) * dr.itemsize_v(mi.Float)
 
 
-def _walk(tree: Any, seen: dict[int, Any]) -> Iterator[DrJitArray | Emission]:
-    """Yield the flat arrays of Dr.Jit in objects and collections, and the distributions."""
+def _walk(tree: Any, seen: dict[int, Any]) -> Iterator[DrJitArray | Emission | mi.Texture2f]:
+    """Yield the flat arrays of Dr.Jit in objects and collections, distributions and tables."""
     if tree is None or isinstance(tree, type | str) or id(tree) in seen:
         return
     seen[id(tree)] = tree  # rows are made on demand: a freed one would pass its id on
     if dr.is_tensor_v(tree):
         tree = tree.array
-    if isinstance(tree, Emission) or (dr.is_jit_v(tree) and dr.depth_v(tree) == 1):
+    if isinstance(tree, Emission | mi.Texture2f) or (dr.is_jit_v(tree) and dr.depth_v(tree) == 1):
         yield tree
     else:
         inner = vars(tree) if hasattr(tree, "__dict__") else tree

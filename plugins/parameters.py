@@ -31,7 +31,7 @@ from eigengs_dr.gaussian.gaussians import (
 )
 from eigengs_dr.raster.parameters import EXP2_SCALE, KernelParameters
 from eigengs_dr.raster.render import decode_parameters
-from eigengs_dr.relight.model import Relightable
+from eigengs_dr.relight.model import Relightable, or_camera
 
 from .emission import outside_of_recordings
 
@@ -62,6 +62,49 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     >>> bsdf = mi.load_dict({"type": "diffuse", "reflectance": texture_of(g, wrap_mode="clamp")})
     """
     return plugin_of("gaussian_texture", gaussians, **properties)
+
+
+@door
+def material_of(model: Relightable, **properties: object) -> Record:
+    """Return a model of lights as the dictionary of a ``gaussian_relightable``.
+
+    Parameters
+    ----------
+    model : Relightable
+        The dictionary for `mitsuba.load_dict` holds it: no file is needed.
+    **properties
+        Other properties of the material: ``scale``, ``wrap_mode``, ``to_uv``, ``prefilter``,
+        ``memory``. None stands for the default.
+
+    Returns
+    -------
+    dict
+        The planes as of `texture_of`, the table of lights, and the other properties.
+
+    Raises
+    ------
+    TypeError
+        If it is no model of lights.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg, mitsuba as mi
+    >>> from eigengs_dr.plugins import material_of
+    >>> model = eg.Relightable.load("coin.npz")  # doctest: +SKIP
+    >>> coin = {"type": "rectangle", "bsdf": material_of(model, scale=2)}  # doctest: +SKIP
+    """
+    if not isinstance(model, Relightable):
+        raise TypeError(f"material_of takes a Relightable, not {type(model).__name__}")
+    table = model.table
+    arrays = {"lights": table.lights, "values": table.values}
+    return {
+        **plugin_of("gaussian_relightable", model.planes),
+        **{name: upload(mi.TensorXf, np.float32(array)) for name, array in arrays.items()},
+        "kind": table.kind,
+        "smoothing": table.smoothing,
+        "brightest": model.brightest,
+        **given(properties),
+    }
 
 
 def plugin_of(plugin: str, gaussians: Gaussians | Fitted, **properties: object) -> Record:
@@ -408,7 +451,7 @@ class TextureParameters:
             if self.weights:
                 return self._reconstruct(inputs["coefficients"])
             if self.lit:
-                return self.lit.relight(_direction(inputs["light"]))
+                return self.lit.relight(or_camera(inputs["light"]))
             return from_tensors(inputs, self.start)
         except ValueError as error:
             raise ValueError(f"parameters of Gaussians: {error}") from error
@@ -430,12 +473,6 @@ class TextureParameters:
             last = dr.gather(types.Float, change, types.UInt(count))
             background.append(start.background[channel] + last)
         return replace(start, color=types.FloatX(colors), background=types.FloatX(background))
-
-
-def _direction(light: Any) -> Any:
-    """Return a light that an optimiser may have spoilt, or the light of the camera."""
-    length = dr.squared_norm(light)
-    return dr.select(dr.isfinite(length) & (length > 0), light, type(light)(0, 0, 1))
 
 
 def read_planes(path: str, backend: str | None) -> Gaussians:

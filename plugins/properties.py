@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -15,7 +16,9 @@ from eigengs_dr.gaussian.file import MAX_CUTOFF
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
-from eigengs_dr.relight.model import Relightable, holds_lights
+from eigengs_dr.relight.lights import LightTable, check_table
+from eigengs_dr.relight.model import Relightable, check_brightest, holds_lights
+from eigengs_dr.storage.npz import BadValue
 
 from .lookup import MEMORIES, Memory
 from .parameters import (
@@ -29,6 +32,10 @@ from .parameters import (
 
 FILES = ("filename", "model", "planes")
 """Properties that name the file of the Gaussians."""
+
+PLANES = (*FIELDS, "width", "height", "space", "cutoff")
+PLANES += ("wrap_mode", "to_uv", "prefilter", "memory")
+"""Properties of a ``gaussian_relightable`` that are those of the texture of its planes."""
 
 UP = (0.0, 0.0, 1.0)
 """Default light of a relightable model: from the camera."""
@@ -108,6 +115,45 @@ def source_of(props: mi.Properties) -> TextureParameters:
     return source
 
 
+def lit_planes(props: mi.Properties) -> tuple[LightTable, float, mi.Properties]:
+    """Read the model of a ``gaussian_relightable``: ``model``, or the arrays of `material_of`.
+
+    Returns
+    -------
+    table : LightTable
+    brightest : float
+    planes : mitsuba.Properties
+        Those of the texture of its planes, a channel for each.
+
+    Raises
+    ------
+    ValueError
+        If a file or an array is invalid.
+    """
+    plugin = props.plugin_name()
+    planes = mi.Properties(plugin)
+    planes.set_id(props.id())
+    planes["raw"] = True
+    if "lights" not in props:
+        planes["planes"] = path(props, "model")
+        model = Relightable.load(planes["planes"], backend_of(mi.variant()))
+        table, brightest = model.table, model.brightest
+    else:
+        lights, values, color = (np.array(props[key]) for key in ("lights", "values", "color"))
+        smoothing = _read(props, "smoothing", 0.0, float, "a number")
+        table = LightTable(lights, values, str(props.get("kind", "")), smoothing)
+        brightest = _read(props, "brightest", 1.0, float, "a number")
+        try:
+            table = check_table(table, color.shape[-1])
+            check_brightest(brightest)
+        except BadValue as error:
+            raise ValueError(f"{plugin}: {error}") from None
+    for key in PLANES:
+        if key in props:
+            planes[key] = props[key]
+    return table, brightest, planes
+
+
 def _from_arrays(props: mi.Properties, backend: str | None) -> Gaussians:
     """Read a set from the properties of `texture_of`."""
     missing = [key for key in (*FIELDS, "width", "height", "space") if key not in props]
@@ -123,7 +169,8 @@ def _from_arrays(props: mi.Properties, backend: str | None) -> Gaussians:
 
 def path(props: mi.Properties, key: str) -> str:
     """Return the path of a file by Mitsuba's resolver, which also looks beside the scene."""
-    return str(mi.file_resolver().resolve(props[key]))
+    name = _read(props, key, None, str, "the path of a file")
+    return str(mi.file_resolver().resolve(name))
 
 
 def file_name(props: mi.Properties) -> str:
@@ -175,6 +222,25 @@ def light_scale(props: mi.Properties) -> float:
     return value
 
 
+def number_of(array: mi.Float, name: str, plugin: str) -> float:
+    """Return the number that a parameter holds; raise `ValueError` if it holds none or several."""
+    numbers = dr.detach(array).numpy().tolist()
+    if len(numbers) != 1:
+        raise ValueError(f"{plugin}: {name} holds {len(numbers)} numbers; it must hold one")
+    return float(numbers[0])
+
+
+def check_scale(scale: mi.Float, plugin: str) -> None:
+    """Raise `ValueError` if a factor of light that has changed is not one, see `light_scale`.
+
+    A frozen function, in which numbers cannot be read, is not checked.
+    """
+    if not dr.flag(dr.JitFlag.FreezingScope):
+        value = number_of(scale, "scale", plugin)
+        if not 0 <= value < math.inf:
+            raise ValueError(f"{plugin}: scale is {value}; it must be finite, and at least 0")
+
+
 def check_light(gaussians: Gaussians, plugin: str) -> None:
     """Raise `ValueError` if a set is not light from all directions."""
     if gaussians.channels not in (1, 3) or not gaussians.space.is_color:
@@ -191,7 +257,10 @@ def check_light(gaussians: Gaussians, plugin: str) -> None:
 
 def check_rotation(transform: mi.AffineTransform4f) -> None:
     """Raise `ValueError` if a transform of directions is not a rotation, perhaps mirrored."""
-    matrix = np.array(transform.matrix, np.float64).reshape(4, 4)[:3, :3]
+    matrix = np.array(transform.matrix, np.float64)
+    if matrix.size != 16:
+        raise ValueError("gaussian_environment: to_world holds several transforms; give one")
+    matrix = matrix.reshape(4, 4)[:3, :3]
     if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
         raise ValueError(
             "gaussian_environment: to_world scales or shears directions; it must be a rotation"
@@ -219,7 +288,7 @@ def wrap_mode(props: mi.Properties) -> str:
     wrap = str(props.get("wrap_mode", "repeat"))
     if wrap not in WRAPS:
         raise ValueError(
-            f"gaussian_texture: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
+            f"{props.plugin_name()}: wrap_mode {wrap!r} is unknown; use one of {', '.join(WRAPS)}"
         )
     return wrap
 
@@ -249,17 +318,17 @@ def to_uv(props: mi.Properties) -> mi.ScalarTransform3f:
     if matrix.ndim == 3:  # of arrays of Dr.Jit
         if matrix.shape[2] != 1:
             raise ValueError(
-                f"gaussian_texture: to_uv holds {matrix.shape[2]} transforms; it must hold one"
+                f"{props.plugin_name()}: to_uv holds {matrix.shape[2]} transforms; it must hold one"
             )
         matrix = matrix[..., 0]
     rows = [[*row[:2], row[-1]] for row in matrix[:2]]
     return mi.ScalarTransform3f([*rows, [0, 0, 1]])
 
 
-def check_invertible(transform: mi.ScalarTransform3f) -> None:
+def check_invertible(transform: mi.ScalarTransform3f, plugin: str) -> None:
     """Raise `ValueError` if a transform of uv is not finite, or maps the plane to a line."""
     matrix = np.array(transform.matrix, np.float64)
     linear = matrix[:2, :2]
     area, size = abs(np.linalg.det(linear)), np.square(linear).sum()
     if not (np.isfinite(matrix).all() and area > 1e-9 * size):
-        raise ValueError("gaussian_texture: to_uv maps the plane to a line; it must be invertible")
+        raise ValueError(f"{plugin}: to_uv maps the plane to a line; it must be invertible")

@@ -125,7 +125,8 @@ def plugin_of_sums(base: type) -> Any:
 
         def _set_prefilter(self) -> None:
             """Take over the parameter ``prefilter``, which may switch footprints on or off."""
-            angle = properties.check_angle(float(dr.slice(self.prefilter)), self.plugin)
+            angle = properties.number_of(self.prefilter, "prefilter", self.plugin)
+            properties.check_angle(angle, self.plugin)
             filtered, self.angle, self.sensor, self.follows = self.filtered(), angle, None, False
             if filtered != self.filtered():
                 self._take_over(True)

@@ -14,8 +14,9 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
-from ..backend.arrays import types_of
+from ..backend.arrays import ArrayTypes, types_of
 from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.types import ArrayLike, Doubles, Rows
@@ -26,13 +27,15 @@ from ..gaussian.file import ARRAYS, SetData, check, file_errors, read_set
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats
+from ..image.pixels import encoding_of
+from ..image.read import is_picture
 from ..image.resize import resample
 from ..image.space import DATA, LINEAR, RGB
 from ..raster.render import render
 from ..storage import npz
 from ..storage.npz import BadValue, Field
 from .fit import find_planes, fit_planes, most_planes, read_photos
-from .lights import KINDS, MAX_LIGHTS, LightTable, check_lights, check_table
+from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
 FORMAT, VERSION = "eigengs_dr.relightable", 1
 
@@ -46,6 +49,9 @@ LAYOUT: dict[str, Field] = ARRAYS | {
     "psnr_held_out": Field("f8", 0),
 }
 """Arrays of a file."""
+
+BRIGHTEST = {"brightest": Field("f8", 0)}
+"""An array that older files lack."""
 
 
 @class_of_doors
@@ -62,6 +68,9 @@ class Relightable:
     psnr_held_out : float
         Mean PSNR in dB, in sRGB, of photos that were left out: from planes of the others, before
         they become Gaussians. The peak is white, also for photos of brighter light.
+    brightest : float
+        The largest code of the photos, at least 1: codes above 1 are light above white, by the same
+        curve. What exceeds it is clamped in scenes and in environments.
 
     Notes
     -----
@@ -74,6 +83,7 @@ class Relightable:
     planes: Gaussians
     table: LightTable
     psnr_held_out: float = float("nan")
+    brightest: float = 1.0
 
     @classmethod
     @shows_progress
@@ -133,10 +143,11 @@ class Relightable:
         most = most_planes(len(read.lights))
         if planes is not None and not 1 <= planes <= most:
             raise ValueError(f"planes is {planes}; {len(read.lights)} photos have 1 to {most}")
+        brightest = max(1.0, float(read.rows.max()))
         found = find_planes(read, planes)
         del read  # the photos take more memory than the fit
         result = fit_planes(found.images, gaussians, iterations, seed, backend, progress)
-        model = cls(result.gaussians, found.table, found.psnr_held_out)
+        model = cls(result.gaussians, found.table, found.psnr_held_out, brightest)
         if result.stopped == "interrupted":
             raise Interrupted(model, "the fit was interrupted; .result holds the model so far")
         return model
@@ -174,19 +185,22 @@ class Relightable:
         Raises
         ------
         ValueError
-            If numbers are no direction above the horizon. A vector of Dr.Jit is not checked: an
-            optimiser may pass below the horizon for a step.
+            If numbers are no direction above the horizon, or an environment has another shape, or
+            light below 0. A vector of Dr.Jit may be below the horizon, as an optimiser may leave it
+            there for a step. Where it must be computed first, as in a frozen function, one that is
+            no direction stands for the light of the camera, (0, 0, 1).
+        TypeError
+            If it is neither a direction nor an environment.
         """
-        if dr.is_tensor_v(light) and light.ndim > 1:
-            light = light.numpy()
-        is_path = isinstance(light, (str, os.PathLike))
-        if is_path or (not dr.is_array_v(light) and np.ndim(light) > 1):
-            return self._under(light)
         planes, types = self.planes, types_of(self.planes.mean)
         if dr.is_array_v(light):
-            direction = [types.Float(v) for v in light]
+            if dr.is_tensor_v(light) and light.ndim > 1:
+                return self._under(_numbers_of(light.numpy()))
+            direction = _vector_of(light, types)
+        elif isinstance(light, (str, os.PathLike)) or _numbers_of(light).ndim > 1:
+            return self._under(light)
         else:
-            [numbers] = check_lights(np.asarray(light, np.float64)[None], "light").tolist()
+            [numbers] = check_lights(_numbers_of(light)[None], "light").tolist()
             direction = [dr.opaque(types.Float, v) for v in numbers]
         factors = self.table.factors(types, direction)
 
@@ -209,7 +223,7 @@ class Relightable:
         for factors, light in zip(self.table.at(lights).astype(np.float32), radiance, strict=True):
             if light.any():
                 codes = shown @ factors[:, :-1].T + factors[:, -1]
-                total += to_linear(np.maximum(codes, 0)) * light.astype(np.float32)
+                total += to_linear(np.clip(codes, 0, self.brightest)) * light.astype(np.float32)
         space = LINEAR.above_white if total.max() > 1 else LINEAR
         start = with_colors(self.planes, np.zeros((len(self.planes) + 1, 3)), space)
         return solve(start, Pixels.plain(total, start, space.weight(total)))
@@ -226,6 +240,7 @@ class Relightable:
             "kind": np.array(table.kind),
             "smoothing": np.array(table.smoothing, np.float64),
             "psnr_held_out": np.array(self.psnr_held_out, np.float64),
+            "brightest": np.array(self.brightest, np.float64),
         }
         npz.write(path, FORMAT, VERSION, arrays)
 
@@ -244,7 +259,8 @@ class Relightable:
         with file_errors(Path(path)):
             if packed.is_packed(path):
                 return cls(*_read_packed(Path(path), backend))
-            members = npz.read(path, FORMAT, VERSION, LAYOUT)
+            layout = LAYOUT | (BRIGHTEST if "brightest" in npz.sizes_of(path) else {})
+            members = npz.read(path, FORMAT, VERSION, layout)
             parts = {name: members[name] for name in ARRAYS}
             size = tuple(members["size"].tolist())
             data = check(SetData(parts, size, DATA, float(members["cutoff"])))
@@ -255,7 +271,56 @@ class Relightable:
                 float(members["smoothing"]),
             )
             table = check_table(table, data.arrays["color"].shape[1])
-            return cls(Gaussians.from_data(data, backend), table, float(members["psnr_held_out"]))
+            figures = [float(members.get(name, 1)) for name in ("psnr_held_out", "brightest")]
+            check_brightest(figures[1])
+            return cls(Gaussians.from_data(data, backend), table, *figures)
+
+
+def check_brightest(code: float) -> float:
+    """Return the largest code of photos; raise `BadValue` if it is none."""
+    if not 1 <= code <= MAX_FACTOR:
+        raise BadValue(f"brightest is {code}, expected 1 to {MAX_FACTOR:g}")
+    return code
+
+
+GIVE = "give one direction, three numbers as lights[0], or an environment: an image (h, w, 3)"
+
+
+def _numbers_of(light: Any) -> NDArray[Any]:
+    """Return a direction, or the pixels of an environment, as an array of real numbers."""
+    try:
+        array = np.asarray(light)
+    except (ValueError, RuntimeError):  # rows of unequal length
+        array = np.array(None)
+    if array.ndim == 0 or array.dtype.kind not in "biuf":
+        raise TypeError(f"light is of type {type(light).__name__}; {GIVE} or its path")
+    if array.ndim != 3 and array.shape != (3,):
+        raise ValueError(f"light has shape {array.shape}; {GIVE} or its path")
+    return array
+
+
+def _vector_of(light: Any, types: ArrayTypes) -> list[Any]:
+    """Return the components of a vector of Dr.Jit; `ValueError` if they are known to be none."""
+    shape = dr.shape(light)
+    if shape not in ((3,), (3, 1)):
+        raise ValueError(f"light has shape {shape}; {GIVE}")
+    if len(shape) == 1:  # a tensor, or a flat array
+        flat = light.array if dr.is_tensor_v(light) else light
+        light = dr.unravel(types.Float3, types.Float(flat))
+    vector = types.Float3([types.Float(v) for v in light])
+    recorded = dr.flag(dr.JitFlag.SymbolicScope) or dr.flag(dr.JitFlag.FreezingScope)
+    without_program = (dr.VarState.Literal, dr.VarState.Evaluated)
+    if not recorded and all(v.state in without_program for v in vector):
+        numbers = [dr.detach(v)[0] for v in vector]
+        if not (np.isfinite(numbers).all() and any(numbers)):
+            raise ValueError(f"light is {numbers}, which is no direction")
+    return list(or_camera(vector))
+
+
+def or_camera(light: Any) -> Any:
+    """Return a light that an optimiser may have spoilt, or the light of the camera."""
+    length = dr.squared_norm(light)
+    return dr.select(dr.isfinite(length) & (length > 0), light, type(light)(0, 0, 1))
 
 
 def holds_lights(path: str | os.PathLike[str]) -> bool:
@@ -279,13 +344,22 @@ def environment_lights(environment: object) -> tuple[Doubles, Doubles]:
     ----------
     environment : array_like, shape (h, w, 3), or path-like
         Latitudes and longitudes, as an ``envmap`` of Mitsuba: the first row is up (y), and the
-        middle column is behind the camera (z). Files of floats and arrays hold linear light.
+        middle column is behind the camera (z). Arrays hold linear light; files, bitmaps of Mitsuba
+        and pictures know their encoding.
     """
-    is_file = isinstance(environment, (str, os.PathLike))
-    pixels, encoding = read_floats(environment, encoding=None if is_file else "linear")
+    told = isinstance(environment, (str, os.PathLike)) or is_picture(environment)
+    encoding = None if told else encoding_of(environment) or "linear"
+    pixels, encoding = read_floats(environment, encoding=encoding)
     light = to_linear(pixels) if encoding == "srgb" else pixels
+    if light.min() < 0:
+        raise ValueError(
+            f"environment: light is {light.min():g} somewhere; it must be at least 0, as after "
+            "numpy.maximum(sky, 0)"
+        )
     width, height = ENVIRONMENT_SIZE
-    average = np.asarray(resample(light, width, height), np.float64)
+    if len(light) > 1:  # the outermost rows have half the height of the others
+        light = np.repeat(resample(light, width, len(light)), 2, axis=0)[1:-1]
+    average = np.maximum(resample(light, width, height), 0).astype(np.float64)
     polar = np.pi * (np.arange(height) + 0.5) / height
     turn = 2 * np.pi * (np.arange(width) + 0.5) / width
     ring, up = np.sin(polar)[:, None], np.cos(polar)[:, None]
@@ -300,14 +374,18 @@ def environment_lights(environment: object) -> tuple[Doubles, Doubles]:
 _HEAD = struct.Struct("<BBHfd")
 """Kind, planes, lights, smoothing, and the PSNR of left-out lights."""
 
+_BRIGHTEST = struct.Struct("<f")
+"""The largest code of photos."""
+
 
 def table_bytes(model: Relightable) -> bytes:
     """Return the table of a model for an ``.egs`` file: 16 bits per coordinate, 8 per factor.
 
     It has the kind and K, the number of planes, both uint8; n, the number of lights, uint16; the
     smoothing, float32; the PSNR of left-out photos, float64; K + 1 scales, float32; directions,
-    (n, 3) int16 over 32767; and values, (n, 3, K + 1) int8 times the scales. Rounding is 40 dB
-    below the contrast of the photos.
+    (n, 3) int16 over 32767; values, (n, 3, K + 1) int8 times the scales; and where photos are
+    brighter than white their largest code, float32. Rounding is 40 dB below the contrast of the
+    photos.
     """
     table, planes = model.table, model.planes.channels
     head = _HEAD.pack(
@@ -316,10 +394,11 @@ def table_bytes(model: Relightable) -> bytes:
     scale = (np.abs(table.values).max(axis=(0, 1), initial=1e-6) / 127).astype("<f4")
     lights = np.round(table.lights * 32767).astype("<i2")
     values = np.round(table.values / scale).astype(np.int8)
-    return head + scale.tobytes() + lights.tobytes() + values.tobytes()
+    brightest = _BRIGHTEST.pack(model.brightest) if model.brightest > 1 else b""
+    return head + scale.tobytes() + lights.tobytes() + values.tobytes() + brightest
 
 
-def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable, float]:
+def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable, float, float]:
     """Read the parts of a model from an ``.egs`` file."""
     content = packed.read_head(path)[1]
     if not content:
@@ -329,12 +408,14 @@ def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable
         raise BadValue("the table of lights is truncated; copy the file again")
     kind, planes, count, smoothing, psnr = _HEAD.unpack_from(content)
     sizes = [4 * (planes + 1), 6 * count, 3 * (planes + 1) * count]
-    if len(content) != _HEAD.size + sum(sizes) or planes != data.arrays["color"].shape[1]:
+    rest = len(content) - _HEAD.size - sum(sizes)
+    if rest not in (0, _BRIGHTEST.size) or planes != data.arrays["color"].shape[1]:
         raise BadValue("the table of lights has another size; copy the file again")
     ends = (_HEAD.size + np.cumsum(sizes)).tolist()
     scale = np.frombuffer(content[_HEAD.size : ends[0]], "<f4").astype(np.float64)
     lights = np.frombuffer(content[ends[0] : ends[1]], "<i2").reshape(count, 3) / 32767
-    rounded = np.frombuffer(content[ends[1] :], np.int8).reshape(count, 3, planes + 1)
+    rounded = np.frombuffer(content[ends[1] : ends[2]], np.int8).reshape(count, 3, planes + 1)
     name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
     table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
-    return Gaussians.from_data(data, backend), table, psnr
+    brightest = check_brightest(_BRIGHTEST.unpack_from(content, ends[2])[0] if rest else 1.0)
+    return Gaussians.from_data(data, backend), table, psnr, brightest
