@@ -76,7 +76,10 @@ def sum_prefiltered(
     total = sum_range(sizes.cells, ends, packed, *near, terms)
     rest = active & ~listed
     part = where_any(
-        rest, lambda: _sum_copies(sizes, packed, x, y, footprint, bounds, rest), packed
+        rest,
+        lambda: _sum_copies(sizes, packed, x, y, footprint, bounds, rest),
+        [types_of(x).Float(0)] * packed.channels,
+        (packed.values, x, y),
     )
     return [t + p for t, p in zip(total, part, strict=True)]
 
@@ -96,7 +99,7 @@ def _shortest_list(
 
 
 def where_any(
-    active: Bool, compute: Callable[[], list], packed: Packed, others: list | None = None
+    active: Bool, compute: Callable[[], list], others: list, inputs: tuple[Float, ...]
 ) -> list:
     """Return values that few points need, and skip the work for packets of lanes without one.
 
@@ -105,17 +108,17 @@ def where_any(
     active : Bool
         The points that need the values.
     compute : callable
-        Returns the values, by default one for each channel.
-    packed : Packed
-        Parameters. With gradients nothing is skipped: Dr.Jit cannot carry them out of the branch.
-    others : list of Float, optional
-        The values of other points, by default 0.
+        Returns the values.
+    others : list of Float
+        The values of other points.
+    inputs : tuple of Float
+        All that `compute` reads and that may have derivatives. If one of them has, nothing is
+        skipped: Dr.Jit cannot carry derivatives out of the branch.
     """
-    if dr.grad_enabled(packed.values):
+    if dr.grad_enabled(inputs):
         return compute()
-    rest = others or [types_of(packed.values).Float(0)] * packed.channels
     return list(
-        dr.if_stmt((), active, lambda: tuple(compute()), lambda: tuple(rest), mode="symbolic")
+        dr.if_stmt((), active, lambda: tuple(compute()), lambda: tuple(others), mode="symbolic")
     )
 
 
@@ -282,8 +285,8 @@ def _sum_copies(
         (part,) = where_any(
             crosses,
             lambda: [_share(sizes, shape, metric, (i, j), (px, py), center)],
-            packed,
             [types.Float(1)],
+            (packed.values, x, y),
         )
         w = dr.select(here, w * amplitude * part, 0)
         sums = [dr.fma(w, c, s) for c, s in zip(color, sums, strict=True)]
