@@ -315,7 +315,7 @@ def sum_over_footprint(
         wide,
         lambda: sum_pyramid(pyramid, x, y, footprint, wide),
         [mi.Float(0)] * pyramid.channels,
-        (pyramid.values, x, y),
+        (pyramid.values, x, y, *footprint),
     )
     sums = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
     return [dr.select(blind, m, s) for m, s in zip(table.average, sums, strict=True)]

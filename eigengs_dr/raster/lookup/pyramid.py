@@ -176,8 +176,7 @@ def sum_pyramid(
     x, y : Float
         Centre of the footprint in the image, in pixels.
     footprint : list of 3 Float
-        xx, xy, yy of the covariance, in pixels squared; `is_minified` must hold; not
-        differentiated.
+        xx, xy, yy of the covariance, in pixels squared; `is_minified` must hold.
     active : Bool
 
     Returns
@@ -186,7 +185,7 @@ def sum_pyramid(
         One sum for each channel.
     """
     types = types_of(lattice.scale)
-    xx, xy, yy = footprint = dr.detach(footprint)
+    xx, xy, yy = footprint
     first, nx, ny, dx, dy = _pick(types, lattice.levels, extreme_variances(footprint)[0])
     pad = lattice.levels[0].pad
     # In spacings of the level; the values are already blurred by SAMPLE_DEVIATION^2.
@@ -197,8 +196,8 @@ def sum_pyramid(
     determinant = dr.maximum(dr.fma(xx, yy, -xy * xy), 1e-6)
     steep = rcp(determinant) * (STEEPNESS / LN2 / SAMPLE_REACH**2)
     inverse = [k * steep for k in (yy, -2 * xy, xx)]
-    lean, free = xy * rcp(yy), determinant * rcp(yy)
-    reach = SAMPLE_REACH * dr.sqrt(yy)
+    lean, free, upright = dr.detach([xy * rcp(yy), determinant * rcp(yy), yy])
+    reach = SAMPLE_REACH * dr.sqrt(upright)
     last, fall = STEEPNESS / LN2, LIFT + math.exp(-STEEPNESS)
     mass = -math.expm1(-STEEPNESS) / STEEPNESS + LIFT / 2 - fall / 3
     scale = rsqrt(determinant) * (1 / (math.pi * SAMPLE_REACH**2 * mass))
@@ -206,16 +205,16 @@ def sum_pyramid(
     def row_of(j: UInt) -> tuple:
         """Return the columns [i, stop] of the ellipse in one row of points."""
         down = types.Float(j) - dr.detach(v)
-        half = dr.safe_sqrt(free * (SAMPLE_REACH**2 - down * down * rcp(yy)))
+        half = dr.safe_sqrt(free * (SAMPLE_REACH**2 - down * down * rcp(upright)))
         middle = dr.fma(lean, down, dr.detach(u))
         return types.Int(dr.ceil(middle - half)), types.Int(dr.floor(middle + half))
 
-    def add(i: UInt, stop: UInt, j: UInt, u: Float, v: Float, sums: list) -> tuple:
+    def add(i: UInt, stop: UInt, j: UInt, u: Float, v: Float, inverse: list, sums: list) -> tuple:
         here = i <= stop
         across, down = types.Float(i) - u, types.Float(j) - v
         q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
         q = dr.clip(q, 0, last)
-        w = dr.fma(q, dr.fma(-fall / last**2, q, LIFT / last), falloff(q)) * scale
+        w = dr.fma(q, dr.fma(-fall / last**2, q, LIFT / last), falloff(q))
         wrap_x, wrap_y = axes_of(lattice.wrap)
         column, row = _fold(types, i, nx, wrap_x), _fold(types, j, ny, wrap_y)
         point = first + row * types.UInt(nx + 2 * pad) + column
@@ -225,20 +224,20 @@ def sum_pyramid(
         ran = i > stop
         j = dr.select(ran, j + 1, j)
         begin, end = row_of(j)
-        return dr.select(ran, begin, i), dr.select(ran, end, stop), j, u, v, sums
+        return dr.select(ran, begin, i), dr.select(ran, end, stop), j, u, v, inverse, sums
 
     bottom = types.Int(dr.select(active, dr.floor(dr.detach(v) + reach), -(2.0**30)))
     j = types.Int(dr.ceil(dr.detach(v) - reach))
     i, stop = row_of(j)
     sums = dr.while_loop(
-        (i, stop, j, u, v, [types.Float(0) for _ in range(lattice.channels)]),
+        (i, stop, j, u, v, inverse, [types.Float(0) for _ in range(lattice.channels)]),
         lambda i, stop, j, *rest: j <= bottom,
         add,
         label="sum pyramid",
         mode="symbolic",
         max_iterations=-1,
     )[-1]
-    return [lattice.scale * s for s in sums]
+    return [lattice.scale * scale * s for s in sums]
 
 
 def _pick(types: ArrayTypes, levels: tuple[Level, ...], smallest: Float) -> list:
