@@ -252,8 +252,10 @@ def reused(
     list of Float
         Never shared where there are gradients: they must not cross `drjit.isolate_grad`.
     """
+    if not _is_traced():
+        return look_up()
     arrays = [table.packed.values, *(getattr(si, name) for name in inputs)]
-    if dr.grad_enabled(arrays) or not _is_traced():
+    if dr.grad_enabled(arrays):
         return look_up()
     backend = dr.backend_v(mi.Float)
     if scope(backend) != _lookups.scope:

@@ -51,13 +51,9 @@ def bound_covariance(metric: list) -> tuple[list, Bool]:
     covariance = [dr.select(blind, r, c) for r, c in zip(round_one, covariance, strict=True)]
     if dr.grad_enabled(metric):
         xx, xy, yy = metric
-        free = q >= floor
-        inverse = rcp(dr.select(free, xx * yy - xy * xy, 1))
-        whole = [k * inverse for k in (yy, -xy, xx)]
-        covariance = [
-            dr.replace_grad(c, dr.select(free, w, 0))
-            for c, w in zip(covariance, whole, strict=True)
-        ]
+        inverse = rcp(dr.select(q >= floor, xx * yy - xy * xy, 1e30))
+        slopes = [k * inverse for k in (yy, -xy, xx)]
+        covariance = [dr.replace_grad(c, s) for c, s in zip(covariance, slopes, strict=True)]
     return covariance, blind
 
 
@@ -141,17 +137,8 @@ def filtered_terms(packed: Packed, footprint: list) -> tuple[Terms, tuple[Float,
     determinant = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
     limit = packed.radius * packed.radius
 
-    def terms(
-        shape: list,
-        color: list,
-        x: Float,
-        y: Float,
-        fxx: Float,
-        fxy: Float,
-        fyy: Float,
-        determinant: Float,
-    ) -> list:
-        mean_x, mean_y, p, t, r = shape
+    def terms(shape: list, color: list, x: Float, y: Float, *shared: Float) -> list:
+        (fxx, fxy, fyy, determinant), (mean_x, mean_y, p, t, r) = shared, shape
         dx, dy = x - mean_x, y - mean_y
         xy, yy = dr.fma(t, r, fxy), dr.fma(r, r, fyy)
         across = dr.fma(r * r, fxx, t * dr.fma(t, fyy, -2 * r * fxy))

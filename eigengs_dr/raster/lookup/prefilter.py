@@ -269,16 +269,9 @@ def _sum_copies(
         return *next_run(fresh, row, stop, (k, i, j), types.Bool(True)), (k, i, j)
 
     def add(
-        n: UInt,
-        end: UInt,
-        row: UInt,
-        stop: UInt,
-        place: tuple,
-        point: tuple,
-        scaled: list,
-        sums: list,
+        n: UInt, end: UInt, row: UInt, stop: UInt, place: tuple, seen_from: tuple, sums: list
     ) -> tuple:
-        (_, i, j), (x, y) = place, point
+        (_, i, j), (x, y, *scaled) = place, seen_from
         here = (n < end) & (j <= bottom)
         shape, color = packed.gather(gather_index(types, sizes.row, n, here), here)
         px, py, factors = _local(sizes, i, j, x, y)
@@ -291,20 +284,20 @@ def _sum_copies(
             crosses,
             lambda: [_share(sizes, shape, metric, (i, j), (px, py), center)],
             [types.Float(1)],
-            (packed.values, x, y, *scaled),
+            (packed.values, *seen_from),
         )
         w = dr.select(here, w * amplitude * part, 0)
         sums = [dr.fma(w, c, s) for c, s in zip(color, sums, strict=True)]
         n = n + 1
         state = n, end, row, stop, place
         state = dr.if_stmt(state, n >= end, advance, lambda *same: same, mode="symbolic")
-        return *state, point, scaled, sums
+        return *state, seen_from, sums
 
     zero = dr.zeros(types.Int, dr.width(x))
     start = next_run(types.Bool(True), zero, zero, (zero, left, top), active)
     sums = [types.Float(0) for _ in range(packed.channels)]
     return dr.while_loop(
-        (*start, (zero, left, top), (x, y), kernel_covariance(footprint), sums),
+        (*start, (zero, left, top), (x, y, *kernel_covariance(footprint)), sums),
         lambda n, end, row, stop, place, *rest: place[2] <= bottom,
         add,
         label="sum footprints",

@@ -8,7 +8,8 @@ blurred by the variance ``2 s^2`` is
 
 where B is the sum blurred by ``s^2`` in closed form. A lookup widens these Gaussians by the rest of
 the variance of its footprint. The ripple of the grid is below
-``2 exp(-2 (pi SAMPLE_DEVIATION)^2)`` = 5e-4.
+``2 exp(-2 (pi SAMPLE_DEVIATION)^2)`` = 5e-4 of Gaussians without ends, and with them up to 1 % for
+the narrowest footprints, 0.4 % from 1.25 times their variance on.
 """
 
 from __future__ import annotations
@@ -209,7 +210,8 @@ def sum_pyramid(
         middle = dr.fma(lean, down, dr.detach(u))
         return types.Int(dr.ceil(middle - half)), types.Int(dr.floor(middle + half))
 
-    def add(i: UInt, stop: UInt, j: UInt, u: Float, v: Float, inverse: list, sums: list) -> tuple:
+    def add(i: UInt, stop: UInt, j: UInt, seen_from: tuple, sums: list) -> tuple:
+        u, v, *inverse = seen_from
         here = i <= stop
         across, down = types.Float(i) - u, types.Float(j) - v
         q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
@@ -224,13 +226,13 @@ def sum_pyramid(
         ran = i > stop
         j = dr.select(ran, j + 1, j)
         begin, end = row_of(j)
-        return dr.select(ran, begin, i), dr.select(ran, end, stop), j, u, v, inverse, sums
+        return dr.select(ran, begin, i), dr.select(ran, end, stop), j, seen_from, sums
 
     bottom = types.Int(dr.select(active, dr.floor(dr.detach(v) + reach), -(2.0**30)))
     j = types.Int(dr.ceil(dr.detach(v) - reach))
     i, stop = row_of(j)
     sums = dr.while_loop(
-        (i, stop, j, u, v, inverse, [types.Float(0) for _ in range(lattice.channels)]),
+        (i, stop, j, (u, v, *inverse), [types.Float(0) for _ in range(lattice.channels)]),
         lambda i, stop, j, *rest: j <= bottom,
         add,
         label="sum pyramid",
