@@ -15,7 +15,7 @@ from eigengs_dr.plugins import environment_of, follow, texture_of  # noqa: E402
 
 pytestmark = pytest.mark.mitsuba
 
-PREFILTERS = [0.05, 0.1, 0.2]
+PREFILTERS = [0.05, pytest.param(0.1, marks=pytest.mark.slow), 0.2]
 """Angles in radians: exact sums, then lookups of the pyramid."""
 
 STEP = 0.01
