@@ -174,20 +174,20 @@ def metric(si: mi.SurfaceInteraction3f, inverse: tuple, angle: Float) -> tuple[l
     Returns
     -------
     metric : list of 3 Float
-        Entries xx, xy, yy, without gradients.
+        Entries xx, xy, yy.
     valid : Bool
         False if the footprint is undefined: the surface has no uv Jacobian, or t is not positive
         and finite.
     """
-    d = dr.detach(si.to_world(si.wi))
-    u, v = dr.detach(si.dp_du), dr.detach(si.dp_dv)
-    t = dr.detach(si.t)
+    d, u, v = si.to_world(si.wi), si.dp_du, si.dp_dv
+    ahead = (si.t > 0) & dr.isfinite(si.t)
+    t = dr.select(ahead, si.t, 1)
     b00, b01, b10, b11 = inverse
     u, v = u * b00 + v * b10, u * b01 + v * b11
     seen_u, seen_v = u - d * dr.dot(d, u), v - d * dr.dot(d, v)
     area = dr.squared_norm(dr.cross(u, v))
     sharp = rcp(dr.square(PIXEL * angle * t))
-    valid = (area > 0) & dr.isfinite(area) & (t > 0) & dr.isfinite(t)
+    valid = (area > 0) & dr.isfinite(area) & ahead
     return [
         dr.squared_norm(seen_u) * sharp,
         dr.dot(seen_u, seen_v) * sharp,

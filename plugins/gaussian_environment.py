@@ -188,7 +188,7 @@ def gaussian_environment() -> type:
             if angle is None:
                 return no_metric(self.label())
             sharp = rcp(PIXEL * angle)
-            along = 2 * dr.pi * dr.sin(dr.detach(uv.y) * dr.pi) * sharp
+            along = 2 * dr.pi * dr.sin(uv.y * dr.pi) * sharp
             down = (dr.pi * self.height / (self.height - 1)) * sharp
             return [along * along, mi.Float(0), down * down], mi.Bool(True)
 

@@ -252,13 +252,15 @@ def reused(
     list of Float
         Never shared where there are gradients: they must not cross `drjit.isolate_grad`.
     """
-    if dr.grad_enabled(table.packed.values) or not _is_traced():
+    if not _is_traced():
+        return look_up()
+    arrays = [table.packed.values, *(getattr(si, name) for name in inputs)]
+    if dr.grad_enabled(arrays):
         return look_up()
     backend = dr.backend_v(mi.Float)
     if scope(backend) != _lookups.scope:
         _lookups.results.clear()
     # The arrays keep their indices, so that no other variable has them.
-    arrays = [table.packed.values, *(getattr(si, name) for name in inputs)]
     key = (where, *indices_of(arrays))
     if key not in _lookups.results:
         _lookups.results[key] = look_up(), arrays
@@ -311,6 +313,11 @@ def sum_over_footprint(
     near, wide = active & ~distant, active & distant & ~blind
 
     sharp = sum_prefiltered(sizes, table.packed, x, y, footprint, near)
-    far = where_any(wide, lambda: sum_pyramid(pyramid, x, y, footprint, wide), table.packed)
+    far = where_any(
+        wide,
+        lambda: sum_pyramid(pyramid, x, y, footprint, wide),
+        [mi.Float(0)] * pyramid.channels,
+        (pyramid.values, x, y, *footprint),
+    )
     sums = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
     return [dr.select(blind, m, s) for m, s in zip(table.average, sums, strict=True)]

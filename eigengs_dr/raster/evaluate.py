@@ -49,10 +49,12 @@ def exp2_neg(q: Float) -> Float:
     return dr.reinterpret_array(types.Float, dr.reinterpret_array(types.UInt, power) + exponent)
 
 
-def falloff(q: Float, limit: float) -> Float:
-    """Return ``2^-q`` if ``q <= limit``, else 0; the derivative is ``-ln(2)`` times the value."""
+def falloff(q: Float, limit: float | None = None) -> Float:
+    """Return ``2^-q``, but 0 beyond a limit; the derivative is ``-ln(2)`` times the value."""
     exact = dr.detach(q)
-    value = dr.select(exact <= limit, exp2_neg(exact), 0)
+    value = exp2_neg(exact)
+    if limit is not None:
+        value = dr.select(exact <= limit, value, 0)
     if not dr.grad_enabled(q):
         return value
     return dr.replace_grad(value, (-LN2 * value) * q)

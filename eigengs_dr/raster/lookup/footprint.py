@@ -32,12 +32,13 @@ def bound_covariance(metric: list) -> tuple[list, Bool]:
     Returns
     -------
     covariance : list of 3 Float
-        xx, xy, yy, in squared widths and heights of the texture.
+        xx, xy, yy, in squared widths and heights of the texture. Where an axis is shortened, the
+        derivative is 0.
     blind : Bool
         True if all axes are longer than `MAX_FOOTPRINT` or the metric is not finite: the caller
         should use the mean of the texture.
     """
-    xx, xy, yy = metric
+    xx, xy, yy = dr.detach(metric)
     floor = 1 / MAX_FOOTPRINT**2
     middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     root = dr.sqrt(dr.fma(half, half, xy * xy))
@@ -48,12 +49,17 @@ def bound_covariance(metric: list) -> tuple[list, Bool]:
     covariance = [dr.fma(slope, xx - q, long), slope * xy, dr.fma(slope, yy - q, long)]
     round_one = (MAX_FOOTPRINT**2, 0.0, MAX_FOOTPRINT**2)
     covariance = [dr.select(blind, r, c) for r, c in zip(round_one, covariance, strict=True)]
+    if dr.grad_enabled(metric):
+        xx, xy, yy = metric
+        inverse = rcp(dr.select(q >= floor, xx * yy - xy * xy, 1e30))
+        slopes = [k * inverse for k in (yy, -xy, xx)]
+        covariance = [dr.replace_grad(c, s) for c, s in zip(covariance, slopes, strict=True)]
     return covariance, blind
 
 
 def extreme_variances(footprint: list) -> tuple[Float, Float]:
-    """Return the smallest and the largest variance of a footprint in any direction."""
-    xx, xy, yy = footprint
+    """Return the smallest and the largest variance in any direction, without derivatives."""
+    xx, xy, yy = dr.detach(footprint)
     middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
     root = dr.sqrt(dr.fma(half, half, xy * xy))
     return middle - root, middle + root
@@ -120,8 +126,8 @@ def quick_erf(x: Float) -> Float:
     return x * p
 
 
-def filtered_terms(packed: Packed, footprint: list) -> Terms:
-    """Return the `Terms` of the filtered sum, without borders, from inverted rows.
+def filtered_terms(packed: Packed, footprint: list) -> tuple[Terms, tuple[Float, ...]]:
+    """Return the `Terms` of the filtered sum, without borders, from inverted rows; what they share.
 
     With ``Sigma' = [[xx, xy], [xy, yy]]`` and its determinant D, the exponent
     ``d^T Sigma'^-1 d`` is ``((yy dx - xy dy)^2 / D + dy^2) / yy``; see
@@ -131,8 +137,8 @@ def filtered_terms(packed: Packed, footprint: list) -> Terms:
     determinant = dr.maximum(dr.fma(fxx, fyy, -fxy * fxy), 0)
     limit = packed.radius * packed.radius
 
-    def terms(shape: list, color: list, x: Float, y: Float) -> list:
-        mean_x, mean_y, p, t, r = shape
+    def terms(shape: list, color: list, x: Float, y: Float, *shared: Float) -> list:
+        (fxx, fxy, fyy, determinant), (mean_x, mean_y, p, t, r) = shared, shape
         dx, dy = x - mean_x, y - mean_y
         xy, yy = dr.fma(t, r, fxy), dr.fma(r, r, fyy)
         across = dr.fma(r * r, fxx, t * dr.fma(t, fyy, -2 * r * fxy))
@@ -142,4 +148,4 @@ def filtered_terms(packed: Packed, footprint: list) -> Terms:
         w = falloff(dr.fma(along, along, dy * dy) * rcp(yy), limit) * scale
         return [w * c for c in color]
 
-    return terms
+    return terms, (fxx, fxy, fyy, determinant)

@@ -19,8 +19,8 @@ from ..parameters import NUM_SHAPE_PARAMS, kernel_radius, unpack_parameters
 from .cells import CellLists
 from .coding import Coding
 
-Terms = Callable[[list, list, Float, Float], list]
-"""``terms(shape, color, x, y)`` returns what a Gaussian contributes to each sum at a point."""
+Terms = Callable[..., list]
+"""``terms(shape, color, x, y, *shared)`` returns what a Gaussian adds to each sum at a point."""
 
 
 @dataclass(frozen=True)
@@ -195,21 +195,25 @@ def sum_range(
     y: Float,
     terms: Terms,
     count: int | None = None,
+    shared: tuple[Float, ...] = (),
 ) -> list:
-    """Sum the Gaussians in the runs from begin to end, with another range at each point."""
+    """Sum the Gaussians in the runs from begin to end, with another range at each point.
+
+    Derivatives flow back to what `terms` take as `shared`, not to what they read as closures.
+    """
     types = types_of(packed.values)
     first = lists.first_at(dr.detach(y))
 
-    def add(i: UInt, end: UInt, x: Float, y: Float, sums: list) -> tuple:
+    def add(i: UInt, end: UInt, x: Float, y: Float, shared: tuple, sums: list) -> tuple:
         here = i < end
         for number in lists.numbers_at(types, i, here):
-            parts = terms(*packed.gather(number + first, here), x, y)
+            parts = terms(*packed.gather(number + first, here), x, y, *shared)
             sums = [s + t for s, t in zip(sums, parts, strict=True)]
-        return i + 1, end, x, y, sums
+        return i + 1, end, x, y, shared, sums
 
     # max_iterations=-1 tells Dr.Jit that the loop is a pure sum: its gradient needs no storage.
     return dr.while_loop(
-        (*ends, x, y, [types.Float(0) for _ in range(count or packed.channels)]),
+        (*ends, x, y, shared, [types.Float(0) for _ in range(count or packed.channels)]),
         lambda i, end, *rest: i < end,
         add,
         label="sum at points",

@@ -48,7 +48,7 @@ def sum_prefiltered(
         Centre of the footprint in pixels, moved into the image by
         `eigengs_dr.raster.lookup.points.fold`, or near it by `near_image` if that is clamped.
     footprint : list of 3 Float
-        xx, xy, yy of the covariance, in pixels squared; not differentiated.
+        xx, xy, yy of the covariance, in pixels squared.
     active : Bool
 
     Returns
@@ -56,7 +56,6 @@ def sum_prefiltered(
     list of Float
         One sum for each channel.
     """
-    footprint = [dr.detach(f) for f in footprint]
     reach, sides = _reach(footprint), (sizes.width, sizes.height)
     bounds = [
         [_part(sizes, dr.detach(v) + k, side) for k in (-r, r)]
@@ -72,11 +71,14 @@ def sum_prefiltered(
         first, last = _ends(sizes, side)
         listed &= (v >= first + r) & (v + r <= last)
     ends = _shortest_list(sizes, *near, widest, listed)
-    terms = filtered_terms(packed, seen)
-    total = sum_range(sizes.cells, ends, packed, *near, terms)
+    terms, shared = filtered_terms(packed, seen)
+    total = sum_range(sizes.cells, ends, packed, *near, terms, shared=shared)
     rest = active & ~listed
     part = where_any(
-        rest, lambda: _sum_copies(sizes, packed, x, y, footprint, bounds, rest), packed
+        rest,
+        lambda: _sum_copies(sizes, packed, x, y, footprint, bounds, rest),
+        [types_of(x).Float(0)] * packed.channels,
+        (packed.values, x, y, *footprint),
     )
     return [t + p for t, p in zip(total, part, strict=True)]
 
@@ -96,7 +98,7 @@ def _shortest_list(
 
 
 def where_any(
-    active: Bool, compute: Callable[[], list], packed: Packed, others: list | None = None
+    active: Bool, compute: Callable[[], list], others: list, inputs: tuple[Float, ...]
 ) -> list:
     """Return values that few points need, and skip the work for packets of lanes without one.
 
@@ -105,17 +107,17 @@ def where_any(
     active : Bool
         The points that need the values.
     compute : callable
-        Returns the values, by default one for each channel.
-    packed : Packed
-        Parameters. With gradients nothing is skipped: Dr.Jit cannot carry them out of the branch.
-    others : list of Float, optional
-        The values of other points, by default 0.
+        Returns the values.
+    others : list of Float
+        The values of other points.
+    inputs : tuple of Float
+        All that `compute` reads and that may have derivatives. If one of them has, nothing is
+        skipped: Dr.Jit cannot carry derivatives out of the branch.
     """
-    if dr.grad_enabled(packed.values):
+    if dr.grad_enabled(inputs):
         return compute()
-    rest = others or [types_of(packed.values).Float(0)] * packed.channels
     return list(
-        dr.if_stmt((), active, lambda: tuple(compute()), lambda: tuple(rest), mode="symbolic")
+        dr.if_stmt((), active, lambda: tuple(compute()), lambda: tuple(others), mode="symbolic")
     )
 
 
@@ -126,7 +128,7 @@ def _ends(sizes: SizeClasses, side: int) -> tuple[float, float]:
 
 def _reach(footprint: list) -> list:
     """Return how far a footprint reaches along x and y."""
-    return [FOOTPRINT_REACH * dr.safe_sqrt(footprint[k]) for k in (0, 2)]
+    return [FOOTPRINT_REACH * dr.safe_sqrt(dr.detach(footprint[k])) for k in (0, 2)]
 
 
 def _at_borders(sizes: SizeClasses, point: tuple, footprint: list) -> tuple[Any, list]:
@@ -209,7 +211,6 @@ def _sum_copies(
     lanes of a packet then wait once for the longest sum.
     """
     types, cutoff = types_of(packed.values), packed.cutoff
-    scaled = kernel_covariance(footprint)
     (left, right), (top, bottom) = bounds
     crosses = (left < right) | (top < bottom)
     bottom = dr.select(active, bottom, top - 1)
@@ -223,7 +224,7 @@ def _sum_copies(
         k, i, j = place
         square, cells, nx, ny, inverse, origin = unpack_parameters(sizes.table, types.UInt(k), 6)
         x0, y0, factors = _local(sizes, i, j, dr.detach(x), dr.detach(y))
-        xx, xy, yy = (f * k for f, k in zip(footprint, factors, strict=True))
+        xx, xy, yy = (dr.detach(f) * k for f, k in zip(footprint, factors, strict=True))
         xx, yy = xx + square, yy + square
         reach = cutoff * dr.sqrt(yy)
         first = types.Int(dr.maximum(dr.floor((y0 - reach - origin) * inverse), 0))
@@ -268,9 +269,9 @@ def _sum_copies(
         return *next_run(fresh, row, stop, (k, i, j), types.Bool(True)), (k, i, j)
 
     def add(
-        n: UInt, end: UInt, row: UInt, stop: UInt, place: tuple, point: tuple, sums: list
+        n: UInt, end: UInt, row: UInt, stop: UInt, place: tuple, seen_from: tuple, sums: list
     ) -> tuple:
-        (_, i, j), (x, y) = place, point
+        (_, i, j), (x, y, *scaled) = place, seen_from
         here = (n < end) & (j <= bottom)
         shape, color = packed.gather(gather_index(types, sizes.row, n, here), here)
         px, py, factors = _local(sizes, i, j, x, y)
@@ -282,21 +283,21 @@ def _sum_copies(
         (part,) = where_any(
             crosses,
             lambda: [_share(sizes, shape, metric, (i, j), (px, py), center)],
-            packed,
             [types.Float(1)],
+            (packed.values, *seen_from),
         )
         w = dr.select(here, w * amplitude * part, 0)
         sums = [dr.fma(w, c, s) for c, s in zip(color, sums, strict=True)]
         n = n + 1
         state = n, end, row, stop, place
         state = dr.if_stmt(state, n >= end, advance, lambda *same: same, mode="symbolic")
-        return *state, point, sums
+        return *state, seen_from, sums
 
     zero = dr.zeros(types.Int, dr.width(x))
     start = next_run(types.Bool(True), zero, zero, (zero, left, top), active)
     sums = [types.Float(0) for _ in range(packed.channels)]
     return dr.while_loop(
-        (*start, (zero, left, top), (x, y), sums),
+        (*start, (zero, left, top), (x, y, *kernel_covariance(footprint)), sums),
         lambda n, end, row, stop, place, *rest: place[2] <= bottom,
         add,
         label="sum footprints",
