@@ -33,7 +33,7 @@ from .options import FitOptions, Goal, Start, named_options
 from .place import Adaptive
 from .problem import Map, PixelsOrPath, Problem, problem_of, problem_of_images
 from .search import fewest
-from .start import start_from
+from .start import set_in, start_from
 from .state import begin
 
 
@@ -75,6 +75,9 @@ class Fit:
     mean_image : ndarray of float32, shape (H, W, 3), or None
         RGB image to add to renderings of the set. The method of the paper EigenGS keeps the mean
         image of the model as pixels. The attribute `image` includes the mean image.
+    kept : int or None
+        How many Gaussians of the start the descent began with; the others were placed anew. None
+        without a start.
     psnr_ycbcr, psnr_rgb : float
         PSNR of the set in dB, from its row of the trace; for maps, the means over the maps; NaN
         without an image.
@@ -94,6 +97,7 @@ class Fit:
     iterations: int
     stopped: str
     mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
+    kept: int | None = field(default=None, repr=False)
     psnr_ycbcr: float = math.nan
     psnr_rgb: float = math.nan
     loss: float = math.nan
@@ -308,9 +312,10 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
             watch = Watch(started, problem.options.iterations, progress, interrupted)
             refinement, seconds_init = fit_loss(problem, watch)
             refinements = [refinement]
+            kept = None if problem.start is None else len(set_in(problem.start))
         else:
             problem = problem.balanced(problem.first_count)
-            pixels, begun, chosen = begin_fit(problem)
+            pixels, begun, kept = begin_fit(problem)
             if pixels.pictures[0].base is not None:
                 mean_image = pixels.picture(pixels.pictures[0].base).numpy()
             # The score must not refer to the descent that holds it: only the collector would free
@@ -324,18 +329,18 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
                 progress,
                 interrupted,
             )
-            refinements, seconds_init = _refined(problem, descent, begun, chosen, started)
-    return _finished(problem, refinements, mean_image, started, seconds_init)
+            refinements, seconds_init = _refined(problem, descent, begun, bool(kept), started)
+    return _finished(problem, refinements, mean_image, kept, started, seconds_init)
 
 
-def begin_fit(problem: Problem) -> tuple[Pixels, Gaussians | None, bool]:
-    """Return the squared error, the set to start from, and whether the user chose Gaussians of it.
+def begin_fit(problem: Problem) -> tuple[Pixels, Gaussians | None, int | None]:
+    """Return the squared error, the set to start from, and how many of the user's it holds.
 
     A method that starts from a model may change the squared error.
     """
     start, options, objective = problem.start, problem.options, problem.pixels()
     if start is None:
-        return objective, None, False
+        return objective, None, None
     if isinstance(start, Gaussians):
         start = problem.fitted(start)
     pixels = problem.channels[0].targets[0].pixels
@@ -375,6 +380,7 @@ def _finished(
     problem: Problem,
     refinements: Sequence[Refinement],
     mean_image: NDArray[np.float32] | None,
+    kept: int | None,
     started: float,
     seconds_init: float,
 ) -> list[Fit]:
@@ -393,6 +399,7 @@ def _finished(
                 iterations=one.iterations,
                 stopped=one.stopped,
                 mean_image=mean_image,
+                kept=kept,
                 psnr_ycbcr=one.row.get("psnr_ycbcr", math.nan),
                 psnr_rgb=one.row.get("psnr_rgb", math.nan),
                 loss=one.row.get("loss", math.nan),

@@ -15,7 +15,7 @@ from ..fitting.options import FitOptions, refuse_unknown
 from ..fitting.start import load_start, set_in
 from ..image.pixels import EncodedImage
 from ..image.space import YCBCR
-from .manifest import ImageRow, Images, fingerprint
+from .manifest import ImageRow, Images, described, fingerprint
 from .run import Job, run_images
 
 MAX_SIDE = 256
@@ -147,7 +147,7 @@ def fit_many(
 def _settings_of(settings: FitOptions) -> dict[str, Any]:
     """Return the options on which results depend; a start is replaced by its fingerprint."""
     options = {name: value for name, value in vars(settings).items() if name != "backend"}
-    options |= {"method": repr(settings.method), "space": settings.space or YCBCR}
+    options |= {"method": described(settings.method), "space": settings.space or YCBCR}
     if settings.goal:
         options["target_psnr"] = vars(settings.goal)
     if isinstance(settings.gaussians, tuple):
