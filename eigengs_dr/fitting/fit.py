@@ -27,7 +27,7 @@ from .levels import place_levels, sort_levels
 from .loop import Descent, FitProgress, Refinement, refine, sets_of
 from .loss import Loss, LossFunction, LossObjective
 from .measure import Row
-from .method import DEFAULT, Method
+from .method import DEFAULT, Method, Model
 from .objective import Pixels
 from .options import FitOptions, Goal, Start, named_options
 from .place import Adaptive
@@ -76,8 +76,8 @@ class Fit:
         RGB image to add to renderings of the set. The method of the paper EigenGS keeps the mean
         image of the model as pixels. The attribute `image` includes the mean image.
     kept : int or None
-        How many Gaussians of the start the descent began with; the others were placed anew. None
-        without a start.
+        How many Gaussians of the start were kept, before the first step; the others were placed
+        anew. None without a start.
     psnr_ycbcr, psnr_rgb : float
         PSNR of the set in dB, from its row of the trace; for maps, the means over the maps; NaN
         without an image.
@@ -176,8 +176,10 @@ def fit(
         Instead of a placement, Gaussians to start from, scaled to the size of the image: the set of
         the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
         that it makes of the image, on shapes that suit many images. The set gets the cutoff of the
-        method. Gaussians that fit the image stay, the others are placed anew: all of them where a
-        placement would end higher. Those of a model, and without steps, all stay.
+        method. Gaussians are kept where the image is fitted much better than by a placement; the
+        others are placed anew: all of them if the whole is not much better. All Gaussians of a
+        model, without steps or without an image, are kept; so are all for a method that places
+        none anew, ``eigengs_dr.DEFAULT.without("places")``. ``result.kept`` says how many.
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
@@ -353,7 +355,8 @@ def _refined(
     """Fit a given number of Gaussians, levels, or the fewest; and the seconds before refinement."""
     options, counts = problem.options, problem.levels
     objective, method = descent.objective, descent.method
-    if counts or method.place != Adaptive():  # the choice of a placement is not undone
+    given = isinstance(problem.start, Model)
+    if counts or given or method.place != Adaptive():  # a choice of the user is not undone
         method = method.without("grows", "places")
     if counts:
         begun = place_levels(

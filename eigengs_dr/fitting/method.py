@@ -111,7 +111,7 @@ class Method:
     """Whether the start must be a model."""
 
     def __post_init__(self) -> None:
-        check_fields(self, warm_up="[0, inf)", decay="[0, 1]", drift="(0, inf)")
+        check_fields(self, warm_up="[0, inf)", decay="[0, 1]", drift="[0, inf)")
         check_fields(self, rate_exponent="[0, inf)", average="[0, 1)", solve_steps="[0, inf)")
         check_fields(self, cutoff=f"(0, {MAX_CUTOFF:g}]")
         self._check_parts()
@@ -150,13 +150,12 @@ class Method:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])
 
-    def rate_factors(self, iterations: int, chosen: bool = False) -> list[float]:
+    def rate_factors(self, iterations: int) -> list[float]:
         """Return the factors of the learning rates at all steps: half a cosine down to `decay`.
 
-        The steps before a redistribution have their own cosine, which gains 0.03 to 0.1 dB;
-        but not if the user chose the Gaussians, which then mostly stay.
+        The steps before a redistribution have their own cosine, which gains 0.03 to 0.1 dB.
         """
-        first, factors = 0 if chosen else self.first_phase(iterations), []
+        first, factors = self.first_phase(iterations), []
         for length in (first, iterations - first):
             falling = [0.5 * (1 + math.cos(math.pi * step / length)) for step in range(length)]
             factors += [self.decay + (1 - self.decay) * along for along in falling]

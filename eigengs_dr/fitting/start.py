@@ -18,7 +18,7 @@ from .objective import Pixels
 from .options import FitOptions, Start
 from .placement.adaptive import error_by_pixel
 
-MAX_RATIO = 0.8
+MAX_RATIO = 0.75
 """Largest squared error of a set with Gaussians of a start over that of a placement, which gains
 more from the steps that follow than Gaussians which are fitted already."""
 

@@ -235,7 +235,7 @@ class State:
     surplus : int
         How many more a control may place before the last ones have left.
     chosen : bool
-        Whether the fit started from Gaussians of the user, which a redistribution keeps.
+        Whether the fit started from Gaussians of the user: a redistribution keeps those that fit.
     squares : Float or None, shape (images,)
         The sums of ``h (p - t)^2`` that a control has measured before this step.
     speed : float

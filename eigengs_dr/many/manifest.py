@@ -62,6 +62,8 @@ class ImageRow:
         time of a group is divided equally.
     iterations : int or None
         Number of refinement steps; None for encoded images.
+    kept : int or None
+        How many Gaussians of a start it began with, see `eigengs_dr.Fit`; None without a start.
     stopped : str
         Why the fit ended, see `eigengs_dr.Fit`; empty for encoded images.
     error : str
@@ -81,6 +83,7 @@ class ImageRow:
     psnr_rgb: float | None = None
     seconds: float | None = None
     iterations: int | None = None
+    kept: int | None = None
     stopped: str = ""
     error: str = ""
     result: Any = field(default=None, repr=False)
@@ -194,7 +197,9 @@ STATUSES = ("done", "skipped", "failed")
 KEYS = [*(field.name for field in fields(ImageRow) if field.name != "result"), "options"]
 """Keys of a row."""
 
-SKIPPED = ("width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", "iterations")
+SKIPPED = (
+    "width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", "iterations", "kept"
+)  # fmt: skip
 """Figures of a result that a later run takes from its row."""
 
 
