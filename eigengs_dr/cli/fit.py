@@ -195,7 +195,8 @@ def _settings(choices: dict[str, Any], basis: str | None, backend: str | None) -
     from ..fitting.options import FitOptions
     from ..fitting.start import set_in
 
-    method, start = _method(choices["preset"], choices["init"]), None
+    start: eg.EigenGS | eg.Gaussians | None = None
+    method = _method(choices["preset"], choices["init"])
     if basis is not None or method.needs_model:
         start = eg.EigenGS.load(basis or DEFAULT_BASIS, backend)
     if start is not None and (choices["init"] or choices["start"]):

@@ -8,7 +8,6 @@ its result, so that a run is only continued with the same options.
 
 from __future__ import annotations
 
-import copyreg
 import hashlib
 import json
 import math
@@ -433,7 +432,7 @@ def described(value: Any, holders: tuple[int, ...] = ()) -> Any:
         with suppress(TypeError):  # of what cannot be copied, such as a lock
             made = value.__reduce_ex__(2)
             attributes = made if isinstance(made, str) else list(made[1:])
-            if made[0] is copyreg.__newobj__ and isinstance(made[2], Mapping):
+            if made[0].__name__ == "__newobj__" and isinstance(made[2], Mapping):
                 attributes = made[2]
     if isinstance(attributes, Mapping):
         return {"class": name} | described(attributes, within)

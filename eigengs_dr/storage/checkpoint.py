@@ -213,7 +213,7 @@ def difference(stored: Record, settings: Record, of: str = "") -> str:
         if old == new or not (of or key in stored):
             continue
         if isinstance(old, list) and isinstance(new, list):
-            old, new = (dict(zip(map(str, range(len(v))), v)) for v in (old, new))
+            old, new = ({str(k): one for k, one in enumerate(v)} for v in (old, new))
         if isinstance(old, dict) and isinstance(new, dict) and old.get("class") == new.get("class"):
             changes.append(difference(old, new, f"{name}."))
         else:
