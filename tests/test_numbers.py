@@ -54,7 +54,7 @@ def test_what_is_no_number_is_refused_in_one_line():
 @pytest.mark.parametrize("name", ["cutoff", "solve_steps", "warm_up", "decay"])
 def test_what_is_no_number_of_a_method_is_refused_in_one_line(name):
     for wrong in ("5", True, [1], None):
-        with pytest.raises(ValueError, match=f"^{name} is .*; it must be a"):
+        with pytest.raises(ValueError, match=f"^Method: {name} is .*; it must be a"):
             replace(eg.DEFAULT, **{name: wrong})
 
 

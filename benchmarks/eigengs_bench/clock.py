@@ -63,13 +63,14 @@ def descent(
     spent, resumed = 0.0, time.perf_counter()
     chosen = FitOptions(iterations=iterations, **options)
     problem, method = problem_of_images([image], chosen), chosen.method
-    objective, begun, is_placed = begin_fit(problem)
+    objective, begun, _ = begin_fit(problem)
     base = objective.pictures[0].base
     mean_image = 0.0 if base is None else objective.picture(base).numpy()
     if begun is None:
         begun = method.place_and_solve(objective, problem.first_count, chosen.seed)
-        is_placed = method.place != Adaptive()
-    state = begin(begun, chosen=is_placed)
+    if problem.start is not None or method.place != Adaptive():
+        method = method.without("grows", "places")
+    state = begin(begun)
     steps = descend(objective, method, state, iterations, chosen.seed)
     for iteration in range(iterations + 1):
         if iteration:

@@ -76,8 +76,9 @@ def fit_case(
     begun: dict[str, Any] = {"gaussians": case.gaussians}
     if method.needs_model:
         begun = {"start": eg.EigenGS.load(BASIS, backend)}
-    elif case.place is not None:
+    elif case.place is not None:  # all of it is kept, so that the descent itself is measured
         begun = {"start": _start(case, image, backend)}
+        method = method.without("places")
     return eg.fit(
         image,
         iterations=case.iterations,

@@ -7,9 +7,11 @@ Functions that are only called from doors need no lock. Work that starts elsewhe
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
 from functools import wraps
 from inspect import isfunction, signature
 from numbers import Integral, Real
@@ -84,6 +86,35 @@ def plain_numbers(values: Mapping[str, object], annotations: Mapping[str, str]) 
         if annotations.get(name) in KINDS
         and not (value is None and annotations[name].endswith("None"))
     }
+
+
+def check_fields(record: Any, **ranges: str) -> None:
+    """Let the fields of a frozen dataclass be plain numbers, each in its range.
+
+    Parameters
+    ----------
+    record : dataclass
+    ranges : str
+        The range of each field that is checked, such as "[0, 1)".
+
+    Raises
+    ------
+    ValueError
+        If a field is no number, not finite, or out of range.
+    """
+    kinds = {field.name: str(field.type) for field in fields(record) if field.name in ranges}
+    kind = type(record).__name__
+    try:
+        plain = plain_numbers(vars(record), kinds)
+    except ValueError as error:
+        raise ValueError(f"{kind}: {error}") from None
+    for name, value in plain.items():
+        low, high = map(float, ranges[name][1:-1].split(","))
+        inside = low < value < high or value == (low if ranges[name][0] == "[" else None)
+        inside |= value == (high if ranges[name][-1] == "]" else None)
+        if not (inside and math.isfinite(value)):
+            raise ValueError(f"{kind}: {name} is {value}; it must be in {ranges[name]}")
+        object.__setattr__(record, name, value)
 
 
 def _plain(name: str, value: object, kind: type) -> Any:

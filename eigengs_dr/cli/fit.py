@@ -44,7 +44,7 @@ PRESETS = ("default", "gaussianimage", "eigengs")
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
 
-EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
+EXCLUDED_BY_MAPS = ("basis", "start", "space", "blocks", "cluster", "recursive")
 """Options that cannot be combined with maps."""
 
 
@@ -61,6 +61,8 @@ EXCLUDED_BY_MAPS = ("basis", "space", "blocks", "cluster", "recursive")
 @options.number("--iterations", "Optimisation steps.", 1000)
 @options.choice("--init", INITS, "Initial placement.  [default: adaptive]", True)
 @options.value("--basis", "NAME|FILE", str, "Model to start from: natural, or a file.")
+@options.value("--start", "FILE", options.path, "Set of Gaussians to start from.")
+@click.option("--keep", is_flag=True, help="Start from all of --start, whatever fits.")
 @options.choice("--preset", PRESETS, "Our method, or that of a paper.")
 @options.choice(
     "--space",
@@ -111,6 +113,7 @@ def fit(
       eigengs-dr fit photo.jpg
       eigengs-dr fit photo.jpg -o photo.npz --target-psnr 38
       eigengs-dr fit photo.jpg --basis natural --iterations 100
+      eigengs-dr fit frame2.jpg --start frame1.npz --iterations 100
       eigengs-dr fit photo.jpg -o levels.npz --levels 5000,7000,9000
       eigengs-dr fit photos/ -o fits/ --report fits.json
       eigengs-dr fit "photos/**/*.jpg" -o fits/ --cluster local:4
@@ -148,8 +151,8 @@ def fit(
             print_message(line)
     if blocks and not has_blocks:
         raise ValueError(
-            "--blocks needs the default preset and init; leave out --basis, --target-psnr, "
-            "--levels and --preview"
+            "--blocks needs the default preset and init; leave out --basis, --start, "
+            "--target-psnr, --levels and --preview"
         )
     if not run.cluster:
         select(run.backend)
@@ -166,7 +169,7 @@ def fit(
             records, lines = _fit_at_once(show, source, outputs[0], pictures[0], settings)
     run.tell(*lines)
     used = choices | {"space": settings.space or YCBCR}
-    if settings.start is not None:
+    if settings.start is not None and choices["start"] is None:
         used["basis"] = basis or DEFAULT_BASIS
     figures = {"images": records} if several else records[0]
     run.write_report(used | {"block": blocks} | figures)
@@ -190,12 +193,20 @@ def _check_maps(context: click.Context, images: Sequence[Path | str], output: Pa
 def _settings(choices: dict[str, Any], basis: str | None, backend: str | None) -> FitOptions:
     """Return the options of a fit for the options of the command line."""
     from ..fitting.options import FitOptions
+    from ..fitting.start import set_in
 
-    method, start = _method(choices["preset"], choices["init"]), None
+    start: eg.EigenGS | eg.Gaussians | None = None
+    method = _method(choices["preset"], choices["init"])
     if basis is not None or method.needs_model:
         start = eg.EigenGS.load(basis or DEFAULT_BASIS, backend)
-    if start is not None and choices["init"]:
-        raise ValueError("--init and --basis, or a preset that has one, exclude each other")
+    if start is not None and (choices["init"] or choices["start"]):
+        name = "--start" if choices["start"] else "--init"
+        raise ValueError(f"{name} and --basis, or a preset that has one, exclude each other")
+    if choices["keep"] and choices["start"] is None:
+        raise ValueError("--keep is for the Gaussians of --start; give both")
+    if choices["start"] is not None:
+        start = eg.Gaussians.load(choices["start"], backend)
+        method = method.without("places") if choices["keep"] else method
     target, count, levels = (choices[name] for name in ("target_psnr", "gaussians", "levels"))
     goal = None
     if target is not None and count is not None:
@@ -215,7 +226,7 @@ def _settings(choices: dict[str, Any], basis: str | None, backend: str | None) -
         iterations=choices["iterations"],
         target_psnr=goal,
         start=start,
-        space=choices["space"] or (start.gaussians.space if start else None),
+        space=choices["space"] or (set_in(start).space if start else None),
         method=method,
         seed=choices["seed"],
         backend=backend,
@@ -352,6 +363,8 @@ def _summary(
     ]
     if "seconds_total" in record:
         lines[0] += f" ({record['seconds_total']:.1f} s including loading and measuring)"
+    if record.get("kept") is not None:
+        lines.append(_kept(record["kept"], count))
     for m in record.get("maps", []):
         figure, value = _target_figure(m, settings)
         lines.append(
@@ -365,6 +378,11 @@ def _summary(
     if picture:
         lines.append(f"  wrote {picture} (photo, fit and outlines side by side)")
     return lines
+
+
+def _kept(kept: int, count: int) -> str:
+    anew = ", the others were placed anew" if kept < count else ""
+    return f"  kept {kept:,} of {count:,} Gaussians of the start{anew}"
 
 
 def _psnrs(space: str, floats: float, rgb: float) -> str:
@@ -476,6 +494,7 @@ def _given_options(context: click.Context, settings: FitOptions) -> dict[str, An
 
 FIELD_OF_OPTION = {
     "init": "method",
+    "keep": "method",
     "preset": "method",
     "target_space": "target_psnr",
     "max_gaussians": "target_psnr",
@@ -495,6 +514,8 @@ def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space
         floats, rgb = (sum(values) / len(fitted) for values in zip(*pairs, strict=True))
         text += f" ({len(fitted) / seconds:.2g} images/s)"
         lines.append(f"  mean{_psnrs(space, floats, rgb)[1:]}")
+    if kept := [row.kept for row in fitted if row.kept is not None]:
+        lines.append(_kept(sum(kept), sum(row.gaussians or 0 for row in fitted)))
     if counts["skipped"]:
         lines.append("  the results of skipped images exist; --overwrite fits them again")
     if fitted:

@@ -16,7 +16,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -327,7 +327,7 @@ def _read_maps(file: BinaryIO) -> tuple[bytes, tuple[TextureMap, ...]]:
         entry = exactly(file, _MAP.size)
         length, number, channels, weight = _MAP.unpack(entry)
         name = exactly(file, length)
-        space = SPACES[number] if number < len(SPACES) else Space(f"number {number}")  # unknown
+        space = SPACES[number] if number < len(SPACES) else cast(Space, f"number {number}")
         maps.append(TextureMap(name.decode("ascii", "replace"), space, channels, weight))
         table += entry + name
     return table, tuple(maps)

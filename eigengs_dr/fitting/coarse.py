@@ -14,6 +14,7 @@ from itertools import pairwise
 import drjit as dr
 
 from ..backend.arrays import types_of
+from ..backend.doors import check_fields
 from ..backend.recording import freeze_program
 from ..backend.types import Float, Rows, UInt
 from .loss import LossObjective
@@ -71,17 +72,8 @@ class Agreeing(Adam):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.memory < 1:
-            raise ValueError(f"Agreeing: memory is {self.memory}; it must be in [0, 1)")
-        if not 0 < self.least <= self.first <= 1:
-            raise ValueError(
-                f"Agreeing: least is {self.least} and first is {self.first}; they must be above 0, "
-                "at most 1 and in this order"
-            )
-        if not (self.gain >= 0 and self.floor >= 0):
-            raise ValueError(
-                f"Agreeing: gain is {self.gain} and floor is {self.floor}; they must be at least 0"
-            )
+        check_fields(self, memory="[0, 1)", gain="[0, inf)", first="(0, 1]", floor="[0, inf)")
+        check_fields(self, least=f"(0, {self.first}]")
 
     def start(self, value: Rows) -> tuple[Rows, ...]:
         """Return both averages of `Adam`, that of the values, and the logarithms of the rates."""
@@ -136,6 +128,12 @@ class Coarse(Adaptive):
     decay: float = 0.05
     optimizer: Optimizer = Agreeing()
     fit_steps: int = 150
+
+    def __post_init__(self) -> None:
+        check_fields(self, share="[0, 1]", max_steps="[0, inf)", rate="(0, inf)", decay="[0, 1]")
+        check_fields(self, fit_steps="[0, inf)")
+        if isinstance(self.optimizer, type) or not isinstance(self.optimizer, Optimizer):
+            raise TypeError(f"Coarse: optimizer is {self.optimizer!r}; give one, such as Adam()")
 
 
 COARSE_TO_FINE = replace(

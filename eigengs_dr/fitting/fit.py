@@ -27,13 +27,13 @@ from .levels import place_levels, sort_levels
 from .loop import Descent, FitProgress, Refinement, refine, sets_of
 from .loss import Loss, LossFunction, LossObjective
 from .measure import Row
-from .method import DEFAULT, Method
+from .method import DEFAULT, Method, Model
 from .objective import Pixels
 from .options import FitOptions, Goal, Start, named_options
 from .place import Adaptive
 from .problem import Map, PixelsOrPath, Problem, problem_of, problem_of_images
 from .search import fewest
-from .start import start_from
+from .start import set_in, start_from
 from .state import begin
 
 
@@ -75,6 +75,9 @@ class Fit:
     mean_image : ndarray of float32, shape (H, W, 3), or None
         RGB image to add to renderings of the set. The method of the paper EigenGS keeps the mean
         image of the model as pixels. The attribute `image` includes the mean image.
+    kept : int or None
+        How many Gaussians of the start were kept, before the first step; the others were placed
+        anew. None without a start.
     psnr_ycbcr, psnr_rgb : float
         PSNR of the set in dB, from its row of the trace; for maps, the means over the maps; NaN
         without an image.
@@ -94,6 +97,7 @@ class Fit:
     iterations: int
     stopped: str
     mean_image: NDArray[np.float32] | None = field(default=None, repr=False)
+    kept: int | None = field(default=None, repr=False)
     psnr_ycbcr: float = math.nan
     psnr_rgb: float = math.nan
     loss: float = math.nan
@@ -172,8 +176,10 @@ def fit(
         Instead of a placement, Gaussians to start from, scaled to the size of the image: the set of
         the previous frame of a video, a file, ``model.encode(image)``. A model stands for the set
         that it makes of the image, on shapes that suit many images. The set gets the cutoff of the
-        method. Gaussians that fit the image stay, the others are placed anew: all of them where a
-        placement would end higher. Those of a model, and without steps, all stay.
+        method. Gaussians are kept where the image is fitted much better than by a placement; the
+        others are placed anew: all of them if the whole is not much better. All Gaussians of a
+        model, without steps or without an image, are kept; so are all for a method that places
+        none anew, ``eigengs_dr.DEFAULT.without("places")``. ``result.kept`` says how many.
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
@@ -308,9 +314,10 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
             watch = Watch(started, problem.options.iterations, progress, interrupted)
             refinement, seconds_init = fit_loss(problem, watch)
             refinements = [refinement]
+            kept = None if problem.start is None else len(set_in(problem.start))
         else:
             problem = problem.balanced(problem.first_count)
-            pixels, begun, chosen = begin_fit(problem)
+            pixels, begun, kept = begin_fit(problem)
             if pixels.pictures[0].base is not None:
                 mean_image = pixels.picture(pixels.pictures[0].base).numpy()
             # The score must not refer to the descent that holds it: only the collector would free
@@ -324,18 +331,18 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
                 progress,
                 interrupted,
             )
-            refinements, seconds_init = _refined(problem, descent, begun, chosen, started)
-    return _finished(problem, refinements, mean_image, started, seconds_init)
+            refinements, seconds_init = _refined(problem, descent, begun, bool(kept), started)
+    return _finished(problem, refinements, mean_image, kept, started, seconds_init)
 
 
-def begin_fit(problem: Problem) -> tuple[Pixels, Gaussians | None, bool]:
-    """Return the squared error, the set to start from, and whether the user chose Gaussians of it.
+def begin_fit(problem: Problem) -> tuple[Pixels, Gaussians | None, int | None]:
+    """Return the squared error, the set to start from, and how many of the user's it holds.
 
     A method that starts from a model may change the squared error.
     """
     start, options, objective = problem.start, problem.options, problem.pixels()
     if start is None:
-        return objective, None, False
+        return objective, None, None
     if isinstance(start, Gaussians):
         start = problem.fitted(start)
     pixels = problem.channels[0].targets[0].pixels
@@ -348,7 +355,8 @@ def _refined(
     """Fit a given number of Gaussians, levels, or the fewest; and the seconds before refinement."""
     options, counts = problem.options, problem.levels
     objective, method = descent.objective, descent.method
-    if counts or method.place != Adaptive():  # the choice of a placement is not undone
+    given = isinstance(problem.start, Model)
+    if counts or given or method.place != Adaptive():  # a choice of the user is not undone
         method = method.without("grows", "places")
     if counts:
         begun = place_levels(
@@ -375,6 +383,7 @@ def _finished(
     problem: Problem,
     refinements: Sequence[Refinement],
     mean_image: NDArray[np.float32] | None,
+    kept: int | None,
     started: float,
     seconds_init: float,
 ) -> list[Fit]:
@@ -393,6 +402,7 @@ def _finished(
                 iterations=one.iterations,
                 stopped=one.stopped,
                 mean_image=mean_image,
+                kept=kept,
                 psnr_ycbcr=one.row.get("psnr_ycbcr", math.nan),
                 psnr_rgb=one.row.get("psnr_rgb", math.nan),
                 loss=one.row.get("loss", math.nan),

@@ -133,7 +133,8 @@ def fit_loss(problem: Problem, watch: Watch) -> tuple[Refinement, float]:
     if options.searches:
         refined = fewest(descent, start, problem.max_count, steps)
     else:
-        [refined] = refine(descent, begin(start, chosen=True), steps)
+        method = descent.method.without("grows", "places")  # the start is the choice of the user
+        [refined] = refine(replace(descent, method=method), begin(start), steps)
     if refined.stopped != "interrupted":
         objective.calls.check_use()
     trace += [{**row, "iteration": row["iteration"] + taken} for row in refined.trace]

@@ -52,7 +52,7 @@ def descend(
     """
     part = range(iterations) if part is None else part
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
-    factors, largest = method.rate_factors(iterations, state.chosen), 0
+    factors, largest = method.rate_factors(iterations), 0
     rates = rate_table(objective.types, method, factors)
     program = step_program(objective, method)
     with release_later(state), objective.models() as model_at, freeze_program(program) as take_step:

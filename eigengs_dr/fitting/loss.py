@@ -262,10 +262,7 @@ class Calls:
         step, before = self.step - 1, self.broken
         self.broken = None if math.isfinite(size.numpy()[0]) else step
         if self.broken is not None and before is not None:
-            raise ValueError(
-                f"loss: its value is finite, but not its derivative at steps {before} and {step}; "
-                "dr.sqrt has none at 0: take dr.sqrt(x + 1e-8)"
-            )
+            raise _no_derivative(f"steps {before} and {step}")
 
     def check(self) -> None:
         """Raise ValueError if a value was not finite."""
@@ -274,6 +271,8 @@ class Calls:
         total = float(np.asarray(dr.slice(self.total)).reshape(-1)[0])
         first, self.checked, self.total = self.checked, self.step, 0.0
         if not math.isfinite(total):
+            if self.broken is not None:  # which made the picture so
+                raise _no_derivative(f"step {self.broken}")
             steps = f"step {first}" if self.step - first == 1 else f"steps {first}-{self.step - 1}"
             raise ValueError(f"loss: its value is {total:g} at {steps}; it must be finite")
         self.is_zero &= total == 0
@@ -287,15 +286,26 @@ class Calls:
         return mean
 
     def check_use(self) -> None:
-        """Raise ValueError if no step of a fit had a derivative, unless its loss was least, 0."""
+        """Raise ValueError if no step of a fit had a derivative, unless its loss was least, 0.
+
+        One that was not finite is an error in any case.
+        """
         self.check()
-        idle = self.step > 0 and self.unit is None and self.broken is None
-        if idle and not (self.depends and self.is_zero):
+        if self.unit is None and self.broken is not None:
+            raise _no_derivative(f"step {self.broken}")
+        if self.step > 0 and self.unit is None and not (self.depends and self.is_zero):
             raise ValueError(
                 "loss: its value does not depend on the picture at any step; compute it by Dr.Jit "
                 "from the picture that it is given (a NumPy array has no derivative, and dr.freeze "
                 "passes none on)"
             )
+
+
+def _no_derivative(steps: str) -> ValueError:
+    return ValueError(
+        f"loss: its value is finite, but not its derivative at {steps}; dr.sqrt has none at 0: "
+        "take dr.sqrt(x + 1e-8)"
+    )
 
 
 USUAL = 2.0**-15

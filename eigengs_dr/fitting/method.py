@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import plain_numbers
+from ..backend.doors import check_fields
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
 from .control import (
@@ -111,20 +111,14 @@ class Method:
     """Whether the start must be a model."""
 
     def __post_init__(self) -> None:
-        for name, value in plain_numbers(vars(self), Method.__annotations__).items():
-            object.__setattr__(self, name, value)
+        check_fields(self, warm_up="[0, inf)", decay="[0, 1]", drift="[0, inf)")
+        check_fields(self, rate_exponent="[0, inf)", average="[0, 1)", solve_steps="[0, inf)")
+        check_fields(self, cutoff=f"(0, {MAX_CUTOFF:g}]")
         self._check_parts()
-        if not 0 < self.cutoff <= MAX_CUTOFF:
+        if self.average and self.controls:
             raise ValueError(
-                f"cutoff is {self.cutoff}; it must be above 0 and at most {MAX_CUTOFF:g}"
+                f"average is {self.average}; it must be 0 with controls, which exchange Gaussians"
             )
-        if not 0 <= self.average < 1 or (self.average and self.controls):
-            raise ValueError(
-                f"average is {self.average}; it must be in [0, 1), and 0 with controls, which "
-                "exchange Gaussians"
-            )
-        if self.solve_steps < 0:
-            raise ValueError(f"solve_steps is {self.solve_steps!r}; it must be at least 0")
         every = {phase_of(c): getattr(c, "every", 0) for c in reversed(self.controls)}
         if every.get("grows") and not 0 < every.get("moves", 0) <= every["grows"]:
             raise ValueError(
@@ -145,8 +139,9 @@ class Method:
                     f"{kind.__module__}.{kind.__name__}"
                 )
         rates = self.rates if isinstance(self.rates, Mapping) else {}
-        if not rates or not all(isinstance(r, Real) and r > 0 for r in rates.values()):
-            raise ValueError(f"Method: rates are {self.rates!r}; each must be above 0")
+        plain = all(isinstance(r, Real) and not isinstance(r, bool) for r in rates.values())
+        if not (rates and plain and all(0 < r < math.inf for r in rates.values())):
+            raise ValueError(f"Method: rates are {self.rates!r}; each must be above 0 and finite")
 
     def __hash__(self) -> int:  # a dictionary has none
         return hash(tuple(sorted(self.rates.items())))
@@ -155,13 +150,12 @@ class Method:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])
 
-    def rate_factors(self, iterations: int, chosen: bool = False) -> list[float]:
+    def rate_factors(self, iterations: int) -> list[float]:
         """Return the factors of the learning rates at all steps: half a cosine down to `decay`.
 
-        The steps before a redistribution have their own cosine, which gains 0.03 to 0.1 dB;
-        but not if the user chose the Gaussians, which then mostly stay.
+        The steps before a redistribution have their own cosine, which gains 0.03 to 0.1 dB.
         """
-        first, factors = 0 if chosen else self.first_phase(iterations), []
+        first, factors = self.first_phase(iterations), []
         for length in (first, iterations - first):
             falling = [0.5 * (1 + math.cos(math.pi * step / length)) for step in range(length)]
             factors += [self.decay + (1 - self.decay) * along for along in falling]

@@ -76,7 +76,8 @@ class Goal:
     Attributes
     ----------
     psnr : float
-        In dB, above 0 and at most 100.
+        In dB, above 0 and at most 100. A picture whose psnr_ycbcr is above 100 reaches each: in 8
+        bits, rounding errors at halves of levels, as of a constant 0.5, leave about 50 dB.
     space : {"rgb", "ycbcr"}
         Whether it is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light above 1 have
         only one PSNR, see `key`.

@@ -7,6 +7,7 @@ colour solve, or, where each map has a goal, over the error of its goal.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -212,7 +213,7 @@ class Problem:
                 # The PSNR without an error is infinite, and the difference of two such is not a
                 # number.
                 margin = min(
-                    min(pair[goal.key(c.space)], MAX_PSNR) - (c.goal or goal.psnr)
+                    min(_reached(pair, goal.key(c.space)), MAX_PSNR) - (c.goal or goal.psnr)
                     for c, pair in reached
                 )
                 if self.has_maps:
@@ -234,6 +235,14 @@ class Problem:
 
 
 _FIGURES = ("psnr_ycbcr", "psnr_rgb")
+
+
+def _reached(pair: dict[str, float], key: str) -> float:
+    """Return the PSNR that counts for a goal: an exact picture reaches each.
+
+    In 8 bits, 127.5 rounds to either side: rounding errors of floats would make about 50 dB of it.
+    """
+    return math.inf if pair["psnr_ycbcr"] > MAX_PSNR else pair[key]
 
 
 def _mean(figures: list[float]) -> float:
@@ -282,6 +291,8 @@ def problem_of_images(
 ) -> Problem:
     """Return the problem of an image, or of a batch of images of one size."""
     start = None if options.start is None else load_start(options.start, options.backend)
+    if start is not None and len(images) > 1:
+        raise ValueError("a start is for one image; fit_many fits each image from it on its own")
     if isinstance(start, Gaussians):
         one_image(start)
     requested = options.space or (YCBCR if start is None else set_in(start).space)

@@ -195,7 +195,8 @@ class _Run:
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Place `count` Gaussians anew, denser where a set leaves more error."""
         near = self.around(gaussians)
-        return redistribute(gaussians, near, count, self.descent.method.solve_steps)
+        descent = self.descent
+        return redistribute(gaussians, near, count, descent.method.solve_steps, descent.key)
 
     def around(self, gaussians: Gaussians) -> Pixels:
         """Return the squared error that stands for the objective near a set."""

@@ -10,21 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..backend.types import Float
-from ..gaussian.gaussians import Fitted, Gaussians, concatenate, set_of
+from ..gaussian.gaussians import Fitted, Gaussians, set_of
 from ..image.space import Space
-from .control import densify, in_order, prune
+from .control import MAX_ERROR, merged
 from .method import Method, Model
 from .objective import Pixels
 from .options import FitOptions, Start
-from .placement.redistribution import Owners, error_by_pixel
-from .solve import solve
+from .placement.redistribution import error_by_pixel
 
-MAX_ERROR, TRUSTED_STEPS = 0.4, 50
-"""Largest squared error of a start over that of a placement, and the steps from which on it holds;
-it rises to 1 for no steps. A placement gains more from many steps than Gaussians that are fitted
-already: of eight frames that move by a pixel or grow (astronaut, 500 Gaussians, 20 to 100 steps),
-0.4 ends at most 0.28 dB below fits of their own, 0.55 and 1 up to 0.5 and 0.8 dB."""
+MAX_RATIO = 0.75
+"""Largest squared error of a set with Gaussians of a start over that of a placement, which gains
+more from the steps that follow than Gaussians which are fitted already."""
+
+TRUSTED_STEPS = 100
+"""Steps of a descent from which on `MAX_ERROR` holds; for fewer it rises, to 1 for none."""
 
 
 def load_start(start: Start | Fitted, backend: str | None) -> Gaussians | Model:
@@ -88,11 +87,11 @@ def start_from(
     pixels: NDArray[np.float32],
     iterations: int,
     seed: int,
-) -> tuple[Pixels, Gaussians, bool]:
-    """Return the objective, what a descent starts from, and whether it holds the user's Gaussians.
+) -> tuple[Pixels, Gaussians, int]:
+    """Return the objective, what a descent starts from, and how many Gaussians of the start it has.
 
-    Those of a set stay where they fit the image, see `keep_fitting`. Those of a model all stay: the
-    user chose its shapes.
+    Those of a set stay where they fit the image, see `keep_fitting`. All stay without steps, of a
+    model, whose shapes the user chose, and for a method that places nothing anew.
 
     Parameters
     ----------
@@ -109,25 +108,22 @@ def start_from(
     """
     if not isinstance(start, Gaussians):
         objective, gaussians = method.start_from_model(objective, start, pixels)
-        return objective, gaussians.bounded() if iterations else gaussians, True
+        return objective, gaussians.bounded() if iterations else gaussians, len(gaussians)
     gaussians = replace(start.scaled(*objective.size), cutoff=float(method.cutoff))
-    if not iterations or method.place.has_colors:
-        gaussians = gaussians.bounded() if iterations else gaussians
-        return objective, method.start_from(objective, gaussians), True
-    started = method.start_from(objective, gaussians.bounded())
-    return objective, *keep_fitting(started, objective, method, iterations, seed)
+    gaussians = method.start_from(objective, gaussians.bounded() if iterations else gaussians)
+    if not iterations or method.place.has_colors or not method.in_phase("places"):
+        return objective, gaussians, len(gaussians)
+    return objective, *keep_fitting(gaussians, objective, method, iterations, seed)
 
 
 def keep_fitting(
     start: Gaussians, objective: Pixels, method: Method, iterations: int, seed: int
-) -> tuple[Gaussians, bool]:
-    """Keep the Gaussians of a start where they fit an image better than a placement does.
+) -> tuple[Gaussians, int]:
+    """Keep the Gaussians of a start where they fit an image much better than a placement does.
 
-    A Gaussian stays if the squared error of what it owns, see `Owners`, is at most that of as many
-    Gaussians that the method places by the image. The others make room for those of the placement
-    that are better there. If this set is not much better than the placement, see `MAX_ERROR`, the
-    placement is the start. Cost: a placement, three colour solves and a pruning, about 30
-    steps long; where all Gaussians stay, a placement and a solve.
+    See `merged`. If the whole is not much better than the placement, see `MAX_RATIO`, the placement
+    is the start. Cost: a placement, three colour solves and a pruning, about 30 steps long; where
+    all Gaussians stay, a placement and a solve.
 
     Parameters
     ----------
@@ -144,44 +140,12 @@ def keep_fitting(
     -------
     Gaussians
         As many as the start has.
-    kept : bool
-        Whether it holds Gaussians of the start.
+    kept : int
+        How many of them are Gaussians of the start.
     """
     placed = method.place_and_solve(objective, len(start), seed)
-    with dr.suspend_grad():
-        errors = [error_by_pixel(one, objective) for one in (start, placed)]
-        stays = _fits_better(start, *errors)
-        mixed = start
-        if not stays.all() and stays.any():
-            mixed = _mixed(start, placed, stays, ~_fits_better(placed, *errors), objective, method)
-        errors.append(error_by_pixel(mixed, objective))
-        old, new, both = (dr.sum(error)[0] for error in errors)
     largest = 1 - (1 - MAX_ERROR) * min(1, iterations / TRUSTED_STEPS)
-    if min(old, both) > largest * new:
-        return placed, False
-    return (mixed if both < old else start), True
-
-
-def _fits_better(gaussians: Gaussians, first: Float, second: Float) -> NDArray[np.bool_]:
-    """Return where the first error (pixels,) of what a Gaussian owns is at most the second."""
-    shares = [share.numpy() for share in Owners.of(gaussians).collect(first, second)]
-    return np.less_equal(*shares)
-
-
-def _mixed(
-    start: Gaussians,
-    placed: Gaussians,
-    stays: NDArray[np.bool_],
-    comes: NDArray[np.bool_],
-    objective: Pixels,
-    method: Method,
-) -> Gaussians:
-    """Return as many Gaussians as a start has: those that stay, and those that come instead."""
-    parts = [start[stays]]
-    if comes.any():
-        parts.append(replace(placed[comes], background=0 * placed.background))
-    both = solve(concatenate(parts), objective, method.solve_steps, warm_start=True)
-    both = densify(prune(both, objective, len(start)), objective, len(start))
-    if len(both) < len(start):  # no place is left where another Gaussian would help
-        return start
-    return in_order(solve(both, objective, method.solve_steps, warm_start=True))
+    both, kept = merged(start, placed, objective, len(start), largest, method.solve_steps)
+    with dr.suspend_grad():
+        old, new = (dr.sum(error_by_pixel(one, objective))[0] for one in (both, placed))
+    return (both, kept) if old <= MAX_RATIO * new else (placed, 0)

@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 import drjit as dr
 
 from ..backend.arrays import rsqrt, types_of
+from ..backend.doors import check_fields
 from ..backend.types import Float, FloatLike, Rows
 from ..gaussian.gaussians import Gaussians
 from ..raster.binning.lists import TileLists
@@ -163,7 +164,7 @@ class Adam:
     Raises
     ------
     ValueError
-        If a beta is outside [0, 1).
+        If a beta is outside [0, 1), or epsilon is negative or not finite.
     """
 
     beta_1: float = 0.9
@@ -171,9 +172,7 @@ class Adam:
     epsilon: float = 1e-8
 
     def __post_init__(self) -> None:
-        betas = (self.beta_1, self.beta_2)
-        if not all(0 <= beta < 1 for beta in betas):
-            raise ValueError(f"Adam: betas are {betas}; each must be in [0, 1)")
+        check_fields(self, beta_1="[0, 1)", beta_2="[0, 1)", epsilon="[0, inf)")
 
     def start(self, value: Rows) -> tuple[Rows, ...]:
         """Return the moments before the first step; see `Optimizer`."""
@@ -236,7 +235,7 @@ class State:
     surplus : int
         How many more a control may place before the last ones have left.
     chosen : bool
-        Whether the fit started from Gaussians of the user, which a redistribution keeps.
+        Whether the fit started from Gaussians of the user: a redistribution keeps those that fit.
     squares : Float or None, shape (images,)
         The sums of ``h (p - t)^2`` that a control has measured before this step.
     speed : float

@@ -289,5 +289,5 @@ def rate_scale_of(color: Sequence[Float], exponent: float, images: int = 1) -> F
         mean = dr.gather(types.Float, dr.block_sum(length, count), image)
     mean *= dr.opaque(types.Float, 1 / count)
     ratio = dr.select(mean > 0, mean / length, types.Float(1))
-    bound = MAX_RATE_SCALE ** (1 / exponent)
+    bound = MAX_RATE_SCALE ** min(1 / exponent, 150)  # as single precision holds it
     return dr.clip(ratio, 1 / bound, bound) ** exponent

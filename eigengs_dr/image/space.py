@@ -144,6 +144,10 @@ class Space(str):
     to_rgb: NDArray[np.floating] = np.eye(3)
     page_kind = 0
 
+    def __new__(cls, name: str) -> Space:
+        """Return the space of a name, see `space_of`; a name that is none raises ValueError."""
+        return space_of(name) if cls is Space and name != "rgb" else super().__new__(cls, name)
+
     def __reduce__(self) -> tuple:
         return space_of, (str(self),)
 

@@ -42,7 +42,7 @@ from .block import (
 )
 from .draw import block_errors
 from .grid import Block, BlockSets, allocate, choose_halo, divide
-from .manifest import ImageRow, RowProgress, list_sources
+from .manifest import ImageRow, RowProgress, described, list_sources
 from .run import figures_of, run_pieces
 from .windows import Source, open_source
 
@@ -197,7 +197,7 @@ def fit_large(
         row = replace(row, output=Path(output))
         names = ("iterations", "space", "seed", "encoding")
         stored = {name: getattr(options, name) for name in names}
-        stored |= {"method": repr(method), "gaussians": settings.gaussians, "block": block}
+        stored |= {"method": described(method), "gaussians": settings.gaussians, "block": block}
         keep = open_checkpoint(output, source.identity | stored, [])
     run = LargeRun(source, blocks, settings, executor_for(client), row, progress)
     try:

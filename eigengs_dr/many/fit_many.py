@@ -16,7 +16,7 @@ from ..fitting.start import load_start, set_in
 from ..image.io import check_data, read_floats
 from ..image.pixels import EncodedImage
 from ..image.space import YCBCR
-from .manifest import ImageRow, Images, fingerprint
+from .manifest import ImageRow, Images, described, fingerprint
 from .run import Job, run_images
 
 MAX_SIDE = 256
@@ -154,7 +154,7 @@ def _read(image: Any, name: str, options: FitOptions) -> EncodedImage:
 def _settings_of(settings: FitOptions) -> dict[str, Any]:
     """Return the options on which results depend; a start is replaced by its fingerprint."""
     options = {name: value for name, value in vars(settings).items() if name != "backend"}
-    options |= {"method": repr(settings.method), "space": settings.space or YCBCR}
+    options |= {"method": described(settings.method), "space": settings.space or YCBCR}
     if settings.goal:
         options["target_psnr"] = vars(settings.goal)
     if isinstance(settings.gaussians, tuple):

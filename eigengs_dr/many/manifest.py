@@ -12,10 +12,13 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
+from inspect import getclosurevars
+from numbers import Real
 from pathlib import Path
+from types import FunctionType
 from typing import Any, BinaryIO, NamedTuple
 from zipfile import is_zipfile
 
@@ -58,6 +61,8 @@ class ImageRow:
         time of a group is divided equally.
     iterations : int or None
         Number of refinement steps; None for encoded images.
+    kept : int or None
+        How many Gaussians of a start it began with, see `eigengs_dr.Fit`; None without a start.
     stopped : str
         Why the fit ended, see `eigengs_dr.Fit`; empty for encoded images.
     error : str
@@ -77,6 +82,7 @@ class ImageRow:
     psnr_rgb: float | None = None
     seconds: float | None = None
     iterations: int | None = None
+    kept: int | None = None
     stopped: str = ""
     error: str = ""
     result: Any = field(default=None, repr=False)
@@ -190,7 +196,9 @@ STATUSES = ("done", "skipped", "failed")
 KEYS = [*(field.name for field in fields(ImageRow) if field.name != "result"), "options"]
 """Keys of a row."""
 
-SKIPPED = ("width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", "iterations")
+SKIPPED = (
+    "width", "height", "gaussians", "psnr_ycbcr", "psnr_rgb", "seconds", "iterations", "kept"
+)  # fmt: skip
 """Figures of a result that a later run takes from its row."""
 
 
@@ -384,6 +392,51 @@ def fingerprint(start: Gaussians | Model) -> str:
     arrays = *set_in(start).to_arrays().values(), *getattr(start, "weights", ())
     data = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     return hashlib.sha256(data).hexdigest()[:16]
+
+
+def described(value: Any, holders: tuple[int, ...] = ()) -> Any:
+    """Return an option as JSON holds it, by its values: equal ones are equal in every process.
+
+    An object is the full name of its class with its attributes, whatever its repr shows; a function
+    its full name with what it encloses; an array its hash.
+
+    Parameters
+    ----------
+    value : object
+    holders : tuple of int, optional
+        Identities of the objects around it; one that holds itself ends there.
+    """
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, Real):
+        return value if math.isfinite(value) else str(value)  # NaN differs from itself
+    named = value if isinstance(value, (type, FunctionType)) else type(value)
+    name, within = f"{named.__module__}.{named.__qualname__}", (*holders, id(value))
+    if isinstance(value, type) or id(value) in holders:
+        return name
+    if isinstance(value, Mapping):
+        return {str(key): described(one, within) for key, one in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [described(one, within) for one in value]
+    if isinstance(value, (set, frozenset)):
+        return sorted((described(one, within) for one in value), key=str)
+    if hasattr(value, "__array__"):
+        array = np.ascontiguousarray(value)
+        return f"{name} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()[:16]}"
+    attributes: Any = None
+    if isinstance(value, FunctionType):
+        attributes = [getclosurevars(value).nonlocals, value.__defaults__]
+    elif "__dataclass_fields__" in vars(named):  # a subclass may have attributes of its own
+        attributes = {f.name: getattr(value, f.name) for f in fields(value)}
+    else:
+        with suppress(TypeError):  # of what cannot be copied, such as a lock
+            made = value.__reduce_ex__(2)
+            attributes = made if isinstance(made, str) else list(made[1:])
+            if made[0].__name__ == "__newobj__" and isinstance(made[2], Mapping):
+                attributes = made[2]
+    if isinstance(attributes, Mapping):
+        return {"class": name} | described(attributes, within)
+    return {"class": name, "values": described(attributes, within)}
 
 
 def _to_json(row: ImageRow) -> Record:

@@ -52,7 +52,7 @@ MAX_WRITING = 8
 FAILURES = (ValueError, OSError, MemoryError)
 """Errors of one image, which do not end the run."""
 
-FIGURES = ("psnr_ycbcr", "psnr_rgb", "iterations", "stopped")
+FIGURES = ("psnr_ycbcr", "psnr_rgb", "iterations", "kept", "stopped")
 """Figures of a fit in a row."""
 
 Piece = TypeVar("Piece")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
+from ..backend.doors import check_fields
 from ..backend.types import Float, Rows
 from ..fitting.state import debias, zeros_like
 
@@ -42,8 +43,9 @@ class Adan:
     epsilon: float = 1e-8
 
     def __post_init__(self) -> None:
-        if not all(0 <= beta < 1 for beta in self.betas):
-            raise ValueError(f"Adan: betas are {self.betas}; each must be in [0, 1)")
+        check_fields(self, epsilon="[0, inf)")
+        if len(self.betas) != 3 or not all(0 <= beta < 1 for beta in self.betas):
+            raise ValueError(f"Adan: betas are {self.betas}; give three in [0, 1)")
 
     def start(self, value: Rows) -> tuple[Rows, ...]:
         """Return the initial moments and gradient; see `Optimizer`."""

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -200,10 +201,27 @@ def to_json(settings: Record) -> Record:
     return plain
 
 
-def difference(stored: Record, settings: Record) -> str:
+def difference(stored: Record, settings: Record, of: str = "") -> str:
     """Describe settings that differ, as in "gaussians 500 instead of 900"; empty if none does.
 
-    Record that only one of the two has, because another version wrote the file, are ignored.
+    Those that only one of the two has, because another version wrote the file, are ignored. What
+    differs inside of one is named by its path, as in "method.rates.mean 0.4 instead of 0.2".
     """
-    changed = [key for key in settings if key in stored and stored[key] != settings[key]]
-    return ", ".join(f"{key} {stored[key]} instead of {settings[key]}" for key in changed)
+    changes = []
+    for key in settings if not of else dict.fromkeys([*stored, *settings]):
+        old, new, name = stored.get(key), settings.get(key), f"{of}{key}"
+        if old == new or not (of or key in stored):
+            continue
+        if isinstance(old, list) and isinstance(new, list):
+            old, new = ({str(k): one for k, one in enumerate(v)} for v in (old, new))
+        if isinstance(old, dict) and isinstance(new, dict) and old.get("class") == new.get("class"):
+            changes.append(difference(old, new, f"{name}."))
+        else:
+            changes.append(f"{name} {_brief(old)} instead of {_brief(new)}")
+    return ", ".join(changes)
+
+
+def _brief(value: Any) -> str:
+    """Return a stored value in a line; of an object, the name of its class."""
+    text = str(value.get("class", value) if isinstance(value, dict) else value)
+    return " ".join(text.split())[:80]

@@ -17,7 +17,7 @@ from eigengs_dr.fitting.control import (
     Surplus,
     round_steps,
 )
-from eigengs_dr.fitting.loop import Descent, descend, refine
+from eigengs_dr.fitting.loop import Descent, descend, last, refine
 from eigengs_dr.fitting.measure import Measured
 from eigengs_dr.fitting.objective import Part
 from eigengs_dr.fitting.state import begin
@@ -25,7 +25,7 @@ from eigengs_dr.fitting.state import begin
 COUNT, STEPS = 30, 100
 
 
-def often(every=15, share=1.0):
+def often(every=5, share=1.0):
     """The default method with rounds in short descents too."""
     rounds = Surplus(share, every=every), Redistribute(), Relocate(every), Perturb(every=every)
     return replace(eg.DEFAULT, controls=(Retreat(), *rounds))
@@ -54,7 +54,8 @@ def test_redistribution_comes_after_a_tenth_of_a_short_descent():
 
 
 def test_how_large_a_surplus_is():
-    assert Surplus(every=45).number(1000, 256 * 256, 280) == 400  # four rounds
+    assert Surplus(every=45).number(1000, 256 * 256, 600) == 0  # eight rounds
+    assert Surplus(every=45).number(1000, 256 * 256, 800) == 500  # eleven
     assert Surplus(every=45).number(1000, 256 * 256, 90) == 0  # none
     assert Surplus(0.0).number(1000, 256 * 256, 980) == 0
     assert Surplus().number(5000, 256 * 256, 1000) == 0  # dense enough
@@ -91,10 +92,14 @@ def test_levels_and_parts_are_not_placed_anew(what):
     assert acts(Redistribute(), state, replace(objective, **what), 20) is state
 
 
-def test_chosen_gaussians_are_not_placed_anew():
-    gaussians, objective = placed()
-    state = begin(gaussians, chosen=True)
-    assert acts(Redistribute(), state, objective, 20) is state
+def test_chosen_gaussians_stay_where_they_fit():
+    """Where half of the set has no error, no redistribution is better; the surplus comes too."""
+    gaussians, objective = fitted(150, image=eg.sample("coffee")[100:164, 200:264])
+    fits = last(descend(objective, eg.DEFAULT, begin(gaussians), 300), gaussians)
+    state = replace(begin(fits, chosen=True), surplus=7)
+    found = acts(Redistribute(), state, objective, 20).gaussians
+    assert len(found) == 157
+    assert np.isin(fits.mean.numpy()[0], found.mean.numpy()[0]).mean() > 0.7
 
 
 def test_a_retreat_returns_where_the_error_has_risen():
@@ -208,15 +213,15 @@ def test_a_descent_ends_with_the_number_asked_for(backend):
     gaussians, objective = placed(backend=backend)
     states = descend(objective, often(), begin(gaussians), STEPS)
     counts = [state.total for state in states]
-    more = Surplus(every=15).number(COUNT, SIDE * SIDE, STEPS)
+    more = Surplus(every=5).number(COUNT, SIDE * SIDE, STEPS)
     assert more > 0
-    assert set(counts[:10]) == {COUNT} and counts[10] == COUNT + more
+    assert set(counts[:10]) == {COUNT} and counts[10] in range(COUNT + 1, COUNT + more + 1)
     assert (np.diff(counts[10:]) <= 0).all() and counts[-1] == COUNT
 
 
 def test_a_recorded_step_serves_all_counts(backend):
     """Without recording the descent is the same, although Gaussians come and go."""
-    controls = Surplus(every=10), Redistribute(after=5), Relocate(10), Perturb(every=10)
+    controls = Surplus(every=3), Redistribute(after=5), Relocate(3), Perturb(every=3)
     method, ends, counts = replace(eg.DEFAULT, controls=controls), [], set()
     for recorded in (True, False):
         with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, recorded):
@@ -224,7 +229,7 @@ def test_a_recorded_step_serves_all_counts(backend):
             for state in descend(objective, method, begin(gaussians), 60, part=range(42)):
                 counts.add(state.total)
             ends.append(state.gaussians.to_arrays())
-    assert len(counts) == 4
+    assert len(counts) > 4
     for name, values in ends[0].items():
         np.testing.assert_array_equal(ends[1][name], values)
 
@@ -233,7 +238,7 @@ def test_a_fit_with_a_surplus_after_fits_of_other_sizes():
     """Programs that were recorded for fewer Gaussians are not replayed for more."""
     image = eg.sample("coffee")[:128, :128]
     for count in (60, 250):
-        found = eg.fit(image, count, iterations=200, method=often(30))
+        found = eg.fit(image, count, iterations=200, method=often(10))
         assert len(found.gaussians) == count
         assert found.psnr_ycbcr > found.trace[0]["psnr_ycbcr"] + 2
 
@@ -284,7 +289,7 @@ def test_an_interrupt_in_between_leaves_the_number_asked_for(color):
 def test_an_interrupt_after_the_last_round_keeps_the_best_set_before_it():
     """Just after noise the last step is poor; the best set with a surplus is pruned as well."""
     image = picture()
-    last_round = round_steps(15, 200)[-1]
+    last_round = round_steps(5, 200)[-1]
 
     def stop(iteration, iterations, row):
         if iteration >= last_round:

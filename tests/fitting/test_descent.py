@@ -83,14 +83,15 @@ def test_a_part_of_the_steps(backend):
     assert squared_error(whole, objective) < 0.9 * squared_error(gaussians, objective)
 
 
-@pytest.mark.parametrize("chosen", [False, True])
-def test_rates(backend, chosen):
+@pytest.mark.parametrize("places", [False, True])
+def test_rates(backend, places):
     """Half a cosine, which ends near what `decay` leaves; another one before a redistribution."""
     steps, rates = 200, {"mean": 0.1, "factor": 0.2, "color": 0.3}
     method = replace(eg.DEFAULT, rates=rates, decay=0.25)
-    factors = method.rate_factors(steps, chosen)
+    method = method if places else method.without("places")
+    factors = method.rate_factors(steps)
     table = rate_table(types_in(select(backend)), method, factors).numpy().reshape(steps, 3)
-    lengths = (200,) if chosen else (20, 180)
+    lengths = (20, 180) if places else (200,)
     left = [0.25 + 0.75 * 0.5 * (1 + np.cos(np.pi * np.arange(n) / n)) for n in lengths]
     expected = np.outer(np.concatenate(left), list(rates.values()))
     np.testing.assert_allclose(table, expected, rtol=1e-5)

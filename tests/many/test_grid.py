@@ -67,7 +67,7 @@ def test_rounds_take_every_step_once(iterations):
 
 def test_rates_rise_from_the_start_of_a_part():
     """By the sums of the rates between builds, which bound how far Gaussians move."""
-    factors = DEFAULT.rate_factors(100, chosen=True)
+    factors = DEFAULT.without("places").rate_factors(100)
 
     def moved(step, since):
         end, moves = next_build(DEFAULT, DEFAULT.drift, factors, step, step + 1, since)

@@ -202,7 +202,7 @@ def target_density(owners: Owners, error: Float, bending: Float) -> Float:
 
 
 def redistribute(
-    gaussians: Gaussians, objective: Pixels, count: int, solve_steps: int = 10
+    gaussians: Gaussians, objective: Pixels, count: int, solve_steps: int = 10, seed: int = 0
 ) -> Gaussians:
     """Place a new set, denser where the old set left more error, and solve for its colours.
 
@@ -215,6 +215,8 @@ def redistribute(
         Number of Gaussians of the new set of each image.
     solve_steps : int, optional
         Steps of the colour solve, see `eigengs_dr.fitting.solve`.
+    seed : int, optional
+        See `place_adaptive`.
 
     Returns
     -------
@@ -239,5 +241,5 @@ def redistribute(
             bending = batch_to_tiles(objective.types, default[..., None])
             return planes_of(target_density(parts, seen, bending), parts.lists.grid)[:, 0]
 
-        placed = place_adaptive(objective, count, gaussians.cutoff, density)
+        placed = place_adaptive(objective, count, gaussians.cutoff, density, seed)
     return solve(placed, objective, solve_steps)
