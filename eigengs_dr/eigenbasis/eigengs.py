@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -321,7 +321,7 @@ class EigenGS:
         Parameters
         ----------
         path : path-like
-            A file, or a name in `SHIPPED`; the latter are read once and cached.
+            A file, or a name in `SHIPPED`.
         backend : {"llvm", "cuda"}, optional
 
         Raises
@@ -330,7 +330,7 @@ class EigenGS:
             As for `eigengs_dr.Gaussians.load`; also if there is no such file or name.
         """
         if path in SHIPPED:
-            return _shipped(str(path), backend)
+            return cls(**read_model(SHIPPED[str(path)], backend))
         if not Path(path).is_file():
             names = ", ".join(SHIPPED)
             raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
@@ -353,11 +353,6 @@ def _encode_all(
 ) -> list[Gaussians]:
     """Encode images, in this process or on a worker."""
     return [model.encode(image, *options) for image in images]
-
-
-@cache  # files of the package do not change
-def _shipped(name: str, backend: str | None) -> EigenGS:
-    return EigenGS(**read_model(SHIPPED[name], backend))
 
 
 def check_coding(colors: str, mean: str, target_psnr: float | None) -> None:
