@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.doors import door
+from eigengs_dr.backend.messages import warn
 from eigengs_dr.backend.recording import freeze_rendering
 from eigengs_dr.backend.types import ArrayLike
 from eigengs_dr.fitting.loss import Loss
@@ -253,13 +254,25 @@ class _Photos:
                 self.known.update(leaves | {key: dr.detach(value) for key, value in others.items()})
                 try:
                     value = self.add_slopes(*drawn, *seen)
-                except RuntimeError:  # Dr.Jit cannot record projective integrators, say
-                    self.add_slopes = _add_slopes
+                except RuntimeError as error:
+                    self._give_up_recording(error)
                     dr.clear_grad(leaves)
-                    value = self.add_slopes(*drawn, *seen)
+                    value = _add_slopes(*drawn, *seen)  # a lasting error is raised here
             finally:
                 self.known.update(texels | others)
             return value, dr.grad(leaves)
+
+    def _give_up_recording(self, error: RuntimeError) -> None:
+        """Record no more if Dr.Jit cannot, as for projective integrators; else say the error."""
+        cause: BaseException = error
+        while cause.__cause__:  # the contexts of Dr.Jit's errors form a ring
+            cause = cause.__cause__
+        if isinstance(cause, KeyboardInterrupt):  # Dr.Jit wraps it
+            raise cause
+        if "supported inside of frozen functions" in str(cause):
+            self.add_slopes = _add_slopes
+        else:
+            warn(f"photo_loss: a recording failed, its step renders anew: {reason_of(cause)}")
 
     def judge(self, picture: Any) -> Any:
         """Return the squared error of held-out pixels, see `JUDGE_SAMPLES`."""

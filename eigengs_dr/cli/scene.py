@@ -6,7 +6,6 @@ bitmaps of a scene by Gaussians.
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections.abc import Iterator, Sequence
@@ -23,6 +22,7 @@ from ..backend.interrupts import INTERRUPTED, Interrupted
 from ..backend.selection import backend_of, name_of, select
 from ..backend.types import Record
 from ..storage.atomic import atomic_write
+from ..storage.plain import parse_json
 from . import options
 from .console import MISSED, bar, print_message, table
 from .outputs import check_outputs, lock_outputs, name_outputs
@@ -53,7 +53,7 @@ def integrator(text: str) -> Record:
 def _value(text: str) -> object:
     """Parse a number or a boolean; other text is returned unchanged."""
     try:
-        return json.loads(text)
+        return parse_json(text)
     except ValueError:
         return text
 

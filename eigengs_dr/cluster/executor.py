@@ -7,7 +7,6 @@ A cluster is not changed: neither its plugins and its configuration nor the limi
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import re
 import threading
@@ -29,6 +28,7 @@ from distributed.scheduler import KilledWorker
 
 from ..backend.executor import ClusterError, Done, Function, Task, Value
 from ..backend.interrupts import defer_interrupts, terminate_as_interrupt
+from ..storage.plain import read_json
 from ..version import __version__
 from .local import local_cluster
 from .worker import package_versions, run_task, share
@@ -111,7 +111,7 @@ def connect(cluster: str) -> Iterator[Client]:
 def _check_scheduler_file(path: str) -> None:
     """Raise ValueError unless a file names an address; Dask would connect to None."""
     try:
-        str(json.loads(Path(path).read_bytes())["address"])
+        str(read_json(path)["address"])
     except (ValueError, KeyError, TypeError):
         raise ValueError(
             f"cluster {path!r} is not the file of a scheduler, as 'dask scheduler "

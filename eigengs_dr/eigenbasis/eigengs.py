@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -339,7 +339,7 @@ class EigenGS:
         Parameters
         ----------
         path : path-like
-            A file, or a name in `SHIPPED`; the latter are read once and cached.
+            A file, or a name in `SHIPPED`.
         backend : {"llvm", "cuda"}, optional
 
         Raises
@@ -348,7 +348,7 @@ class EigenGS:
             As for `eigengs_dr.Gaussians.load`; also if there is no such file or name.
         """
         if path in SHIPPED:
-            return _shipped(str(path), backend)
+            return cls(**read_model(SHIPPED[str(path)], backend))
         if not Path(path).is_file():
             names = ", ".join(SHIPPED)
             raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
@@ -377,11 +377,6 @@ def _read(image: Any, name: str, encoding: str | None) -> EncodedImage:
     """Read an image. An array is copied, because its owner may overwrite it."""
     pixels = check_member(image, encoding, f"image {name}")
     return EncodedImage(pixels if isinstance(image, Path | str) else pixels.copy(), "srgb")
-
-
-@cache  # files of the package do not change
-def _shipped(name: str, backend: str | None) -> EigenGS:
-    return EigenGS(**read_model(SHIPPED[name], backend))
 
 
 def check_coding(colors: str, mean: str, target_psnr: float | None) -> None:

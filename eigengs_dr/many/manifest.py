@@ -34,6 +34,7 @@ from ..image.folder import list_images
 from ..image.remote import is_url, stem_of
 from ..storage.atomic import atomic_write, lock_folder, refuse_link, remove_stale
 from ..storage.checkpoint import difference, to_json
+from ..storage.plain import parse_json
 
 
 @dataclass(frozen=True)
@@ -375,7 +376,7 @@ def read_manifest(path: Path) -> tuple[dict[str, Record], bool]:
     *lines, rest = path.read_text(encoding="utf-8", errors="replace").split("\n")
     for number, line in enumerate(lines, 1):
         try:
-            row = json.loads(line)
+            row = parse_json(line)
             if row["status"] not in STATUSES or not isinstance(row["name"], str):
                 raise ValueError
         except (ValueError, TypeError, KeyError):

@@ -58,8 +58,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     OSError
-        If the folder is missing or not writable, the target is a folder, a device or a URL, or the
-        disk is full. The message names the target.
+        If the folder is missing or not writable, the target is a folder, a device, a URL or a
+        read-only file, or the disk is full. The message names the target.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     with _names(path), _temporary(target, path) as temporary:
         # tempfile would make a file that only its owner may read.
         mode = target.stat().st_mode & 0o777 if target.exists() else 0o666
-        temporary.touch(mode | 0o200, exist_ok=False)
+        temporary.touch(mode, exist_ok=False)
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
@@ -169,6 +169,9 @@ def _target(path: str | os.PathLike[str]) -> Path:
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "a device"
         raise OSError(f"{path}: is {kind}; choose another path")
+    # A rename would replace it, and root may write anything: its owner's mode decides.
+    if target.exists() and not target.stat().st_mode & stat.S_IWUSR:
+        raise OSError(f"{path}: is read-only; allow writing (chmod u+w) or choose another path")
     return target
 
 
@@ -264,13 +267,16 @@ def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tup
                 os.lseek(descriptor, 0, os.SEEK_SET)
                 # Windows locks the first byte against readers. The length is that of what a killed
                 # run left, so that nobody reads a part.
-                os.write(descriptor, b"\0" + text[:LENGTH].ljust(LENGTH))
+                if os.write(descriptor, b"\0" + text[:LENGTH].ljust(LENGTH)) <= LENGTH:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                 return descriptor, True
         except OSError as error:
             if error.errno in NO_LOCKS:
                 return descriptor, False
+            with suppress(OSError):  # an empty lock of a full disk
+                path.unlink()
             os.close(descriptor)
-            raise
+            raise OSError(error.errno, error.strerror, os.fspath(output)) from error
         os.close(descriptor)
         if not locked:
             if time.monotonic() >= deadline:

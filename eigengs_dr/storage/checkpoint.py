@@ -16,6 +16,7 @@ from ..backend.interrupts import undone_at_end
 from ..backend.types import Arrays, Record
 from . import npz
 from .atomic import atomic_folder, lock_output, refuse_link, remove_folder, remove_stale
+from .plain import parse_json, read_json
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
 
@@ -82,7 +83,7 @@ def _resumed(folder: Path, settings: Record) -> Checkpoint | None:
         for path in folder.iterdir():
             refuse_link(path)
     try:
-        head = json.loads((folder / HEAD).read_text(encoding="utf-8"))
+        head = read_json(folder / HEAD)
         stored, files = dict(head["settings"]), [str(name) for name in head["files"]]
     except (OSError, ValueError, KeyError, TypeError):
         is_ours = folder.is_dir() and all(
@@ -188,7 +189,7 @@ def read_arrays(path: Path) -> Arrays:
     try:
         fields = {
             key: npz.Field(kind, ndim, MAX_ENTRIES)
-            for key, (kind, ndim) in json.loads(layout.tobytes()).items()
+            for key, (kind, ndim) in parse_json(layout.tobytes()).items()
         }
     except (ValueError, AttributeError, TypeError):
         raise ValueError(f"{path}: layout is damaged") from None
