@@ -26,7 +26,7 @@ def check():
 
 def test_names_are_where_the_manual_says(check):
     assert check["missing"]() == []
-    assert check["exists"]("eigengs_dr.fitting.placement.adaptive.target_density")
+    assert check["exists"]("eigengs_dr.fitting.placement.redistribution.target_density")
     assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.Canvas")
     assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.nothing")
 

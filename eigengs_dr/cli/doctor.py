@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import click
 
 from ..backend import doctor as machine
-from ..backend.arrays import types_of
 from ..backend.selection import BACKENDS
 from . import options
 from .console import MISSED, bar
@@ -80,6 +79,7 @@ def _render(gaussians: eg.Gaussians) -> None:
     import drjit as dr
     import mitsuba as mi
 
+    from ..backend.arrays import types_of
     from ..plugins import register_plugins, texture_of
 
     mi.set_variant(f"{types_of(gaussians.mean).backend}_ad_rgb")

@@ -8,7 +8,6 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from _helpers.process import SELECT, run_python
-from eigengs_dr.backend import doctor
 from eigengs_dr.backend import selection as module
 from eigengs_dr.backend.selection import (
     BACKENDS,
@@ -62,23 +61,6 @@ def test_cuda_is_the_default_where_there_is_a_gpu(monkeypatch):
     assert select() is select("cuda") is drjit.cuda.ad
     assert select("llvm") is drjit.llvm.ad
     assert select() is drjit.cuda.ad
-
-
-def test_a_gpu_that_ends_the_process_has_a_problem():
-    gpu = doctor.run_trial("fit", "cuda")
-    if gpu.problem == "":
-        pytest.skip("a GPU is here")
-    assert "no CUDA GPU or driver" in gpu.problem
-
-
-def test_figures_are_compared_by_their_largest_difference(monkeypatch):
-    trials = {"llvm": doctor.Trial(1.0, [2.0, -4.0]), "cuda": doctor.Trial(1.0, [2.0, -4.002])}
-    monkeypatch.setattr(doctor, "run_trial", lambda name, b: trials[b])
-    row = doctor.compare_backends("scene", "cuda")
-    assert row.agrees and row.difference == pytest.approx(5e-4)
-    for other in (doctor.Trial(1.0, [2.0]), doctor.Trial(1.0, [2.0, -4.0], "it crashed")):
-        trials["cuda"] = other
-        assert not doctor.compare_backends("scene", "cuda").agrees
 
 
 def test_metal_by_its_names(monkeypatch):

@@ -191,11 +191,11 @@ def test_a_cell_says_what_the_fit_says(backend):
 
 
 def test_cases_start_as_users_do(backend):
-    """From a useless start the default method places Gaussians anew."""
+    """A useless start is kept: the table shows the descent from it."""
     heap = case(place=cases.heap, gaussians=60, iterations=100)
     found = stability.measure_cell(heap, "default", backend)
     assert found["finite"] and found["gaussians"] == 60
-    assert found["end_ycbcr"] > found["start_ycbcr"] + 5
+    assert found["end_ycbcr"] > found["start_ycbcr"]
     stays = stability.measure_cell(heap, "gaussianimage", backend)
     assert stays["finite"] and stays["end_ycbcr"] < found["end_ycbcr"]
     assert stays["start_ycbcr"] < found["start_ycbcr"]  # it solves for no colours

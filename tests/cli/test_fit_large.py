@@ -39,9 +39,9 @@ def test_the_number_of_gaussians_does_not_depend_on_memory(photo, tmp_path, monk
     """Too little memory is an error that names blocks, where there are such."""
     command = ["fit", photo, "-o", tmp_path / "x.npz", "--iterations", 2]
     assert "5,000 Gaussians" in succeeded(run(*command)).stdout
-    monkeypatch.setattr(memory, "usable_memory", lambda: 200_000_000)
+    monkeypatch.setattr("eigengs_dr.storage.memory.usable_memory", lambda: 200_000_000)
     assert "5,000 Gaussians" in succeeded(run(*command)).stdout
-    monkeypatch.setattr(memory, "usable_memory", lambda: 100_000_000)
+    monkeypatch.setattr("eigengs_dr.storage.memory.usable_memory", lambda: 100_000_000)
     assert_refused(run(*command), "may use 0.1 GB; fit it with --blocks 1024, scale the image down")
     levels = run(*command, "--levels", 2, *FEW)
     assert_refused(levels, "may use 0.1 GB; scale the image down")
@@ -72,7 +72,7 @@ def test_large_fit_says_its_memory(tmp_path):
 )
 def test_a_fit_that_does_not_fit_is_refused(tmp_path, monkeypatch, grey, options, expected):
     """Grey becomes RGB, and a search starts with one Gaussian for 64 pixels."""
-    monkeypatch.setattr(memory, "usable_memory", lambda: 1)
+    monkeypatch.setattr("eigengs_dr.storage.memory.usable_memory", lambda: 1)
     path = tmp_path / "large.png"
     path.write_bytes(png(8000, 4000, 8, 0 if grey else 2, []))
     outputs = ["-o", tmp_path / "x.npz", "--preview", tmp_path / "p.png"]

@@ -21,7 +21,7 @@ def values():
 
 
 def fit(values, **options):
-    return eg.fit(values, **{"gaussians": 60, "iterations": 120, "space": "data", **options})
+    return eg.fit(values, **{"gaussians": 60, "iterations": 60, "space": "data", **options})
 
 
 def psnr_of_range(found, values):

@@ -301,7 +301,7 @@ def test_a_fit_knows_how_bright_its_photos_are(tmp_path):
     photos = np.stack([eg.render(model.relight(light)).numpy() for light in lights])
     for factor in (1, 1.4 / photos.max()):
         options = {"gaussians": 30, "planes": 2, "iterations": 2, "progress": False}
-        fitted = eg.Relightable.fit(factor * photos, lights, **options)
+        fitted = eg.Relightable.fit(factor * photos, lights, encoding="srgb", **options)
         assert fitted.brightest == pytest.approx(max(1, factor * photos.max()), rel=1e-5)
         for name in ("m.npz", "m.egs"):
             fitted.save(tmp_path / name) if name == "m.npz" else eg.pack(fitted, tmp_path / name)

@@ -68,7 +68,7 @@ def test_a_bitmap_that_is_better_stays(folder, tmp_path, monkeypatch):
     text = wall(folder).read_text()
     scene = folder / "mixed.xml"
     scene.write_text(text.replace("photo.png", "soft.png", 1))
-    settings = {"target_psnr": 50, "iterations": 20, "spp": 0}
+    settings = {"target_psnr": 50, "iterations": 60, "spp": 0}
     found = eg.convert_scene(scene, tmp_path / "new", **settings)
     by_name = {t.names[0]: t for t in found.textures}
     assert by_name["soft.png (paint.reflectance)"].bytes == 256 * 256 * 4  # Dr.Jit pads colours

@@ -41,7 +41,7 @@ def test_a_smooth_sky_takes_less_memory(sun, tmp_path):
     mi.Bitmap(horizon(*size, sun)).write(str(tmp_path / "sky.pfm"))
     turn = mi.ScalarTransform4f().rotate([0, 1, 0], 50)
     given = {"filename": str(tmp_path / "sky.pfm"), "scale": 0.7, "to_world": turn}
-    found = eg.convert_scene(scene(**given), tmp_path / "new", 40, iterations=30, spp=64)
+    found = eg.convert_scene(scene(**given), tmp_path / "new", 40, iterations=100, spp=64)
     [environment] = found.textures
     assert environment.names == ("sky.pfm (sky)",)
     assert environment.file == "sky.npz"
