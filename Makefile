@@ -11,8 +11,8 @@ PHOTO := .venv/lib/python3*/site-packages/skimage/data/coffee.png
 DATA ?= data
 RESULTS := build/report
 
-# A file of tests runs in one of as many processes as there are cores; a process takes about 1 GB.
-ON_ALL_CORES := -n logical --maxprocesses 4 --dist loadfile
+# Tests run in as many processes as there are cores, which take over each other's; a process takes about 1 GB.
+ON_ALL_CORES := -n logical --maxprocesses 4 --dist worksteal
 
 # Path of a simulator of the CUDA driver: a program that runs the command it is given.
 CUDASIM ?= $(wildcard ../shared/cudasim/cudasim)
