@@ -10,6 +10,7 @@ import eigengs_dr as eg
 from _helpers.command import SMALL, assert_refused, run, said, succeeded
 from _helpers.lit_models import LitFormula
 from _helpers.lit_spheres import directions, photos
+from _helpers.packed import few_groups
 from _helpers.photos import random_fields
 
 LIGHTS = directions(8)
@@ -107,7 +108,8 @@ def fits(tmp_path_factory):
     photo = np.random.default_rng(0).uniform(size=(16, 24, 3)).astype(np.float32)
     fit = eg.fit(photo, gaussians=30, iterations=3, progress=False)
     fit.save(folder / "a.npz")
-    eg.pack(fit.gaussians, folder / "b.egs", photo)
+    with few_groups():
+        eg.pack(fit.gaussians, folder / "b.egs", photo)
     LitFormula().model().save(folder / "c.npz")
     maps = {"albedo": photo, "roughness": photo[..., :1]}
     eg.fit(maps, gaussians=20, iterations=2, progress=False).save(folder / "d.npz")
@@ -150,7 +152,7 @@ def test_a_folder_where_a_file_belongs_is_named_with_its_files(fits, command, mo
     monkeypatch.chdir(fits.parent)
     result = run(command[0], "fits", *command[1:])
     files = "a.npz, b.egs, c.npz, ..." if command == ["view"] else "a.npz"
-    assert_refused(result, "fits: is a folder", "give one of its files", files)
+    assert_refused(result, "fits: is a folder", "give one of its files (.npz, .egs)", files)
     assert "notes.txt" not in result.stderr and "Is a directory" not in result.stderr
 
 
