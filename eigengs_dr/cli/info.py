@@ -67,8 +67,9 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     if as_json:
         click.echo(json.dumps(found if in_folder else found[0], indent=2))
     elif in_folder and found:
-        header = [*COLUMNS, *(TEXTURE_COLUMNS if texture else ())]
-        click.echo("\n".join(table([header, *(_row(**known) for known in found)])))
+        columns = ["file", "kind", "size", "gaussians", "bytes", "psnr"]
+        columns += TEXTURE_COLUMNS if texture else ()
+        click.echo("\n".join(table([columns, *(_row(**known) for known in found)])))
     elif found:
         click.echo(_text(**found[0]))
     exit_if_failed(facts)
@@ -200,9 +201,6 @@ TEXTURE_COLUMNS: dict[str, Record] = {
     "small_bytes": {"memory": "small"},
 }
 """Figures of textures, and the properties that each is for."""
-
-COLUMNS = ("file", "kind", "size", "gaussians", "bytes", "psnr")
-"""Columns of the table of a folder."""
 
 
 def _row(

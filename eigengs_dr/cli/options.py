@@ -60,6 +60,12 @@ def images(text: str) -> Path | str:
     return click.Path(exists=not pattern, path_type=Path).convert(text, None, None)
 
 
+def folder(text: str) -> Path | str:
+    """Parse an existing folder, or its URL."""
+    kind = click.Path(exists=True, file_okay=False, path_type=Path)
+    return text if is_url(text) else kind.convert(text, None, None)
+
+
 def sets_in(path: Path, suffixes: tuple[str, ...] = (".npz", ".egs")) -> list[Path]:
     """Return the sets in a folder, sorted by name; of a file, the file."""
     if not path.is_dir():

@@ -56,7 +56,7 @@ def train(
     lights: Path | None,
     **choices: Any,
 ) -> None:
-    """Train a model on the images in a folder or at a URL.
+    """Train a model on the images of a folder, a pattern or a URL.
 
     A model is one set of Gaussians that renders all principal components of the images. One image
     in ten is held out; up to 100 of them are measured. --energy refers to each channel of the
@@ -65,10 +65,10 @@ def train(
     access to FOLDER and MODEL.npz.
 
     With --lights, the folder holds photos of one object from one camera; the list names each photo
-    and the direction of its light. 'eigengs-dr render' shows the object under any light. A list
-    (.lp) in FOLDER counts as given; a pattern of the photos trains a family.
+    and the direction of its light. 'eigengs-dr render' shows the object under any light.
     Then --components counts planes, by default as many as left-out lights need; the defaults are a
-    Gaussian per 16 pixels and 300 steps; and nothing resumes.
+    Gaussian per 16 pixels and 300 steps; and nothing resumes. If FOLDER holds one list (.lp), it is
+    taken without --lights, which a note says; PATTERN trains a family.
 
     \b
     Examples:
@@ -146,23 +146,17 @@ def _find_lights(run: options.Run, folder: Path | str) -> Path | None:
     lists = find_lists(folder) if os.path.isdir(folder) else []
     if not lists:
         return None
-    suffixes = (path.suffix for path in sorted(Path(folder).iterdir()) if path.name[0] != ".")
+    suffixes = sorted(path.suffix for path in Path(folder).iterdir() if path.name[0] != ".")
     suffix = next((name for name in suffixes if name.lower() in READ_SUFFIXES), "")
     family = f"give '{Path(folder) / '*'}{suffix}' to train a family"
     if len(lists) > 1:
         names = ", ".join(path.name for path in lists)
-        raise click.UsageError(
-            f"{folder}: holds {len(lists)} lists of lights ({names}); give one "
-            f"with --lights, or {family}"
-        )
+        listed = f"{folder}: holds {len(lists)} lists of lights ({names})"
+        raise click.UsageError(f"{listed}; give one of them with --lights, or {family}")
+    note = f"{lists[0]} names the lights of the photos"
     if given := _given(run, *FOR_FAMILIES, "components"):
-        raise click.UsageError(
-            f"{lists[0]} names the lights of the photos, and a model of lights takes no {given}; "
-            f"leave it out, or {family}"
-        )
-    print_message(
-        f"note: {lists[0]} names the lights of the photos: training a model of lights; {family}"
-    )
+        raise click.UsageError(f"{note}; such a model takes no {given}: leave it out, or {family}")
+    print_message(f"note: {note}: training a model of lights; {family}")
     return lists[0]
 
 
@@ -200,8 +194,8 @@ def _train_on_lights(
         raise click.UsageError("--components is one number with --lights: that of planes")
     [output] = name_outputs([_named(folder)], output, [".npz"])
     [picture] = name_pictures([_named(folder)], preview)
-    in_folder = os.path.isdir(folder)
-    photos, directions = read_lights(lights, folder if in_folder else list_images(folder))
+    photos = folder if os.path.isdir(folder) else list_images(folder)
+    photos, directions = read_lights(lights, photos)
     check_outputs([output, picture, run.report], [lights, *photos])
     lock_outputs(output)
     select(run.backend)

@@ -99,7 +99,7 @@ def train_model(
     started = time.perf_counter()
     images = list_images(folder)
     root = Path(folder) if os.path.isdir(folder) else Path()  # a pattern gives whole paths
-    names = [str(path) if root == Path() else path.name for path in images]
+    names = [str(path) if root == Path() else Path(path).name for path in images]
     steps = settings.training_steps
     record = {**asdict(settings), "iterations": steps, "folder": str(folder)}
     with (
