@@ -52,4 +52,10 @@ def _packed_head(path: Path) -> tuple[tuple[TextureMap, ...], bytes]:
 messages.make_html = _make_html
 packed.read_set, packed.read_head = _read_packed, _packed_head
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    if name in __all__:
+        return _import_name(name)
+    raise messages.no_attribute(__name__, name, __all__)

@@ -3,6 +3,8 @@
 `register_plugins` registers them with the current variant and later ones.
 """
 
+from typing import TYPE_CHECKING
+
 try:
     import mitsuba  # noqa: F401
 except ImportError as error:
@@ -10,6 +12,7 @@ except ImportError as error:
         f"the plugins need Mitsuba ({error}): pip install 'mitsuba>=3.9,<4'"
     ) from error
 
+from ..backend.messages import no_attribute
 from .cone import pixel_angle
 from .environment import bake_environment, environment_of
 from .follow import follow
@@ -31,3 +34,8 @@ __all__ = [
     "resident_bytes",
     "texture_of",
 ]
+
+if not TYPE_CHECKING:  # checkers know the names without it
+
+    def __getattr__(name):
+        raise no_attribute(__name__, name, __all__)

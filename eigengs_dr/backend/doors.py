@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import wraps
+from importlib import import_module
+from importlib.util import find_spec
 from inspect import isfunction, signature
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -195,7 +197,8 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
     if progress is False or not _is_watched():
         yield None
         return
-    from tqdm.auto import tqdm
+    # A notebook without widgets shows text; tqdm.auto would warn about it.
+    tqdm = import_module("tqdm.auto" if find_spec("ipywidgets") else "tqdm").tqdm
 
     with tqdm(desc=name, delay=DELAY, leave=False) as bar:
 

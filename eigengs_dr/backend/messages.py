@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 SKIPPED_MODULES = ("eigengs_dr", "contextlib", "functools")
 """Modules whose frames a warning skips to reach the caller's line."""
@@ -16,6 +16,17 @@ def warn(text: str) -> None:
     while frame.f_globals.get("__name__", "").partition(".")[0] in SKIPPED_MODULES and frame.f_back:
         frame, level = frame.f_back, level + 1
     warnings.warn(text, stacklevel=level)
+
+
+def no_attribute(module: str, name: str, names: Iterable[str]) -> AttributeError:
+    """Return the error of a name that a module lacks, with the public name that is closest."""
+    from difflib import get_close_matches  # only after a mistake
+
+    by_case = {public.casefold(): public for public in names}
+    close = get_close_matches(name.casefold(), by_case, 1) if name[0] != "_" else []
+    hint = "".join(f"; did you mean {by_case[key]!r}?" for key in close)
+    # With `obj` too, Python 3.10 and later add a suggestion of their own.
+    return AttributeError(f"module {module!r} has no attribute {name!r}{hint}", name=name)
 
 
 def printable(text: str) -> str:

@@ -43,8 +43,10 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     With --texture, texture_bytes is the memory of a gaussian_texture for lookups at points,
     prefilter_bytes with a prefilter, and small_bytes with memory = small.
 
-    The preview shows the image, or the mean image, some components and the outlines of a model. Of
-    a folder, all .npz and .egs files are shown, and --preview names a folder.
+    The preview shows the image, or the mean image, some components and the outlines of a model.
+
+    Of a folder, a table has a row for each .npz and .egs file. There psnr is psnr_rgb of a fit,
+    psnr_ycbcr if it has none, or that of left-out lights. --preview names a folder.
 
     \b
     Examples:
@@ -64,8 +66,12 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
     found = [known for known in facts if known]
     if as_json:
         click.echo(json.dumps(found if in_folder else found[0], indent=2))
-    else:
-        click.echo("\n\n".join(_text(**known) for known in found))
+    elif in_folder and found:
+        columns = ["file", "kind", "size", "gaussians", "bytes", "psnr"]
+        columns += TEXTURE_COLUMNS if texture else ()
+        click.echo("\n".join(table([columns, *(_row(**known) for known in found)])))
+    elif found:
+        click.echo(_text(**found[0]))
     exit_if_failed(facts)
 
 
@@ -182,13 +188,30 @@ def _load_textures(key: str, file: str, maps: Any = (), **_: Any) -> Record:
     from ..plugins import resident_bytes
 
     source = {"type": "gaussian_texture", key: file} | ({"map": maps[0]["name"]} if maps else {})
-    kinds: Record = {
-        "texture_bytes": {},
-        "prefilter_bytes": {"prefilter": 1e-3},
-        "small_bytes": {"memory": "small"},
-    }
     with scene_errors(Path(file)):  # one at a time: textures of a file share memory
-        return {name: resident_bytes(mi.load_dict(source | kind)) for name, kind in kinds.items()}
+        return {
+            name: resident_bytes(mi.load_dict(source | kind))
+            for name, kind in TEXTURE_COLUMNS.items()
+        }
+
+
+TEXTURE_COLUMNS: dict[str, Record] = {
+    "texture_bytes": {},
+    "prefilter_bytes": {"prefilter": 1e-3},
+    "small_bytes": {"memory": "small"},
+}
+"""Figures of textures, and the properties that each is for."""
+
+
+def _row(
+    file: str, kind: str, width: int, height: int, gaussians: int, bytes: int, **facts: Any
+) -> list[str]:
+    """Format facts as a row, with the first PSNR that the file holds."""
+    names = ("psnr_rgb", "psnr_ycbcr", "psnr", "psnr_held_out")
+    known = [float(facts[name]) for name in names if facts.get(name, "nan") != "nan"]
+    cells = [Path(file).name, kind, f"{width}x{height}", f"{gaussians:,}", f"{bytes:,}"]
+    cells.append(f"{known[0]:.2f}" if known else "-")
+    return cells + [f"{facts[name]:,}" for name in TEXTURE_COLUMNS if name in facts]
 
 
 def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) -> str:

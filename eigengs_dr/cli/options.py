@@ -77,6 +77,14 @@ def sets_in(path: Path, suffixes: tuple[str, ...] = (".npz", ".egs")) -> list[Pa
     return files
 
 
+def refuse_folder(path: Path) -> None:
+    """Raise ValueError for a folder where one set belongs, with the names of the sets in it."""
+    if path.is_dir():
+        names = [file.name for file in sets_in(path)]
+        several = ", ".join(names[:3]) + ", ..." * (len(names) > 3)
+        raise ValueError(f"{path}: is a folder; give one of its files (.npz, .egs): {several}")
+
+
 def size(text: str) -> tuple[int, int]:
     """Parse width and height in pixels, such as "1024x768"."""
     width, height = _numbers(text, r"\d+x\d+", "width and height, such as 1024x768")

@@ -95,6 +95,7 @@ def _write_planes(run: options.Run, file: Path, folder: Path) -> None:
     from ..relight.model import Relightable
     from ..relight.planes import PixelPlanes
 
+    options.refuse_folder(file)
     select(run.backend)
     planes = PixelPlanes.of(Relightable.load(file, run.backend))
     planes.write(folder)

@@ -1,5 +1,6 @@
 """The command ``eigengs-dr train``: train an EigenGS model on a folder of images."""
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ import click
 
 from ..backend.selection import select
 from ..backend.types import Record
+from ..image.remote import is_url
 from . import options
 from .console import INTERRUPTED, bar, open_cluster, print_message
 from .outputs import check_outputs, lock_outputs, name_outputs, name_pictures
@@ -20,7 +22,7 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
 
 
 @click.command()
-@click.argument("folder", type=options.folder, metavar="FOLDER")
+@click.argument("folder", type=options.images, metavar="FOLDER|PATTERN")
 @options.output("Model to write.", "MODEL.npz")
 @options.value("--size", "WxH", options.size, "Crop and resize the images to this size.", "256x256")
 @options.value(
@@ -54,7 +56,7 @@ def train(
     lights: Path | None,
     **choices: Any,
 ) -> None:
-    """Train a model on the images in a folder or at a URL.
+    """Train a model on the images of a folder, a pattern or a URL.
 
     A model is one set of Gaussians that renders all principal components of the images. One image
     in ten is held out; up to 100 of them are measured. --energy refers to each channel of the
@@ -65,7 +67,8 @@ def train(
     With --lights, the folder holds photos of one object from one camera; the list names each photo
     and the direction of its light. 'eigengs-dr render' shows the object under any light.
     Then --components counts planes, by default as many as left-out lights need; the defaults are a
-    Gaussian per 16 pixels and 300 steps; and nothing resumes.
+    Gaussian per 16 pixels and 300 steps; and nothing resumes. If FOLDER holds one list (.lp), it is
+    taken without --lights, which a note says; PATTERN trains a family.
 
     \b
     Examples:
@@ -75,6 +78,7 @@ def train(
       eigengs-dr train /shared/faces/ -o /shared/faces.npz --cluster tcp://node1:8786
       eigengs-dr train coin/ -o coin.npz --lights coin/dirs.lp
     """
+    lights = lights or _find_lights(run, folder)
     if lights is not None:
         return _train_on_lights(run, folder, output, lights, preview, choices)
     from ..backend.interrupts import Interrupted
@@ -85,9 +89,10 @@ def train(
     from ..image.io import save_image
     from ..viewer.pictures import component_sheet
 
-    [output] = name_outputs([folder], output, [".npz"])
-    [picture] = name_pictures([folder], preview)
-    check_outputs([output, picture, run.report], list_images(folder))
+    files = list_images(folder)
+    [output] = name_outputs([_named(folder)], output, [".npz"])
+    [picture] = name_pictures([_named(folder)], preview)
+    check_outputs([output, picture, run.report], files)
     select(run.backend)
     width, height = options.check_pixels(*choices["size"])
     choices["gaussians"] = choices["gaussians"] or default_count(width * height)
@@ -128,6 +133,40 @@ def train(
     )
 
 
+def _named(folder: Path | str) -> Path | str:
+    """Return the folder after which outputs are named; of a pattern, the one that holds it."""
+    return folder if is_url(folder) or os.path.isdir(folder) else Path(folder).absolute().parent
+
+
+def _find_lights(run: options.Run, folder: Path | str) -> Path | None:
+    """Return the list of lights in a folder, and say so; None of a URL, a pattern or a family."""
+    from ..image.folder import find_lists
+    from ..image.formats import READ_SUFFIXES
+
+    lists = find_lists(folder) if os.path.isdir(folder) else []
+    if not lists:
+        return None
+    suffixes = sorted(path.suffix for path in Path(folder).iterdir() if path.name[0] != ".")
+    suffix = next((name for name in suffixes if name.lower() in READ_SUFFIXES), "")
+    family = f"give '{Path(folder) / '*'}{suffix}' to train a family"
+    if len(lists) > 1:
+        names = ", ".join(path.name for path in lists)
+        listed = f"{folder}: holds {len(lists)} lists of lights ({names})"
+        raise click.UsageError(f"{listed}; give one of them with --lights, or {family}")
+    note = f"{lists[0]} names the lights of the photos"
+    if given := _given(run, *FOR_FAMILIES, "components"):
+        raise click.UsageError(f"{note}; such a model takes no {given}: leave it out, or {family}")
+    print_message(f"note: {note}: training a model of lights; {family}")
+    return lists[0]
+
+
+def _given(run: options.Run, *names: str) -> str:
+    """Return those of some options that the command line holds, as it spells them."""
+    source = run.context.get_parameter_source
+    given = [name for name in names if source(name) == click.core.ParameterSource.COMMANDLINE]
+    return ", ".join("--" + name.replace("_", "-") for name in given)
+
+
 FOR_FAMILIES = ("size", "energy", "target_psnr", "frequency_aware", "preset", "space", "cluster")
 """Options that photos under known lights do not take."""
 
@@ -143,23 +182,20 @@ def _train_on_lights(
     """Fit a model to photos of one object under known lights, and write it."""
     import eigengs_dr as eg
 
-    from ..image.remote import is_url
+    from ..image.folder import list_images
     from ..relight.lights import read_lights
 
-    for name in FOR_FAMILIES:
-        if run.context.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE:
-            option = name.replace("_", "-")
-            raise click.UsageError(f"--{option} and --lights exclude each other; give one of them")
+    if given := _given(run, *FOR_FAMILIES):
+        raise click.UsageError(f"{given} and --lights exclude each other; give one of them")
     if is_url(folder):
         raise click.UsageError("--lights takes a folder of this machine")
-    planes = None
-    if run.context.get_parameter_source("components") == click.core.ParameterSource.COMMANDLINE:
-        planes = choices["components"]
-        if not isinstance(planes, int):
-            raise click.UsageError("--components is one number with --lights: that of planes")
-    [output] = name_outputs([folder], output, [".npz"])
-    [picture] = name_pictures([folder], preview)
-    photos, directions = read_lights(lights, folder)
+    planes = choices["components"] if _given(run, "components") else None
+    if isinstance(planes, tuple):
+        raise click.UsageError("--components is one number with --lights: that of planes")
+    [output] = name_outputs([_named(folder)], output, [".npz"])
+    [picture] = name_pictures([_named(folder)], preview)
+    photos = folder if os.path.isdir(folder) else list_images(folder)
+    photos, directions = read_lights(lights, photos)
     check_outputs([output, picture, run.report], [lights, *photos])
     lock_outputs(output)
     select(run.backend)

@@ -89,6 +89,7 @@ def _load(
     from ..viewer.view import check_count
 
     file = SHIPPED.get(str(file), file)
+    options.refuse_folder(file)
     if holds_lights(file):
         if levels is not None or name is not None:
             raise ValueError(f"{file}: is a model of lights; leave out --levels and --map")

@@ -13,7 +13,7 @@ import numpy as np
 from ..backend.doors import shows_progress, takes_numbers
 from ..backend.messages import to_html, warn
 from ..backend.types import ArrayLike, Doubles, Singles
-from ..image.folder import TrainingImages
+from ..image.folder import TrainingImages, find_lists
 from ..image.io import check_member
 from ..image.notes import series
 from ..image.pixels import check_encoding, check_size
@@ -125,12 +125,14 @@ class Eigenbasis:
         Warns
         -----
         UserWarning
-            If images are skipped, cropped, too few or brighter than white, or `components` is too
-            low for the energy.
+            If images are skipped, cropped, too few or brighter than white, `components` is too low
+            for the energy, or the folder holds a list of lights (.lp).
         """
         size, limits = check_size(size), check_components(components, energy)
         ranks = [rank_for(k) for k in limits]
         check_encoding(encoding)
+        if isinstance(images, (str, os.PathLike)) and (lists := find_lists(images)):
+            warn(f"{lists[0]}: names the lights of photos; Relightable.fit makes a model of them")
         stream = Stream(size, space, ranks, block_length(size), progress, encoding)
         with series():
             states = find_states(images, stream, client, checkpoint)

@@ -71,7 +71,8 @@ def train_model(
     Parameters
     ----------
     folder : path-like
-        Folder of images; one in `HELD_OUT` is held out and measured.
+        Folder of images, or a pattern such as "faces/*.png"; one in `HELD_OUT` is held out and
+        measured.
     output : path-like
         File of the model.
     settings : TrainOptions
@@ -97,7 +98,8 @@ def train_model(
     """
     started = time.perf_counter()
     images = list_images(folder)
-    names = [path if isinstance(path, str) else path.name for path in images]
+    root = Path(folder) if os.path.isdir(folder) else Path()  # a pattern gives whole paths
+    names = [str(path) if root == Path() else Path(path).name for path in images]
     steps = settings.training_steps
     record = {**asdict(settings), "iterations": steps, "folder": str(folder)}
     with (
@@ -110,7 +112,7 @@ def train_model(
                 f"{folder}: the images have changed since this training began; it continues with "
                 f"the original {len(checkpoint.files)}"
             )
-        files = [name if is_url(name) else Path(folder) / name for name in checkpoint.files]
+        files = [name if is_url(name) else root / name for name in checkpoint.files]
         held_out = files[HELD_OUT - 1 :: HELD_OUT][:MAX_HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
         run = _Run(checkpoint, settings, backend, progress, interrupted, held_out, client)

@@ -159,6 +159,12 @@ def list_images(images: str | os.PathLike[str], recursive: bool = False) -> Sequ
     return image_files(Path(images), recursive)
 
 
+def find_lists(folder: PathLike) -> list[Path]:
+    """Return the lists of lights (.lp) in a folder, without hidden files."""
+    files = sorted(Path(folder).glob("*.[lL][pP]"))
+    return [file for file in files if file.name[0] != "." and file.is_file()]
+
+
 def read_blocks(
     source: TrainingImages,
     size: tuple[int, int],

@@ -21,6 +21,7 @@ import numpy as np
 from ..backend.arrays import ArrayTypes, upload
 from ..backend.messages import printable, warn
 from ..backend.types import ArrayLike, Doubles, Float, PathLike
+from ..image.folder import find_lists as find_lists
 from ..image.pixels import ImageError
 from ..image.remote import is_url
 from ..storage.memory import open_regular
@@ -107,12 +108,6 @@ def read_lights(path: PathLike, photos: Any = None) -> tuple[list[Any], Doubles]
     if not is_right:
         warn(f"{note}; all of them are taken")
     return [parts[-1] for parts in names] if photos is None else named, directions
-
-
-def find_lists(folder: PathLike) -> list[Path]:
-    """Return the lists of lights in a folder, without hidden files."""
-    files = sorted(Path(folder).glob("*.[lL][pP]"))
-    return [file for file in files if file.name[0] != "." and file.is_file()]
 
 
 MAX_LIST_BYTES = 1 << 24

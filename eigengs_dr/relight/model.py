@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of
 from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
+from ..backend.messages import to_html
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
@@ -84,6 +85,8 @@ class Relightable:
     table: LightTable
     psnr_held_out: float = float("nan")
     brightest: float = 1.0
+
+    _repr_html_ = to_html  # what a notebook shows
 
     @classmethod
     @shows_progress

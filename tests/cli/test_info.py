@@ -57,7 +57,7 @@ def test_sets_in_a_folder(set_file, trained, tmp_path):
         (fits / f"{name}.npz").write_bytes(set_file[1].read_bytes())
     (fits / "manifest.jsonl").write_text("")
     assert [facts["gaussians"] for facts in facts_of(fits)] == [40, 40]
-    assert said("info", fits, "--preview", tmp_path / "seen").count("kind ") == 2
+    assert said("info", fits, "--preview", tmp_path / "seen").count(" image ") == 2
     said("render", fits, "-o", tmp_path / "drawn", "--size", 16)
     assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.png", "b.png"]
     assert len(list((tmp_path / "seen").iterdir())) == 2
@@ -68,7 +68,7 @@ def test_sets_in_a_folder(set_file, trained, tmp_path):
     [figures] = json.loads(report.read_text())["sets"]
     assert figures["bytes"] == (tmp_path / "packed" / "a.egs").stat().st_size
     shown = run("info", fits)
-    assert shown.exit_code == 2 and shown.stdout.count("kind ") == 1
+    assert shown.exit_code == 2 and shown.stdout.count(" image ") == 1
     image = run("pack", fits, "-o", tmp_path / "x", "--image", set_file[1])
     assert_refused(image, "--image and --map belong to one set")
     assert_refused(run("render", fits, "-o", tmp_path / "x.png"), "need a folder")
