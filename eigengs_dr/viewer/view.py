@@ -154,6 +154,9 @@ def view(
             gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
     elif pixels is not None:
         check_aspect(pixels, (gaussians.width, gaussians.height))
+    summary = f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels"
+    if isinstance(source, Relightable) and np.isfinite(source.psnr_held_out):
+        summary += f"; left-out lights: psnr_rgb {source.psnr_held_out:.2f} dB"
     views = channel_views(gaussians.channels)
     facts = {
         "set": describe_set(gaussians, levels),
@@ -165,7 +168,7 @@ def view(
     }
     html = _template().render(
         title=title,
-        summary=f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels",
+        summary=summary,
         facts=facts,
         model_note=note,
         views=views,

@@ -1,0 +1,117 @@
+"""What models of lights say of themselves: the PSNR of photos that they have never seen."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.command import said
+from _helpers.lit_spheres import directions, photos
+from _helpers.packed import few_groups
+
+LIGHTS = directions(40)
+LEFT_OUT = np.arange(40) % 8 == 4
+OPTIONS = {"gaussians": 60, "planes": 6, "iterations": 50, "encoding": "srgb", "progress": False}
+
+
+def textured(white=1.0):
+    """Photos with grain in the albedo, which Gaussians miss, and with noise."""
+    random = np.random.default_rng(1)
+    images = photos(LIGHTS, 32) * (1 - 0.2 * random.random((32, 32, 1)))
+    images += 0.02 * random.standard_normal(images.shape)
+    return np.maximum(images * white, 0).astype(np.float32)
+
+
+PHOTOS = textured()
+
+
+@pytest.fixture(scope="module")
+def model():
+    return eg.Relightable.fit(PHOTOS[~LEFT_OUT], LIGHTS[~LEFT_OUT], **OPTIONS)
+
+
+def real_psnr(model, images=PHOTOS):
+    """psnr_rgb of photos that were left out by hand, from the lights of those."""
+    pairs = zip(images[LEFT_OUT], LIGHTS[LEFT_OUT], strict=True)
+    return np.mean([eg.psnr(image, eg.picture_of(model.relight(light))) for image, light in pairs])
+
+
+def packed(model, path, drop):
+    with few_groups():
+        result = eg.pack(model, path, max_psnr_drop=drop)
+    return result, eg.Relightable.load(path)
+
+
+def test_the_number_is_that_of_photos_left_out_by_hand(model):
+    assert model.psnr_held_out == pytest.approx(real_psnr(model), abs=0.5)
+
+
+@pytest.mark.parametrize("drop", [0.5, 3])
+def test_after_packing_the_number_is_that_of_the_file(model, tmp_path, drop):
+    result, loaded = packed(model, tmp_path / "model.egs", drop)
+    assert 0.8 * drop < result.psnr_drop <= drop
+    assert loaded.psnr_held_out == pytest.approx(model.psnr_held_out - result.psnr_drop)
+    assert loaded.psnr_held_out == pytest.approx(real_psnr(loaded), abs=0.5)
+
+
+def test_light_above_white_counts_too(tmp_path):
+    images = textured(1.2)
+    bright = eg.Relightable.fit(images[~LEFT_OUT], LIGHTS[~LEFT_OUT], **OPTIONS)
+    assert bright.brightest > 1.05
+    _, loaded = packed(bright, tmp_path / "bright.egs", 0.5)
+    assert loaded.brightest == pytest.approx(bright.brightest)
+    for fitted in (bright, loaded):
+        assert fitted.psnr_held_out == pytest.approx(real_psnr(fitted, images), abs=0.5)
+
+
+def test_an_interrupted_fit_tells_how_far_it_came(model):
+    def stop(done, total, row):
+        raise KeyboardInterrupt
+
+    options = OPTIONS | {"gaussians": 12, "progress": stop}
+    with pytest.raises(eg.Interrupted) as error:
+        eg.Relightable.fit(PHOTOS[~LEFT_OUT], LIGHTS[~LEFT_OUT], **options)
+    partial = error.value.result
+    assert partial.psnr_held_out < model.psnr_held_out - 0.5
+    assert partial.psnr_held_out == pytest.approx(real_psnr(partial), abs=0.5)
+
+
+def test_what_is_unknown_stays_unknown(model, tmp_path):
+    unknown = replace(model, psnr_held_out=math.nan)
+    result, loaded = packed(unknown, tmp_path / "unknown.egs", 0.5)
+    assert 0 < result.psnr_drop <= 0.5  # of 40 dB
+    assert math.isnan(loaded.psnr_held_out)
+    assert "psnr_held_out" not in said("info", tmp_path / "unknown.egs")
+    assert "left-out" not in eg.view(unknown).html
+
+
+def test_a_model_is_too_good_for_its_table_where_the_budget_is_tiny(model, tmp_path):
+    with pytest.raises(ValueError, match="no rounding is fine enough"):
+        eg.pack(replace(model, psnr_held_out=70.0), tmp_path / "x.egs", max_psnr_drop=0.1)
+
+
+def test_commands_and_the_page_repeat_the_number(tmp_path):
+    lines = ["8"]
+    for k in range(8):
+        eg.save_image(tmp_path / f"{k}.png", PHOTOS[5 * k])
+        lines.append(f"{k}.png " + " ".join(map(str, LIGHTS[5 * k])))
+    (tmp_path / "dirs.lp").write_text("\n".join(lines))
+    output = tmp_path / "model.npz"
+    told = said(
+        "train", tmp_path, "-o", output, "--lights", tmp_path / "dirs.lp",
+        "--gaussians", "40", "--iterations", "10", "--components", "4",
+    )  # fmt: skip
+    packed(eg.Relightable.load(output), tmp_path / "model.egs", 0.5)
+    for name in ("model.npz", "model.egs"):
+        number = eg.Relightable.load(tmp_path / name).psnr_held_out
+        facts = json.loads(said("info", tmp_path / name, "--json"))
+        assert facts["psnr_held_out"] == pytest.approx(number, abs=0.006)
+        assert f"{number:.2f}" in said("info", tmp_path / name)
+        said("view", tmp_path / name, "-o", tmp_path / "page.html")
+        page = (tmp_path / "page.html").read_text()
+        assert f"left-out lights: psnr_rgb {number:.2f} dB" in page
+    number = eg.Relightable.load(output).psnr_held_out
+    assert f"left-out lights: psnr_rgb {number:.2f} dB" in told
