@@ -1,14 +1,18 @@
 """What models of lights say of themselves: the PSNR of photos that they have never seen."""
 
+import io
 import json
 import math
+import re
+from base64 import b64decode
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import eigengs_dr as eg
-from _helpers.command import said
+from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
 from _helpers.packed import few_groups
 
@@ -115,3 +119,59 @@ def test_commands_and_the_page_repeat_the_number(tmp_path):
         assert f"left-out lights: psnr_rgb {number:.2f} dB" in page
     number = eg.Relightable.load(output).psnr_held_out
     assert f"left-out lights: psnr_rgb {number:.2f} dB" in told
+
+
+def test_the_page_has_buttons_for_lights(model):
+    html = eg.view(model).html
+    buttons = dict(re.findall(r'<button data-light="([^"]*)">([^<]*)</button>', html))
+    lights = {name: np.array(light.split(","), float) for light, name in buttons.items()}
+    assert set(lights) == {"Raking, left", "Raking, top", "From the camera"}
+    assert lights["Raking, left"][0] < -0.9 and lights["Raking, top"][1] > 0.9
+    assert lights["Raking, left"][2] == pytest.approx(LIGHTS[:, 2].min(), abs=1e-3)
+    assert lights["From the camera"].tolist() == [0, 0, 1]
+
+
+def facts_of(html):
+    facts = json.loads(re.search(r'id="facts">(.*?)</script>', html, re.S)[1])
+    photo = facts["photo"] and Image.open(io.BytesIO(b64decode(facts["photo"].partition(",")[2])))
+    return facts, photo and np.asarray(photo.convert("RGB")) / 255
+
+
+def test_a_photo_is_compared_under_its_light_and_as_it_is_stored(model, tmp_path):
+    exif = Image.Exif()
+    exif[274] = 6  # turned by a quarter
+    stored = np.rint(PHOTOS[4].clip(0, 1) * 255).astype(np.uint8)
+    path = tmp_path / "photo.png"
+    Image.fromarray(stored).save(path, exif=exif)
+    model.save(tmp_path / "model.npz")
+    x, y, z = LIGHTS[4]
+    said(
+        "view", tmp_path / "model.npz", "--image", path, "--light", f"{2 * x},{2 * y},{2 * z}",
+        "-o", tmp_path / "page.html",
+    )  # fmt: skip
+    pages = [(tmp_path / "page.html").read_text(), eg.view(model, path, light=LIGHTS[4]).html]
+    for html in pages:
+        facts, photo = facts_of(html)
+        assert np.abs(photo - stored / 255).mean() < 0.02  # a JPEG
+        np.testing.assert_allclose(facts["lights"]["start"], LIGHTS[4], atol=1e-6)
+        shown = model.relight(LIGHTS[4]).to_arrays()["background"]
+        np.testing.assert_allclose(facts["set"]["background"], shown, atol=1e-6)
+        assert "As in the photo</button>" in html
+        assert re.search(r'id="follows" type="checkbox">', html)  # the pointer leaves the light
+
+
+def test_a_photo_without_its_light_is_refused(model, tmp_path):
+    with pytest.raises(ValueError, match="under its own light; give it as light"):
+        eg.view(model, PHOTOS[4])
+    with pytest.raises(ValueError, match="below the horizon"):
+        eg.view(model, PHOTOS[4], light=(0, 0.5, -0.5))
+    with pytest.raises(ValueError, match="light is for a model of lights"):
+        eg.view(model.relight((0, 0, 1)), light=(0, 0, 1))
+    model.save(tmp_path / "model.npz")
+    model.relight((0, 0, 1)).save(tmp_path / "set.npz")
+    eg.save_image(tmp_path / "photo.png", PHOTOS[4])
+    command = ["view", "-o", tmp_path / "page.html"]
+    photo = ["--image", tmp_path / "photo.png"]
+    assert_refused(run(*command, tmp_path / "model.npz", *photo), "--light X,Y,Z", "photo.png")
+    assert_refused(run(*command, tmp_path / "set.npz", "--light", "0,0,1"), "--light", "set.npz")
+    assert not (tmp_path / "page.html").exists()
