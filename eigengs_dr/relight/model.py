@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of
 from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
+from ..backend.messages import to_html
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
@@ -160,6 +161,8 @@ class Relightable:
             f"Relightable({len(self.planes)} Gaussians, {size}, {self.planes.channels} planes, "
             f"{len(self.lights)} lights, {self.table.kind})"
         )
+
+    _repr_html_ = to_html  # what a notebook shows
 
     @property
     def lights(self) -> Doubles:
