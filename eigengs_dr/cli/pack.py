@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,8 @@ def _pack(
             raise ValueError(f"{file}: a model of lights takes no --image, --map and --levels")
         model = eg.Relightable.load(file, run.backend)
         gaussians, packed = model.planes, eg.pack(model, target, max_psnr_drop=drop)
-        compared = " of left-out lights"
+        left_out = model.psnr_held_out - packed.psnr_drop
+        compared = " of left-out lights" + (f": psnr_rgb {left_out:.2f} dB" * isfinite(left_out))
     else:
         gaussians = eg.Gaussians.load(file, run.backend)
         if maps and not gaussians.maps:

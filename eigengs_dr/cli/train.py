@@ -228,7 +228,7 @@ def _train_on_lights(
     run.tell(
         f"{folder}: {len(model.lights)} photos, {planes} planes, {len(model.planes):,} Gaussians "
         f"in {seconds:.1f} s",
-        f"  left-out lights: psnr_rgb {model.psnr_held_out:.2f} dB, before planes are Gaussians",
+        f"  left-out lights: psnr_rgb {model.psnr_held_out:.2f} dB",
         f"  wrote {output}" + (f" and {picture}" if picture else ""),
     )
     if stopped:

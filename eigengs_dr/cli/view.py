@@ -11,6 +11,7 @@ import click
 import eigengs_dr as eg
 
 from ..backend.selection import select
+from ..backend.types import Record
 from ..gaussian import file as set_file
 from ..gaussian.packed import is_packed
 from ..storage import npz
@@ -31,6 +32,7 @@ SUFFIXES = (".html", ".htm")
     "Photo to compare with, or for a model to start from.",
 )
 @options.encoding
+@options.value("--light", "X,Y,Z", options.light, "Light at first, or that of the photo.")
 @click.option("--map", "name", metavar="NAME", help="Map of a material to show.")
 @options.level_counts("Levels, as in fit.  [default: sections of an .egs file]")
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
@@ -41,6 +43,7 @@ def view(
     output: Path | None,
     image: Path | str | None,
     encoding: str | None,
+    light: tuple[float, ...] | None,
     name: str | None,
     levels: int | tuple[int, ...] | None,
     opens: bool,
@@ -51,7 +54,7 @@ def view(
     draws the picture of "render" at any zoom, outlines, the first Gaussians, and the parameters of
     the one under the pointer. With --image, a divider wipes to the photo. A model has sliders for
     its first components, and draws random images; the light of a model of lights follows the
-    pointer.
+    pointer, and a photo of it needs --light.
 
     \b
     Examples:
@@ -66,9 +69,15 @@ def view(
     lock_outputs(page)
     select(run.backend)
     source, counts = _load(file, name, levels, run.backend)
+    is_lit = isinstance(source, eg.Relightable)
+    if image and is_lit and light is None:
+        raise ValueError(f"{file}: is a model of lights; give --light X,Y,Z, that of {image}")
+    if light is not None and not is_lit:
+        raise ValueError(f"{file}: is no model of lights; leave out --light")
+    choices: Record = {"levels": counts, "title": file.stem, "encoding": encoding, "light": light}
     photo: Any = image
     with prefix_errors(file):
-        result = eg.view(source, photo, levels=counts, title=file.stem, encoding=encoding)
+        result = eg.view(source, photo, **choices)
     result.save(page)
     run.tell(f"{file}: wrote {page} ({page.stat().st_size:,} bytes)")
     if opens and click.launch(str(page)):

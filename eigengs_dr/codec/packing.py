@@ -24,11 +24,11 @@ from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
 from ..image.pixels import check_encoding
 from ..raster.render import picture_of
-from ..relight.model import Relightable, table_bytes
+from ..relight.model import Relightable, read_table, table_bytes
 from ..storage.atomic import require_writable
 from .egs import MAX_SECTIONS, SUFFIX, write_egs
 from .quantization import Steps
-from .rounding import MIN_MSE, Comparison, planes_of, round_within
+from .rounding import MIN_MSE, TOO_FINE, Comparison, planes_of, round_within
 
 Array = NDArray[np.floating]
 
@@ -55,7 +55,8 @@ class PackResult(NamedTuple):
         image; without an image, against the rendering of the set before rounding. For maps, the
         psnr_rgb of each by name.
     psnr_drop : float
-        Loss of PSNR in dB; without an image, from 40 dB.
+        Loss of PSNR in dB; without an image, from 40 dB, or the `psnr_held_out` of a model of
+        lights.
     steps : Steps
         Steps of the rounding.
     """
@@ -97,7 +98,8 @@ def pack(
         maps, the loss refers to the mean over the maps of the ratio of the squared errors (of
         colours as sRGB) after and before, so that all maps lose about the same number of decibels.
         Without images, the errors of the maps are in the ratio of their weights in the fit.
-        For a model of lights, the loss refers to its `psnr_held_out`.
+        For a model of lights, the loss is that of its `psnr_held_out`, from the rounding of planes
+        and table; the file holds the number after it.
     sections : sequence of int, optional
         Number of Gaussians in each section of the file, in the order of the set. A reader may stop
         after any section; the budget applies to each of these prefixes. By default one section.
@@ -145,15 +147,24 @@ def pack(
         maps, display, compared = compare(source, image, encoding)
     else:
         maps, display, compared = _compare_planes(model)
+        # The budget also pays for the rounding of the table, which is the error of equal planes.
+        unseen = psnr_from_mse(compared.extra_error)
+        max_psnr_drop -= unseen - psnr_from_mse(compared.extra_error + compared.error(source))
+        if max_psnr_drop <= 0:
+            raise ValueError(TOO_FINE)
     weighted = scale_channels(source, channel_weights(maps)) if maps else source
     attempt, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
     seen = psnr_from_mse(attempt.error)
     stored = seen if image is not None and not maps else math.nan
-    lights = b"" if model is None else table_bytes(model)
+    after = psnr_from_mse(max(attempt.error + compared.extra_error, MIN_MSE))
+    lights = b""
+    if model is not None:
+        before = compared.extra_error
+        held_out = after if math.isfinite(model.psnr_held_out) else math.nan
+        lights = table_bytes(replace(model, psnr_held_out=held_out))
     content = attempt.packed._replace(maps=maps, psnr=stored, lights=lights)
     size = write_egs(output, content)
     rounded = Gaussians.load(output, types_of(source.mean).backend)
-    after = psnr_from_mse(max(attempt.error + compared.extra_error, MIN_MSE))
     figure: float | dict[str, float] = seen
     if maps:
         pictures = picture_of(rounded)
@@ -230,15 +241,26 @@ def _display(g: Gaussians) -> Array:
 
 
 def _compare_planes(model: Relightable) -> Compared:
-    """Compare planes with themselves: the sum of their errors is that of the photos."""
-    target = planes_of(model.planes)
+    """Compare pictures under the lights of the photos, with the table as the file rounds it.
+
+    With planes P and factors t, rounded to Q and s, they differ by ``s (Q - P) + (s - t) P``.
+    """
+    target, table = planes_of(model.planes), model.table
+    count = target.shape[2]
+    rounded_table = read_table(table_bytes(model), count)[0].at(table.lights)
+    change = rounded_table - table.at(table.lights)
+    factors = np.concatenate([rounded_table[..., :-1], change], axis=2).reshape(-1, 2 * count + 1)
+    moments = factors.T @ factors / len(factors)
+    plain = np.concatenate([target, np.ones_like(target[..., :1])], axis=2)
 
     def error(rounded: Gaussians) -> float:
-        difference = np.square(planes_of(rounded) - target, dtype=np.float64)
-        return float(difference.sum(axis=2).mean())
+        values = np.concatenate([planes_of(rounded) - target, plain], axis=2)
+        values = values.reshape(-1, 2 * count + 1)
+        return float((moments * (values.T @ values / len(values))).sum())
 
-    unseen = 10 ** (-model.psnr_held_out / 10)
-    return (), [], Comparison(error, target, unseen if np.isfinite(unseen) else MSE_WITHOUT_IMAGE)
+    known = math.isfinite(model.psnr_held_out)
+    unseen = 10 ** (-model.psnr_held_out / 10) if known else MSE_WITHOUT_IMAGE
+    return (), [], Comparison(error, target, unseen)
 
 
 # --- A set with maps -----------------------------------------------------------------------------

@@ -57,8 +57,8 @@ MIN_LIGHTS = 4
 FOLDS = 8
 """Number of parts of the lights, each left out once."""
 
-ROUNDING = 1e-10
-"""Mean squared error that rounding in single precision hides."""
+ROUNDING = 1 / (12 * 255**2)
+"""Mean squared error that rounding a picture to 8 bits adds."""
 
 TABLES = (("thin_plate", 1e-3), ("thin_plate", 1e-2), ("thin_plate", 0.1), ("hsh", 0.1))
 """Tables that are tried, with their smoothing."""
@@ -187,14 +187,27 @@ class Planes(NamedTuple):
     images : ndarray of float32, shape (H, W, K)
         Scaled so that the sum of their mean squared errors is that of the photos.
     table : LightTable
-    psnr_held_out : float
-        Mean PSNR in dB of photos that were left out, from planes of the others; its peak is white,
-        also where light is above it.
+    left_out : ndarray of float64, shape (n,)
+        Mean squared error of each photo from planes of others, see `left_out`; 1 is white, also
+        where light is above it.
     """
 
     images: Singles
     table: LightTable
-    psnr_held_out: float
+    left_out: Doubles
+
+    def psnr_held_out(self, shown: Singles) -> float:
+        """Return the mean PSNR in dB of left-out photos, where the planes are shown (H, W, K).
+
+        A photo under a light with the factors t_c gets the error ``1/3 sum_c t_c^T E t_c`` besides
+        that of its planes, with the second moments E of the errors of the planes over the pixels.
+        These two and the rounding to 8 bits hardly depend on each other, so they are added.
+        """
+        difference = (shown - self.images).reshape(-1, shown.shape[2])
+        moments = (difference.T @ difference / len(difference)).astype(np.float64)
+        factors = self.table.at(self.table.lights)[..., :-1]
+        added = np.einsum("nck,kl,ncl->n", factors, moments, factors) / 3
+        return _mean_psnr(self.left_out + added + ROUNDING)
 
 
 def find_planes(photos: Photos, planes: int | None = None) -> Planes:
@@ -212,7 +225,11 @@ def find_planes(photos: Photos, planes: int | None = None) -> Planes:
     rows -= mean.astype(np.float32)[:, None]
     gram = product(rows, rows) / rows.shape[1]
     limit = planes or min(MAX_PLANES, most_planes(len(lights)))
-    psnrs = {choice: left_out(gram, mean, lights, *choice, limit) for choice in TABLES}
+    errors = {choice: left_out(gram, mean, lights, *choice, limit) for choice in TABLES}
+    psnrs = {
+        choice: np.array([_mean_psnr(column + ROUNDING) for column in of_choice.T])
+        for choice, of_choice in errors.items()
+    }
     best = max(psnrs.values(), key=lambda values: values.max())
     count = planes or int(np.argmax(best >= best.max() - SPARED)) + 1
     kind, smoothing = max(psnrs, key=lambda choice: psnrs[choice][count - 1])
@@ -225,8 +242,12 @@ def find_planes(photos: Photos, planes: int | None = None) -> Planes:
     columns = np.vstack([unit * scale, mean[None]]).astype(np.float64)
     values = np.moveaxis(columns.reshape(-1, len(lights), 3), 0, 2)
     table = LightTable(lights, values, kind, smoothing)
-    held_out = float(psnrs[kind, smoothing][len(unit) - 1])
-    return Planes(np.ascontiguousarray(images), table, held_out)
+    return Planes(np.ascontiguousarray(images), table, errors[kind, smoothing][:, len(unit) - 1])
+
+
+def _mean_psnr(errors: Doubles) -> float:
+    """Return the mean PSNR in dB of photos with these mean squared errors."""
+    return float(np.mean([psnr_from_mse(error) for error in errors.tolist()]))
 
 
 def most_planes(photos: int) -> int:
@@ -237,7 +258,7 @@ def most_planes(photos: int) -> int:
 def left_out(
     gram: Doubles, mean: Doubles, lights: Doubles, kind: str, smoothing: float, limit: int
 ) -> Doubles:
-    """Return the mean PSNR of left-out photos with 1, 2, ..., `limit` planes of the others.
+    """Return errors (n, limit) of left-out photos with 1, 2, ..., `limit` planes of the others.
 
     With the covariance C of the rows, the eigenpairs (V, L) of the rest R, and interpolated factors
     W of left-out rows T, the mean squared error is ``C_TT - 2 W V^T C_RT + W L W^T`` and the
@@ -255,7 +276,7 @@ def left_out(
         At most `most_planes`.
     """
     part = np.arange(len(lights)) % min(FOLDS, len(lights))
-    found = []
+    all_errors = np.empty((len(lights), limit))
     for fold in range(part.max() + 1):
         out = part == fold
         left, rest = np.repeat(out, 3), np.repeat(~out, 3)
@@ -269,10 +290,8 @@ def left_out(
         change = values * weights**2 - 2 * weights * (gram[np.ix_(left, rest)] @ vectors)
         errors = np.diag(gram)[left] + (mean[left] - factors[:, -1]) ** 2
         errors = errors[:, None] + np.cumsum(change, axis=1)
-        errors = errors.reshape(-1, 3, weights.shape[1]).mean(axis=1)
-        found.append(np.maximum(errors, ROUNDING))
-    psnrs = [[psnr_from_mse(e) for e in row] for row in np.concatenate(found).tolist()]
-    return np.asarray(np.mean(psnrs, axis=0))
+        all_errors[out] = np.maximum(errors.reshape(-1, 3, limit).mean(axis=1), 0)
+    return all_errors
 
 
 def fit_planes(

@@ -67,8 +67,9 @@ class Relightable:
     table : LightTable
         The factors of the planes for every light.
     psnr_held_out : float
-        Mean PSNR in dB, in sRGB, of photos that were left out: from planes of the others, before
-        they become Gaussians. The peak is white, also for photos of brighter light.
+        Mean psnr_rgb in dB of photos that such a model has not seen, as it shows them: an estimate
+        from the errors of planes of other photos and of the Gaussians, after `pack` also of its
+        rounding. The peak is white, and errors of brighter light count too. NaN if unknown.
     brightest : float
         The largest code of the photos, at least 1: codes above 1 are light above white, by the same
         curve. What exceeds it is clamped in scenes and in environments.
@@ -150,7 +151,8 @@ class Relightable:
         found = find_planes(read, planes)
         del read  # the photos take more memory than the fit
         result = fit_planes(found.images, gaussians, iterations, seed, backend, progress)
-        model = cls(result.gaussians, found.table, found.psnr_held_out, brightest)
+        shown = result.image.reshape(found.images.shape)
+        model = cls(result.gaussians, found.table, found.psnr_held_out(shown), brightest)
         if result.stopped == "interrupted":
             raise Interrupted(model, "the fit was interrupted; .result holds the model so far")
         return model
@@ -161,6 +163,8 @@ class Relightable:
             f"Relightable({len(self.planes)} Gaussians, {size}, {self.planes.channels} planes, "
             f"{len(self.lights)} lights, {self.table.kind})"
         )
+
+    _repr_html_ = to_html  # what a notebook shows
 
     @property
     def lights(self) -> Doubles:
@@ -407,12 +411,18 @@ def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable
     if not content:
         raise BadValue("holds a set without a table of lights; read it by Gaussians.load")
     data = read_set(path)
+    figures = read_table(content, data.arrays["color"].shape[1])
+    return Gaussians.from_data(data, backend), *figures
+
+
+def read_table(content: bytes, channels: int) -> tuple[LightTable, float, float]:
+    """Return what `table_bytes` wrote: the table, the PSNR and the largest code of photos."""
     if len(content) < _HEAD.size:
         raise BadValue("the table of lights is truncated; copy the file again")
     kind, planes, count, smoothing, psnr = _HEAD.unpack_from(content)
     sizes = [4 * (planes + 1), 6 * count, 3 * (planes + 1) * count]
     rest = len(content) - _HEAD.size - sum(sizes)
-    if rest not in (0, _BRIGHTEST.size) or planes != data.arrays["color"].shape[1]:
+    if rest not in (0, _BRIGHTEST.size) or planes != channels:
         raise BadValue("the table of lights has another size; copy the file again")
     ends = (_HEAD.size + np.cumsum(sizes)).tolist()
     scale = np.frombuffer(content[_HEAD.size : ends[0]], "<f4").astype(np.float64)
@@ -421,4 +431,4 @@ def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable
     name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
     table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
     brightest = check_brightest(_BRIGHTEST.unpack_from(content, ends[2])[0] if rest else 1.0)
-    return Gaussians.from_data(data, backend), table, psnr, brightest
+    return table, psnr, brightest

@@ -23,10 +23,11 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
-from ..image.io import Codes, displayed
+from ..image.io import Codes, codes_of, displayed, read_file, read_photo
 from ..image.pixels import check_encoding
 from ..image.resize import resample
 from ..raster.render import picture_of
+from ..relight.lights import check_lights
 from ..relight.model import Relightable
 from ..storage.atomic import atomic_write
 from .pictures import check_aspect, first_components, photo_uri, within
@@ -90,25 +91,30 @@ def view(
     levels: Sequence[int] = (),
     title: str = "Gaussians",
     encoding: str | None = None,
+    light: ArrayLike | None = None,
 ) -> Page:
     """Make a page for the browser that renders a set or a model as `render` does.
 
     The page pans and zooms without limits, and can show outlines, only the first Gaussians, and the
     parameters of the Gaussian under the pointer. For a model it has sliders for the first
     components of each channel, and draws random images. Of a model of lights, the light follows the
-    pointer, and on a phone the finger.
+    pointer, and on a phone the finger, unless a photo is compared; buttons turn it to usual places.
 
     Parameters
     ----------
     source : Gaussians, Fit, EigenGS or Relightable
     image : array_like, shape (H, W, 3), (H, W, 1) or (H, W), optional
-        A photo to compare with. A model encodes it, so that the sliders start from it.
+        A photo to compare with. A model encodes it, so that the sliders start from it. For a model
+        of lights, a file is read as stored, without its EXIF orientation.
     levels : sequence of int, optional
         Number of Gaussians up to each level, as from `level_counts`.
     title : str, optional
         Title of the page.
     encoding : {"srgb", "linear"}, optional
         The encoding of the pixels of the image, see `fit`.
+    light : array_like, shape (3,), optional
+        For a model of lights, the direction of the light at first, by default that of the camera.
+        It must be given with a photo, as that of the photo.
 
     Returns
     -------
@@ -119,7 +125,8 @@ def view(
     ------
     ValueError
         If the set has more than a million Gaussians, a value is not finite, the image has another
-        aspect ratio than a set (a model encodes any), or a fit has a mean image of pixels.
+        aspect ratio than a set (a model encodes any), a fit has a mean image of pixels, or a light
+        is missing or no direction above the horizon.
     TypeError
         If the source has another type.
 
@@ -140,12 +147,24 @@ def view(
     if encoding and image is None:
         raise ValueError("encoding is for the pixels of an image; leave it out, or give one")
     model = source if isinstance(source, EigenGS) else None
-    lights = describe_lights(source) if isinstance(source, Relightable) else None
+    lights, presets = None, []
     if isinstance(source, Relightable):
-        gaussians = source.relight(OVERHEAD)
+        if image is not None and light is None:
+            raise ValueError(
+                "a photo is compared under its own light; give it as light, such as (0.3, 0.2, 0.9)"
+            )
+        direction = np.asarray(OVERHEAD if light is None else light)
+        [start] = check_lights(direction[None], "light").tolist()
+        gaussians, lights = source.relight(start), describe_lights(source) | {"start": start}
+        presets = light_presets(source)
+        if image is not None:
+            presets.insert(0, ("As in the photo", start))
+        pixels = None if image is None else _stored(image, encoding)
     else:
+        if light is not None:
+            raise ValueError("light is for a model of lights; leave it out")
         gaussians = one_image(set_of(source)) if model is None else model.gaussians
-    pixels = None if image is None else displayed(image, gaussians.space, encoding)
+        pixels = None if image is None else displayed(image, gaussians.space, encoding)
     model_facts, note = None, ""
     if model is not None:
         counts = kept_counts(model)
@@ -154,6 +173,9 @@ def view(
             gaussians = gaussians.scaled(pixels.shape[1], pixels.shape[0])
     elif pixels is not None:
         check_aspect(pixels, (gaussians.width, gaussians.height))
+    summary = f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels"
+    if isinstance(source, Relightable) and np.isfinite(source.psnr_held_out):
+        summary += f"; left-out lights: psnr_rgb {source.psnr_held_out:.2f} dB"
     views = channel_views(gaussians.channels)
     facts = {
         "set": describe_set(gaussians, levels),
@@ -165,14 +187,22 @@ def view(
     }
     html = _template().render(
         title=title,
-        summary=f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels",
+        summary=summary,
         facts=facts,
         model_note=note,
         views=views,
+        presets=presets,
         bright=not gaussians.space.bounded,
         color_name="Colour" if gaussians.space.is_color else "Values",
     )
     return Page(html)
+
+
+def _stored(image: ArrayLike, encoding: str | None) -> NDArray[np.float32]:
+    """Read a photo under a light as `Relightable.fit` does: lights belong to stored pixels."""
+    if isinstance(image, (str, os.PathLike)):
+        return codes_of(read_file(os.fspath(image), encoding=encoding, upright=False))
+    return codes_of(read_photo(image, encoding, arrays="srgb"))
 
 
 # --- The data of a page: arrays in base64, with colours decoded to RGB ----------------------------
@@ -251,7 +281,10 @@ def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:
 
 
 OVERHEAD = (0.0, 0.0, 1.0)
-"""The light of a page before the pointer moves it."""
+"""The light of a page at first: that of the camera."""
+
+LEAST_RAKING = 0.17
+"""Smallest z of a raking light: 10 degrees above the horizon."""
 
 
 def describe_lights(model: Relightable) -> Record:
@@ -268,6 +301,14 @@ def describe_lights(model: Relightable) -> Record:
         "scales": scales.tolist(),
         "background": arrays["background"].tolist(),
     }
+
+
+def light_presets(model: Relightable) -> list[tuple[str, Sequence[float]]]:
+    """Return names and directions of lights; raking ones are as low as those of the photos."""
+    low = max(float(model.lights[:, 2].min()), LEAST_RAKING)
+    aside = (1 - low**2) ** 0.5
+    raking = [("Raking, left", (-aside, 0, low)), ("Raking, top", (0, aside, low))]
+    return [*raking, ("From the camera", OVERHEAD)]
 
 
 MAX_WEIGHT_BYTES = 1 << 20

@@ -142,8 +142,8 @@ def test_photos_that_do_not_depend_on_the_light():
     same = np.repeat(photos(LIGHTS)[:1], 8, axis=0)
     options = {"gaussians": 80, "iterations": 20, "encoding": "srgb", "progress": False}
     model = eg.Relightable.fit(same, LIGHTS[:8], **options)
-    assert model.planes.channels <= 3 and 90 < model.psnr_held_out <= 100
-    assert eg.psnr(same[0], picture(model, LIGHTS[20])) > 25
+    shown = eg.psnr(same[0], picture(model, LIGHTS[20]))
+    assert model.planes.channels <= 3 and 50 < model.psnr_held_out == pytest.approx(shown, abs=1)
 
 
 def test_as_many_planes_as_the_rest_of_the_photos_has_rows():
@@ -201,7 +201,7 @@ def test_a_packed_model_is_smaller_and_shows_nearly_the_same(model, packed, tmp_
     assert result.bytes < 0.4 * (tmp_path / "model.npz").stat().st_size
     assert 0 < result.psnr_drop <= 0.3
     loaded = eg.Relightable.load(path)
-    assert loaded.psnr_held_out == model.psnr_held_out
+    assert loaded.psnr_held_out == pytest.approx(model.psnr_held_out - result.psnr_drop)
     light = [0.2, 0.3, 0.9]
     allowed = model.psnr_held_out - 10 * np.log10(10**0.03 - 1)  # the error that 0.3 dB adds
     assert eg.psnr(picture(loaded, light), picture(model, light)) > allowed - 4

@@ -9,7 +9,7 @@ class Lights {
     const count = facts.scales.length;
     const rows = decodeHalves(facts.planes).map((value, at) => value * facts.scales[at % count]);
     this.planes = set.sorted(rows, count);
-    this.aim(0, 0, 1);
+    this.aim(...facts.start);
   }
 
   /** Return the functions of a direction whose sums the factors are, see LightTable. */

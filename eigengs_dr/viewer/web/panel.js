@@ -131,7 +131,7 @@ function connectModel(viewer, model) {
   update(false);
 }
 
-/** Connect the light: sliders for where it stands; return what turns it to a pixel of the canvas. */
+/** Connect the light: buttons and sliders for where it stands; return what turns it to a pixel of the canvas. */
 function connectLights(viewer, lights) {
   const [turn, height, follows] = ["turn", "height", "follows"].map(byId);
   const degrees = Math.PI / 180;
@@ -147,6 +147,13 @@ function connectLights(viewer, lights) {
     slider.addEventListener("input", () => {
       const [a, b] = [turn.value * degrees, height.value * degrees];
       lights.aim(Math.cos(a) * Math.cos(b), Math.sin(a) * Math.cos(b), Math.sin(b));
+      show(true);
+    });
+  }
+  for (const button of document.querySelectorAll("#presets button")) {
+    button.addEventListener("click", () => {
+      follows.checked = false; // else the pointer turns it away on its way to the picture
+      lights.aim(...button.dataset.light.split(",").map(Number));
       show(true);
     });
   }
