@@ -16,10 +16,12 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..backend.messages import warn
 from ..backend.types import ArrayLike, Doubles, Singles
@@ -199,15 +201,23 @@ class Planes(NamedTuple):
     def psnr_held_out(self, shown: Singles) -> float:
         """Return the mean PSNR in dB of left-out photos, where the planes are shown (H, W, K).
 
-        A photo under a light with the factors t_c gets the error ``1/3 sum_c t_c^T E t_c`` besides
-        that of its planes, with the second moments E of the errors of the planes over the pixels.
-        These two and the rounding to 8 bits hardly depend on each other, so they are added.
+        The Gaussians show a projection S of the planes, whose errors have the second moments E. A
+        photo x, of which the others say y, then has the error ``|x - S y|^2``, which is
+        ``|x - y|^2 + |x - S x|^2 - |(x - y) - S (x - y)|^2``: that of planes, and with the factors
+        t of the photo and u of the others ``1/3 sum_c t^T E t - (t - u)^T E (t - u)``.
         """
         difference = (shown - self.images).reshape(-1, shown.shape[2])
         moments = (difference.T @ difference / len(difference)).astype(np.float64)
-        factors = self.table.at(self.table.lights)[..., :-1]
-        added = np.einsum("nck,kl,ncl->n", factors, moments, factors) / 3
-        return _mean_psnr(self.left_out + added + ROUNDING)
+        lights, values = self.table.lights, self.table.values
+        change = values.copy()
+        for out in folds(lights):
+            others = replace(self.table, lights=lights[~out], values=values[~out])
+            change[out] -= others.at(lights[out])
+        added, spared = (
+            np.einsum("nck,kl,ncl->n", factors[..., :-1], moments, factors[..., :-1]) / 3
+            for factors in (values, change)
+        )
+        return _mean_psnr(np.maximum(self.left_out + added - spared, 0) + ROUNDING)
 
 
 def find_planes(photos: Photos, planes: int | None = None) -> Planes:
@@ -255,6 +265,12 @@ def most_planes(photos: int) -> int:
     return min(MAX_CHANNELS, 3 * (photos - math.ceil(photos / FOLDS)))
 
 
+def folds(lights: Doubles) -> list[NDArray[np.bool_]]:
+    """Return which lights each part leaves out."""
+    count = min(FOLDS, len(lights))
+    return [np.arange(len(lights)) % count == fold for fold in range(count)]
+
+
 def left_out(
     gram: Doubles, mean: Doubles, lights: Doubles, kind: str, smoothing: float, limit: int
 ) -> Doubles:
@@ -275,10 +291,8 @@ def left_out(
     limit : int
         At most `most_planes`.
     """
-    part = np.arange(len(lights)) % min(FOLDS, len(lights))
     all_errors = np.empty((len(lights), limit))
-    for fold in range(part.max() + 1):
-        out = part == fold
+    for out in folds(lights):
         left, rest = np.repeat(out, 3), np.repeat(~out, 3)
         values, vectors = np.linalg.eigh(gram[np.ix_(rest, rest)])
         values, vectors = values[::-1][:limit], vectors[:, ::-1][:, :limit]

@@ -164,8 +164,6 @@ class Relightable:
             f"{len(self.lights)} lights, {self.table.kind})"
         )
 
-    _repr_html_ = to_html  # what a notebook shows
-
     @property
     def lights(self) -> Doubles:
         """Directions of the lights of the photos, shape (n, 3)."""

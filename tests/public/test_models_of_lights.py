@@ -181,3 +181,18 @@ def test_a_photo_without_its_light_is_refused(model, tmp_path):
     assert_refused(run(*command, tmp_path / "model.npz", *photo), "--light X,Y,Z", "photo.png")
     assert_refused(run(*command, tmp_path / "set.npz", "--light", "0,0,1"), "--light", "set.npz")
     assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.slow
+def test_the_number_holds_where_left_out_lights_are_outermost():
+    """Each eighth of few lights is left out in turn, so that some are extrapolated."""
+    lights, options = LIGHTS[::2], OPTIONS | {"gaussians": 36, "planes": 10}
+    images, psnrs = photos(lights), []
+    for part in range(8):
+        out = np.arange(len(lights)) % 8 == part
+        model = eg.Relightable.fit(images[~out], lights[~out], **options)
+        pairs = zip(images[out], lights[out], strict=True)
+        psnrs += [eg.psnr(image, eg.picture_of(model.relight(light))) for image, light in pairs]
+    assert eg.Relightable.fit(images, lights, **options).psnr_held_out == pytest.approx(
+        np.mean(psnrs), abs=0.4
+    )
