@@ -25,6 +25,7 @@ from zipfile import is_zipfile
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..backend.plain import parse_json
 from ..backend.types import Record
 from ..fitting.method import Model
 from ..fitting.start import set_in
@@ -34,7 +35,6 @@ from ..image.folder import list_images
 from ..image.remote import is_url, stem_of
 from ..storage.atomic import atomic_write, lock_folder, refuse_link, remove_stale
 from ..storage.checkpoint import difference, to_json
-from ..storage.plain import parse_json
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ..backend.interrupts import undone_at_end
+from ..backend.plain import parse_json, read_json
 from ..backend.types import Arrays, Record
 from . import npz
 from .atomic import atomic_folder, lock_output, refuse_link, remove_folder, remove_stale
-from .plain import parse_json, read_json
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
 
