@@ -56,7 +56,8 @@ class ImageRow:
         Size of the image in pixels, and the number of Gaussians. For a skipped image, the figures
         come from the manifest.
     psnr_ycbcr, psnr_rgb : float or None
-        PSNR of the fit in dB, see `eigengs_dr.Fit`; None for encoded images.
+        PSNR in dB, see `eigengs_dr.Fit` and `eigengs_dr.psnr`; None for sets that are encoded
+        without the mean image.
     seconds : float or None
         Time of the work on the image, without reading and writing; None if there was none. The
         time of a group is divided equally.
