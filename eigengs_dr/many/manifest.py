@@ -33,7 +33,13 @@ from ..gaussian.file import read_figures, read_head
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import list_images
 from ..image.remote import is_url, stem_of
-from ..storage.atomic import atomic_write, lock_folder, refuse_link, remove_stale
+from ..storage.atomic import (
+    atomic_write,
+    lock_folder,
+    refuse_link,
+    remove_stale,
+    require_writable,
+)
 from ..storage.checkpoint import difference, to_json
 
 
@@ -243,6 +249,7 @@ def open_manifest(
             if message := _conflict(folder, rows, chosen):
                 raise ValueError(message)
             conflict = _conflict(folder, rows, settings)
+        require_writable(path)  # root may append to what its owner made read-only
         file = path.open("ab")
         try:
             yield Manifest(path, rows, file, settings, overwrite, conflict)

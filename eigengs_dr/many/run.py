@@ -42,7 +42,7 @@ from ..image.metrics import psnr
 from ..image.notes import NotedImages, kept_notes, series, tell_all
 from ..image.pixels import EncodedImage
 from ..raster.render import render
-from ..storage.atomic import refuse_url, require_writable
+from ..storage.atomic import lock_folder, refuse_url
 from .manifest import ImageRow, Images, Manifest, RowProgress, RunImage, list_sources, open_manifest
 
 WRITERS = 2
@@ -192,9 +192,15 @@ def make_folder(output: str | os.PathLike[str]) -> Path:
     output = Path(output)
     if output.exists() and not output.is_dir():
         raise OSError(f"{output}: is a file; many images need a folder")
+    is_new = not output.exists()
     output.mkdir(parents=True, exist_ok=True)
-    require_writable(output / "probe.npz")
-    return output
+    try:
+        with lock_folder(output):
+            return output
+    except OSError:
+        if is_new:
+            output.rmdir()
+        raise
 
 
 # ---------------------------------------------------------------------------------------------
