@@ -2,6 +2,7 @@
 
 import json
 import os
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import pytest
@@ -201,3 +202,70 @@ def test_an_encoding_follows_no_model_that_was_loaded_before():
         weights[...] = 0
     found = eg.EigenGS.load("natural").encode(photo).to_arrays()["color"]
     np.testing.assert_array_equal(found, expected)
+
+
+@contextmanager
+def memory_of(limit):
+    """Let this process use no more memory than a number of bytes."""
+    resource = pytest.importorskip("resource", reason="Windows has no such limit")
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+SMALL_PHOTO = np.full((8, 8, 3), 0.5, np.float32)
+READERS = {
+    "fit": lambda image: eg.fit(image, 10),
+    "data": lambda image: eg.fit(image, 10, space="data"),
+    "weight": lambda image: eg.fit(SMALL_PHOTO, 10, weight=image),
+    "start": lambda image: eg.fit(image, start=eg.fit(SMALL_PHOTO, 4, iterations=0).gaussians),
+    "family": lambda image: eg.Eigenbasis.from_images([image] * 3, (16, 16), 1),
+    "encode": lambda image: eg.EigenGS.load("natural").encode(image),
+    "save": lambda image: eg.save_image("never.exr", image),
+    "blocks": lambda image: eg.fit_large(image),
+}
+
+
+class Recipe:
+    """An array of another library, which computes its values only when they are asked for."""
+
+    shape, dtype, ndim = (60_000, 60_000, 3), np.dtype(np.float32), 3
+
+    def __array__(self, *arguments, **options):
+        raise AssertionError("it is read")
+
+    __getitem__ = __array__
+
+
+@pytest.mark.parametrize("kind", ["broadcast", "recipe", "uint8"])
+@pytest.mark.parametrize("reader", READERS)
+def test_an_array_that_memory_cannot_hold_is_refused_unread(reader, kind, tmp_path):
+    image = Recipe()
+    if kind != "recipe":
+        value = np.float32(0.5) if kind == "broadcast" else np.uint8(9)
+        image = np.broadcast_to(value, Recipe.shape)
+    with (
+        memory_of(8 << 30),
+        pytest.raises(ValueError, match=r"60000x60000 pixels.* memory|got Recipe") as told,
+    ):
+        READERS[reader](image)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("side", "told"), [(60_000, r"take about .* GB of memory"), (100_000, "sides must be from 1")]
+)
+def test_a_file_of_an_array_is_refused_by_its_header(tmp_path, side, told):
+    file = tmp_path / "large.npy"
+    head = {"descr": "|u1", "fortran_order": False, "shape": (side, side)}
+    with file.open("wb") as stream:
+        np.lib.format.write_array_header_1_0(stream, head)
+        stream.truncate(stream.tell() + side * side)  # without blocks on the disk
+    with memory_of(8 << 30) if side < 65_536 else nullcontext():
+        with pytest.raises(ValueError, match=rf"{file}: .*{told}"):
+            eg.fit_large(file, tmp_path / "out.npz")
+        assert_refused(run("fit", file, "-o", tmp_path / "o.npz", "--blocks", 1024), file)
+    assert os.listdir(tmp_path) == ["large.npy"]
