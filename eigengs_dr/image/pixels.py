@@ -197,7 +197,7 @@ def check_floats(image: object, name: str, channels: int = 1) -> None:
 
     An array may be a file, or the recipe of one, of which nothing is read yet.
     """
-    shape = getattr(image, "shape", ())
+    shape: Any = getattr(image, "shape", ())
     needed = 4.0 * math.prod(shape[:2]) * max([channels, *shape[2:3]])
     if len(shape) > 1 and needed > ALWAYS:
         try:
