@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -123,12 +122,11 @@ def raise_reason(path: Path, reason: str) -> None:
 
 
 def check_room(path: Path) -> None:
-    """Raise the error of the system if a file, as it was written, cannot grow by 64 KiB.
+    """Raise the error of the system if a file, as it was written, cannot grow by a block.
 
     Pillow and OpenImageIO take a picture that a full disk has cut for written.
     """
     size = path.stat().st_size
     with path.open("ab") as file:
-        file.write(bytes(1 << 16))
-        os.fsync(file.fileno())
+        file.write(bytes(1 << 12))
         file.truncate(size)
