@@ -7,7 +7,8 @@ from _helpers.command import run
 from _helpers.families import small_model
 from _helpers.lit_models import LitFormula
 
-PICTURES = tuple(f"picture.{s}" for s in "png jpg webp bmp ppm tif exr hdr pfm".split())
+SUFFIXES = ("png", "jpg", "webp", "bmp", "ppm", "tif", "exr", "hdr", "pfm")
+PICTURES = tuple(f"picture.{suffix}" for suffix in SUFFIXES)
 OUTPUTS = (
     *("set.npz", "fit.npz", "set.egs", *PICTURES, "deep.png", "page.html", "model.npz", "lit.npz"),
     *("command.npz", "report.json", "preview.png", "packed.egs", "drawn.png", "drawn.tif"),
