@@ -6,6 +6,7 @@
 - ``doors``: the entry points of the package: their numbers, progress bars and lock
 - ``types``: names of types for annotations
 - ``messages``: warnings, text for a terminal, pictures in a notebook
+- ``plain``: JSON from files, with limits
 - ``interrupts``: Ctrl-C and SIGTERM, between steps and at the end of the program
 - ``executor``: where tasks run, in this process or on a cluster
 - ``doctor``: what works here and what to install

@@ -19,10 +19,10 @@ import click
 
 from ..backend.doors import label_of
 from ..backend.interrupts import INTERRUPTED, Interrupted
+from ..backend.plain import parse_json
 from ..backend.selection import backend_of, name_of, select
 from ..backend.types import Record
 from ..storage.atomic import atomic_write
-from ..storage.plain import parse_json
 from . import options
 from .console import MISSED, bar, print_message, table
 from .outputs import check_outputs, lock_outputs, name_outputs

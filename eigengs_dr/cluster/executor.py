@@ -28,7 +28,7 @@ from distributed.scheduler import KilledWorker
 
 from ..backend.executor import ClusterError, Done, Function, Task, Value
 from ..backend.interrupts import defer_interrupts, terminate_as_interrupt
-from ..storage.plain import read_json
+from ..backend.plain import read_json
 from ..version import __version__
 from .local import local_cluster
 from .worker import package_versions, run_task, share

@@ -291,7 +291,8 @@ class EigenGS:
         ----------
         images, output, overwrite, progress, client
             See `eigengs_dr.fit_many`. Without an output folder, ``ImageRow.result`` is a
-            `Gaussians`; rows have no PSNR.
+            `Gaussians`. Rows have the PSNRs of its picture as `eigengs_dr.psnr` computes them, or
+            None with the mean "dense", without which a set is no picture.
         colors, mean, target_psnr, encoding
             See `encode`. The Gaussians are bit-identical to those of `encode`.
 
@@ -313,9 +314,8 @@ class EigenGS:
         work = partial(_encode_all, model=self, options=(colors, mean, target_psnr))
         options = {"colors": colors, "mean": mean, "target_psnr": target_psnr, "encoding": encoding}
         options |= {"model": fingerprint(self)}
-        job = Job(
-            work, read=partial(_read, encoding=encoding), options=options, given=list(options)
-        )
+        read, has_picture = partial(_read, encoding=encoding), mean != "dense"
+        job = Job(work, None, read, 0, options, list(options), has_picture)
         return run_images(images, output, overwrite, job, progress, client)
 
     def _colored(self, columns: Doubles, size: tuple[int, int] | None) -> Gaussians:

@@ -82,8 +82,9 @@ class Goal:
         Whether it is a psnr_rgb or a psnr_ycbcr of an image. Data, normals and light above 1 have
         only one PSNR, see `key`.
     max_gaussians : int or None
-        Largest number of Gaussians. By default they have at most as many parameters as the image
-        has numbers: 3 Gaussians for 8 pixels in colour.
+        Largest number of Gaussians; an image with fewer pixels takes one per pixel at most. By
+        default they have at most as many parameters as the image has numbers: 3 Gaussians for 8
+        pixels in colour.
 
     Raises
     ------
@@ -225,12 +226,11 @@ class FitOptions:
         """Raise ValueError for more Gaussians than pixels, and for an image too large to index."""
         check_sides((width, height))
         check_index_range(width, height, channels)
-        limit = self.goal.max_gaussians if self.goal else None
-        for name, count in (("gaussians", self.count), ("max_gaussians", limit)):
-            if count is not None and not 1 <= count <= width * height:
-                raise ValueError(
-                    f"{name} is {count}; an image of {width}x{height} takes 1 to {width * height}"
-                )
+        count = self.count
+        if count is not None and not 1 <= count <= width * height:
+            raise ValueError(
+                f"gaussians is {count}; an image of {width}x{height} takes 1 to {width * height}"
+            )
         self.levels_for(width * height)
 
     @property
@@ -246,7 +246,7 @@ class FitOptions:
     def max_count_for(self, pixels: int, channels: int) -> int:
         """Return the largest number of Gaussians that a search tries."""
         limit = self.goal.max_gaussians if self.goal else None
-        return limit or max_gaussians_for(pixels, channels)
+        return min(limit, pixels) if limit else max_gaussians_for(pixels, channels)
 
     def first_try(self, pixels: int, channels: int) -> int:
         """Return the number of Gaussians with which a search starts."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -95,6 +94,7 @@ def write_file(path: Path, pixels: Pixels, bits: int) -> None:
         Image.fromarray(flat).save(path, **options)
     else:
         _write_openimageio(path, pixels, bits)
+    check_room(path)
 
 
 def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
@@ -111,23 +111,22 @@ def _write_openimageio(path: Path, pixels: Pixels, bits: int) -> None:
     image.set_write_format(kind)
     image.specmod().channelnames = ("R", "G", "B") if pixels.shape[2] == 3 else ("Y",)
     image.specmod().attribute("compression", "zip")
-    written = image.write(str(path))
-    reason = image.geterror().strip() or "the file is cut"
-    if written and suffix == ".png":  # OpenImageIO takes one that a full disk has cut for written
-        with path.open("rb") as file:
-            file.seek(max(0, path.stat().st_size - len(PNG_END)))
-            written = file.read() == PNG_END
-    if not written:
-        raise_reason(path, reason)
+    if not image.write(str(path)):
+        raise_reason(path, image.geterror().strip())
 
 
 def raise_reason(path: Path, reason: str) -> None:
     """Raise the error of the system for a file that OpenImageIO could not write, or its own."""
-    with path.open("ab") as file:
-        file.write(bytes(1 << 16))
-        os.fsync(file.fileno())
+    check_room(path)
     raise OSError(reason)
 
 
-PNG_END = b"IEND\xaeB`\x82"
-"""Last bytes of a PNG file."""
+def check_room(path: Path) -> None:
+    """Raise the error of the system if a file, as it was written, cannot grow by a block.
+
+    Pillow and OpenImageIO take a picture that a full disk has cut for written.
+    """
+    size = path.stat().st_size
+    with path.open("ab") as file:
+        file.write(bytes(1 << 12))
+        file.truncate(size)

@@ -22,6 +22,7 @@ from .pixels import (
     EncodedImage,
     ImageError,
     check_encoding,
+    check_floats,
     encoding_of,
     is_bitmap,
     is_drjit,
@@ -260,6 +261,7 @@ def check_member(
 
 def _array_of(photo: object) -> Any:
     """Return numbers as an array of NumPy; rows of unequal length unchanged, for their error."""
+    check_floats(photo, "image")
     try:
         return np.asanyarray(photo)
     except ValueError:

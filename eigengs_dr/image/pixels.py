@@ -7,6 +7,7 @@ is decoded as sRGB is too dark. Files of integers hold sRGB, files of floats hol
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import partial
 from operator import index
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..backend.messages import warn
 from ..backend.types import ArrayLike, Singles, Tensor
+from ..storage.memory import ALWAYS, check_usable
 from .strips import Pixels, by_strips
 
 ENCODINGS = ("srgb", "linear")
@@ -150,6 +152,7 @@ def to_floats(
 
     The range of the pixels is checked if the encoding is given.
     """
+    check_floats(image, name, 1 if keep_grey else 3)
     try:
         array = np.asarray(image)
     except ValueError:  # rows of unequal length
@@ -189,6 +192,21 @@ def to_floats(
     return pixels
 
 
+def check_floats(image: object, name: str, channels: int = 1) -> None:
+    """Raise ImageError, by the shape alone, if pixels as floats take more memory than there is.
+
+    An array may be a file, or the recipe of one, of which nothing is read yet.
+    """
+    shape: Any = getattr(image, "shape", ())
+    needed = 4.0 * math.prod(shape[:2]) * max([channels, *shape[2:3]])
+    if len(shape) > 1 and needed > ALWAYS:
+        try:
+            advice = "scale them down, or work on parts of them, as fit_large does"
+            check_usable(needed, f"{name}: {shape[1]}x{shape[0]} pixels", advice)
+        except ValueError as error:
+            raise ImageError(str(error)) from None
+
+
 def _check_range(pixels: NDArray[np.float32], name: str, encoding: str) -> None:
     """Reject sRGB far outside [0, 1], and light whose squares would overflow single precision."""
     low, high = float(pixels.min()), float(pixels.max())
@@ -213,6 +231,7 @@ def check_weight(weight: ArrayLike | None) -> Singles | None:
     """
     if weight is None:
         return None
+    check_floats(weight, "weight")
     try:
         given = np.asarray(weight)
     except ValueError:  # rows of unequal length

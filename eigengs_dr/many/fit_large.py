@@ -22,7 +22,7 @@ from ..backend.types import Arrays
 from ..cluster import executor_for
 from ..fitting.method import DEFAULT, Method
 from ..fitting.objective import restored
-from ..fitting.options import FitOptions, named_options
+from ..fitting.options import COLOR_PARAMETERS, FitOptions, named_options
 from ..gaussian.file import SetData, check_suffix, write_set
 from ..gaussian.gaussians import Gaussians
 from ..gaussian.region import crop
@@ -30,6 +30,8 @@ from ..image.metrics import psnr_from_mse
 from ..image.space import Extent, exposure_of, space_of
 from ..storage.atomic import require_writable
 from ..storage.checkpoint import Checkpoint, open_checkpoint
+from ..storage.memory import check_usable
+from ..storage.npz import COPIES
 from .block import (
     BlockSettings,
     BlockTask,
@@ -226,7 +228,8 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Bl
     Raises
     ------
     ValueError
-        If the blocks are too small, or there are too few or too many Gaussians.
+        If the blocks are too small, or there are too few Gaussians, or too many for the image or
+        the memory.
     """
     if side < MIN_SIDE:
         raise ValueError(f"block is {side}; it must be at least {MIN_SIDE} pixels")
@@ -247,6 +250,9 @@ def plan(image: Source, options: FitOptions, side: int) -> tuple[list[Block], Bl
         raise ValueError(
             f"gaussians is {count}; an image of {image.width}x{image.height} takes 1 to {pixels}"
         )
+    needed = COPIES * 4.0 * count * (COLOR_PARAMETERS + image.channels)
+    what = f"{image.name}: {count:,} Gaussians on {image.width}x{image.height} pixels"
+    check_usable(needed, what, "use fewer, or fit parts of the image")
     return blocks, BlockSettings(options, count, spacing)
 
 

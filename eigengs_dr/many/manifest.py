@@ -25,6 +25,7 @@ from zipfile import is_zipfile
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..backend.plain import parse_json
 from ..backend.types import Record
 from ..fitting.method import Model
 from ..fitting.start import set_in
@@ -32,9 +33,14 @@ from ..gaussian.file import read_figures, read_head
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import list_images
 from ..image.remote import is_url, stem_of
-from ..storage.atomic import atomic_write, lock_folder, refuse_link, remove_stale
+from ..storage.atomic import (
+    atomic_write,
+    lock_folder,
+    refuse_link,
+    remove_stale,
+    require_writable,
+)
 from ..storage.checkpoint import difference, to_json
-from ..storage.plain import parse_json
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,8 @@ class ImageRow:
         Size of the image in pixels, and the number of Gaussians. For a skipped image, the figures
         come from the manifest.
     psnr_ycbcr, psnr_rgb : float or None
-        PSNR of the fit in dB, see `eigengs_dr.Fit`; None for encoded images.
+        PSNR in dB, see `eigengs_dr.Fit` and `eigengs_dr.psnr`; None for sets that are encoded
+        without the mean image.
     seconds : float or None
         Time of the work on the image, without reading and writing; None if there was none. The
         time of a group is divided equally.
@@ -242,6 +249,7 @@ def open_manifest(
             if message := _conflict(folder, rows, chosen):
                 raise ValueError(message)
             conflict = _conflict(folder, rows, settings)
+        require_writable(path)  # root may append to what its owner made read-only
         file = path.open("ab")
         try:
             yield Manifest(path, rows, file, settings, overwrite, conflict)

@@ -38,9 +38,11 @@ from ..gaussian.file import FitFigures, write_set
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import read_ahead
 from ..image.io import read_floats
+from ..image.metrics import psnr
 from ..image.notes import NotedImages, kept_notes, series, tell_all
 from ..image.pixels import EncodedImage
-from ..storage.atomic import refuse_url, require_writable
+from ..raster.render import render
+from ..storage.atomic import lock_folder, refuse_url
 from .manifest import ImageRow, Images, Manifest, RowProgress, RunImage, list_sources, open_manifest
 
 WRITERS = 2
@@ -111,6 +113,8 @@ class Job(NamedTuple):
         Options on which the results depend, with values that JSON can hold.
     given : collection of str
         Names of the options that the caller gave explicitly.
+    measures : bool
+        Whether results are sets without figures, whose pictures are compared with the images.
     """
 
     work: Callable[[list[EncodedImage]], list[Fit] | list[Gaussians]]
@@ -119,6 +123,7 @@ class Job(NamedTuple):
     steps: int = 0
     options: Record | None = None
     given: Collection[str] = ()
+    measures: bool = False
 
 
 def run_images(
@@ -187,9 +192,15 @@ def make_folder(output: str | os.PathLike[str]) -> Path:
     output = Path(output)
     if output.exists() and not output.is_dir():
         raise OSError(f"{output}: is a file; many images need a folder")
+    is_new = not output.exists()
     output.mkdir(parents=True, exist_ok=True)
-    require_writable(output / "probe.npz")
-    return output
+    try:
+        with lock_folder(output):
+            return output
+    except OSError:
+        if is_new:
+            output.rmdir()
+        raise
 
 
 # ---------------------------------------------------------------------------------------------
@@ -298,15 +309,18 @@ def _work_on(
         height, width = image.pixels.shape[:2]
         figures = {name: getattr(result, name) for name in FIGURES if hasattr(result, name)}
         figures |= {"width": width, "height": height, "gaussians": len(gaussians)}
+        if job.measures:
+            picture = render(gaussians).numpy()
+            figures |= {f"psnr_{s}": psnr(picture, image.pixels, s) for s in ("ycbcr", "rgb")}
         yield source, source.row("done", seconds=seconds, result=result, **figures), gaussians
 
 
 def figures_of(row: ImageRow) -> FitFigures | None:
     """Return the figures that are stored in the file of a fit."""
-    if row.psnr_ycbcr is None or row.psnr_rgb is None:
+    if row.psnr_ycbcr is None or row.psnr_rgb is None or row.iterations is None:
         return None
     name = "" if row.input is None else Path(row.input).name
-    return FitFigures(row.psnr_ycbcr, row.psnr_rgb, row.iterations or 0, name)
+    return FitFigures(row.psnr_ycbcr, row.psnr_rgb, row.iterations, name)
 
 
 def _results(images: list, job: Job) -> list:

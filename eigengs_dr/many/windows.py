@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..backend.types import Record, Values
 from ..gaussian.file import MAX_SET_SIDE
-from ..image.formats import raise_reason
+from ..image.formats import check_room, raise_reason
 from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
 from ..image.notes import tell
 from ..image.pixels import encoding_of
@@ -263,3 +263,4 @@ def write_tiles(
     reason = file.geterror().strip()
     if not (file.close() and written):
         raise_reason(Path(path), reason or file.geterror().strip())
+    check_room(Path(path))

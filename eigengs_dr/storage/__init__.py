@@ -2,7 +2,6 @@
 
 - ``atomic``: files and folders that are created in one step, and have one writer at a time
 - ``npz``: arrays with a format, a version and checks
-- ``plain``: JSON from files, with limits
 - ``memory``: limits of the memory that a file may take
 - ``checkpoint``: the state of an unfinished run
 """

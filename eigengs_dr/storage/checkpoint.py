@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from ..backend.interrupts import undone_at_end
+from ..backend.messages import warn
+from ..backend.plain import parse_json, read_json
 from ..backend.types import Arrays, Record
 from . import npz
 from .atomic import atomic_folder, lock_output, refuse_link, remove_folder, remove_stale
-from .plain import parse_json, read_json
 
 FORMAT, VERSION = "eigengs_dr.checkpoint", 1
 
@@ -36,7 +37,7 @@ def open_checkpoint(
 
     The folder is deleted at the end of the block. If the block raises, the folder is kept unless
     it is empty. A folder without saved state, left by a run that was killed before its first save
-    or during the deletion, is replaced.
+    or during the deletion, is replaced; a warning says so if its head cannot be read.
 
     Parameters
     ----------
@@ -91,6 +92,8 @@ def _resumed(folder: Path, settings: Record) -> Checkpoint | None:
         )
         if not is_ours:
             raise ValueError(f"{folder}: not a readable checkpoint; move it away") from None
+        if any(folder.iterdir()):
+            warn(f"{folder}: {HEAD} is unreadable; the interrupted run begins anew")
         remove_folder(folder)
         return None
     if all(path.name == HEAD for path in folder.iterdir()):

@@ -59,6 +59,7 @@ def empty(folder):
     folder.mkdir()
 
 
+@pytest.mark.filterwarnings("ignore:.*run.json is unreadable")
 @pytest.mark.parametrize("damage", [lose_head, cut_head, lose_work, empty])
 def test_a_folder_that_a_kill_left_is_begun_anew(output, stopped, damage):
     damage(stopped)
