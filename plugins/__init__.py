@@ -9,7 +9,7 @@ try:
     import mitsuba  # noqa: F401
 except ImportError as error:
     raise ImportError(
-        f"the plugins need Mitsuba ({error}): pip install 'mitsuba>=3.9,<4'"
+        f"the plugins need Mitsuba ({error}): pip install 'mitsuba>=3.9,<3.10'"
     ) from error
 
 from ..backend.messages import no_attribute

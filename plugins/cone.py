@@ -1,7 +1,4 @@
-"""The footprint of a pixel on a texture: the cone of the pixel, cut by the surface.
-
-Mitsuba 3.10 gives footprints where the camera sees directly; elsewhere the angle of a pixel does.
-"""
+"""The footprint of a pixel on a texture: the cone of the pixel, cut by the surface."""
 
 from __future__ import annotations
 
@@ -14,8 +11,6 @@ from eigengs_dr.backend.arrays import rcp
 from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.messages import warn
 from eigengs_dr.backend.types import Bool, Float
-
-from .versions import footprint_of, has_footprints
 
 PIXEL = 0.4
 """Standard deviation of a footprint in pixels. The random positions of samples in a pixel already
@@ -59,42 +54,8 @@ def current_angle(sensor: mi.Sensor) -> Float:
     return dr.tan(half) * (2 / sensor.film().size()[0])
 
 
-def footprint_inputs() -> tuple[str, ...]:
-    """Return the attributes of a surface interaction from which `seen_metric` finds a footprint."""
-    carried = ("footprint",) if has_footprints() else ()
-    return ("t", "wi", "sh_frame", "dp_du", "dp_dv", *carried)
-
-
-def seen_metric(
-    si: mi.SurfaceInteraction3f, inverse: tuple, angle: Float | None, plugin: str
-) -> tuple[list, Bool]:
-    """Return the metric of the renderer's footprint, or of the cone's where there is none.
-
-    Parameters
-    ----------
-    si, inverse, angle
-        As for `metric`. Without an angle, surfaces without a footprint have no metric.
-    plugin : str
-        Name of the plugin, for messages.
-
-    Returns
-    -------
-    metric : list of 3 Float
-    valid : Bool
-
-    Raises
-    ------
-    ValueError
-        As for `no_metric`, if there is no angle, and rays carry no footprints.
-    """
-    footprint = footprint_of(si)
-    if footprint is None:
-        return metric(si, inverse, angle) if angle is not None else no_metric(plugin)
-    entries, present = footprint_metric(footprint, inverse)
-    if angle is None:
-        return entries, present
-    others, valid = metric(si, inverse, angle)
-    return [dr.select(present, e, o) for e, o in zip(entries, others, strict=True)], present | valid
+FOOTPRINT_INPUTS = ("t", "wi", "sh_frame", "dp_du", "dp_dv")
+"""Attributes of a surface interaction from which `metric` finds a footprint."""
 
 
 def no_metric(plugin: str) -> tuple[list, Bool]:
@@ -122,36 +83,6 @@ def no_metric(plugin: str) -> tuple[list, Bool]:
         raise ValueError(text)
     warn(f"{text}. Until then it looks at points")
     return [mi.Float(0)] * 3, mi.Bool(False)
-
-
-def footprint_metric(footprint: tuple, inverse: tuple) -> tuple[list, Bool]:
-    """Return the metric in which the footprint of a renderer is the unit circle.
-
-    With the footprint M, whose columns span a pixel in uv, and the inverse B of ``to_uv``, the
-    covariance is ``PIXEL^2 B^-1 M M^T B^-T``.
-
-    Parameters
-    ----------
-    footprint : tuple of 4 Float
-        Entries m00, m01, m10, m11.
-    inverse : tuple of 4 Float
-        Rows of B.
-
-    Returns
-    -------
-    metric : list of 3 Float
-        Entries xx, xy, yy.
-    present : Bool
-        False if the footprint has no area.
-    """
-    m00, m01, m10, m11 = footprint
-    b00, b01, b10, b11 = inverse
-    area = dr.fma(m00, m11, -m01 * m10)
-    present = (area != 0) & dr.isfinite(area)
-    scale = rcp(PIXEL * dr.select(present, area, 1))
-    n00, n01 = (m11 * b00 - m01 * b10) * scale, (m11 * b01 - m01 * b11) * scale
-    n10, n11 = (m00 * b10 - m10 * b00) * scale, (m00 * b11 - m10 * b01) * scale
-    return [n00 * n00 + n10 * n10, n00 * n01 + n10 * n11, n01 * n01 + n11 * n11], present
 
 
 def metric(si: mi.SurfaceInteraction3f, inverse: tuple, angle: Float) -> tuple[list, Bool]:

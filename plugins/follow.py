@@ -10,7 +10,7 @@ from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.messages import warn
 
 from .cone import pixel_angle
-from .versions import Texture, texture_class
+from .versions import Texture
 
 CLOSE = 1.25
 """Ratio of a prefilter to the angle of a pixel up to which nobody sees the difference."""
@@ -64,7 +64,7 @@ def follow_where_asked(scene: mi.Scene, sensor: mi.Sensor | int) -> None:
     """
     sensor = sensor_of(scene, sensor)
     for plugin in plugins_of(scene):
-        is_texture = isinstance(plugin, texture_class())  # environments may be blurred on purpose
+        is_texture = isinstance(plugin, mi.Texture)  # environments may be blurred on purpose
         if plugin.follows:
             plugin.follow(sensor)
         elif is_texture and plugin.angle and "x_fov" in mi.traverse(sensor):

@@ -13,18 +13,17 @@ from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, su
 
 from . import properties
 from .color import STEP, luminance, slope_of, upsample
-from .cone import footprint_inputs, seen_metric
+from .cone import FOOTPRINT_INPUTS, metric, no_metric
 from .emission import Emission, Survey, emission_of, make_survey, outside_of_recordings
 from .lookup import reused
 from .memory import resident_bytes
 from .sums import plugin_of_sums
-from .versions import texture_class
 
 
 def gaussian_texture() -> type:
     """Return the class of the texture, a `mitsuba.Texture` of the current variant."""
 
-    class GaussianTexture(plugin_of_sums(texture_class())):  # type: ignore[misc]
+    class GaussianTexture(plugin_of_sums(mi.Texture)):  # type: ignore[misc]
         """A sum of Gaussians over uv, ``(u, v) = (x / width, y / height)``, row 0 at v = 0.
 
         The Gaussians come from `filename`, from `model`, or from the arrays of a set, as
@@ -162,7 +161,7 @@ def gaussian_texture() -> type:
         def values(self, si: mi.SurfaceInteraction3f, active: Mask) -> list:
             """Look up all channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
             where = (self.wrap, self.angle, id(self.sensor), *np.array(self.to_uv.matrix).flat)
-            inputs = ("uv", *(footprint_inputs() if self.filtered() else ()))
+            inputs = ("uv", *(FOOTPRINT_INPUTS if self.filtered() else ()))
             sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))
             _, _, inside = self.point(si.uv)
             return [dr.select(inside & active, s, 0) for s in self.display(sums)]
@@ -175,7 +174,8 @@ def gaussian_texture() -> type:
             # B of a transform with the rows of B^-1
             turned = self.transform.inverse_transpose
             inverse = tuple(turned[j, i] for i in range(2) for j in range(2))
-            seen = seen_metric(si, inverse, self.pixel(), self.label())
+            angle = self.pixel()
+            seen = no_metric(self.label()) if angle is None else metric(si, inverse, angle)
             if self.wrap == "clamp":  # a footprint beyond the border may see what lies inside
                 u, v = self.transform @ si.uv
                 x, y = (

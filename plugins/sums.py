@@ -66,7 +66,7 @@ def plugin_of_sums(base: type) -> Any:
             self.changed = False
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
-            # C++ looks for objects alone: scenes of Mitsuba 3.10 for textures that are `filtered`.
+            # C++ and `follow` look for objects alone.
             if type(callback) is mi.TraversalCallback or hasattr(callback, "only_objects"):
                 return
             for name, tensor in self.source.tensors.items():
@@ -132,7 +132,7 @@ def plugin_of_sums(base: type) -> Any:
                 self._take_over(True)
 
         def filtered(self) -> bool:
-            """Return whether lookups average over a footprint; scenes of Mitsuba 3.10 ask once."""
+            """Return whether lookups average over a footprint."""
             return self.follows or self.sensor is not None or self.angle > 0
 
         def pixel(self) -> Float | None:

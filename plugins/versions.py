@@ -1,8 +1,4 @@
-"""The one place for differences between versions of Mitsuba.
-
-3.10 has footprints of rays (pull request 1964) and finds plugins by itself (1943, see `entry`).
-Pull request 1885, which is open, turns `mitsuba.Texture` into `mitsuba.Field`.
-"""
+"""The one place for what Mitsuba 3.9 does differently from what its interface says."""
 
 from __future__ import annotations
 
@@ -11,44 +7,15 @@ from functools import cache, partial
 from operator import methodcaller
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
-
-from eigengs_dr.backend.types import Float, Mask
 
 Texture = Any
 """A ``mitsuba.Texture`` of the current variant."""
 
 
-def _renamed(holder: Any, before: str, after: str) -> Any:
-    return getattr(holder, before if hasattr(holder, before) else after)
-
-
-def texture_class() -> type:
-    """Return the base class of textures."""
-    texture: type = _renamed(mi, "Texture", "Field")
-    return texture
-
-
-def texture_kind() -> object:
-    """Return the member of `mitsuba.ObjectType` that stands for textures."""
-    return _renamed(mi.ObjectType, "Texture", "Field")
-
-
 def register(kind: str, name: str, create: Callable[[mi.Properties], Any]) -> None:
-    """Register a plugin with the current variant.
-
-    Parameters
-    ----------
-    kind : {"texture", "emitter", "bsdf"}
-    name : str
-        The type of the plugin in scenes.
-    create : callable
-        A class of the kind, or a function that refuses the properties.
-    """
-    if kind == "texture" and not hasattr(mi, "register_texture"):
-        kind, create = "field", _as_field(create) if isinstance(create, type) else create
+    """Register a plugin ("texture", "emitter" or "bsdf") with the current variant."""
     getattr(mi, f"register_{kind}")(name, reason_first(create))
 
 
@@ -92,69 +59,3 @@ def reason_first(create: Callable[[mi.Properties], Any]) -> type:
         __init__ = property(methodcaller("end"))
 
     return Created
-
-
-def _as_field(texture: Any) -> type:
-    """Return a class of textures with the methods that `mitsuba.Field` asks for in addition.
-
-    A field says what it holds, and is asked for that by one method for each kind. C++ passes the
-    arguments of a field before `active`, in some of its methods; a texture takes none.
-    """
-    kinds = mi.FieldValueType
-
-    class SurfaceField(texture):
-        def out_type(self) -> object:
-            if self.channels == 1:
-                return kinds.Float
-            light = self.space.is_color and not self.raw
-            return kinds.Spectrum if mi.is_spectral and light else kinds.Color3
-
-        def domain(self) -> object:
-            return mi.FieldDomain.Surface
-
-        def supports_jit(self) -> bool:
-            return True
-
-        def supports_surface_queries(self) -> bool:
-            return True
-
-        def eval_1(self, si: mi.SurfaceInteraction3f, *rest: Mask, active: Mask = True) -> object:
-            return super().eval_1(si, rest[-1] if rest else active)
-
-        def eval_color3(
-            self, si: mi.SurfaceInteraction3f, *rest: Mask, active: Mask = True
-        ) -> object:
-            return super().eval_3(si, rest[-1] if rest else active)
-
-        def eval_spec(
-            self, si: mi.SurfaceInteraction3f, *rest: Mask, active: Mask = True
-        ) -> object:
-            return super().eval(si, rest[-1] if rest else active)
-
-    return SurfaceField
-
-
-def has_footprints() -> bool:
-    """Return whether rays carry footprints to surfaces: ``si.footprint``, Mitsuba 3.10."""
-    return hasattr(mi.SurfaceInteraction3f, "footprint")
-
-
-def footprint_of(si: mi.SurfaceInteraction3f) -> tuple[Float, ...] | None:
-    """Return the footprint from the renderer, without gradients.
-
-    Parameters
-    ----------
-    si : mitsuba.SurfaceInteraction3f
-
-    Returns
-    -------
-    tuple of 4 Float, or None
-        The matrix m00, m01, m10, m11 whose columns span the ellipse of a pixel in uv; a column is
-        as long as a pixel is wide, or shorter where a pixel takes several samples, and 0 if the
-        ray has no cone or the scene had no texture to filter when it was made. None before
-        Mitsuba 3.10.
-    """
-    if not hasattr(si, "footprint"):
-        return None
-    m = si.footprint
-    return tuple(dr.detach(mi.Float(m[i, j])) for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))

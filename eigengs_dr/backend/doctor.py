@@ -107,12 +107,12 @@ def describe_machine(diagnosis: Record) -> str:
 def _mitsuba_line(version: str | None, variants: list[str] | None) -> str:
     """Describe the installation of Mitsuba."""
     if version is None:
-        return "not installed; only the plugins need it: pip install 'mitsuba>=3.9,<4'"
+        return "not installed; only the plugins need it: pip install 'mitsuba>=3.9,<3.10'"
     if variants:
         return f"{version}: {', '.join(variants)}"
     wanted = [r for r in requires("mitsuba") or [] if r.startswith("drjit")]
     pin = f"; it needs {wanted[0]}, and drjit {version_of('drjit')} is installed" if wanted else ""
-    return f"{version}: cannot be imported{pin}: pip install 'mitsuba>=3.9,<4'"
+    return f"{version}: cannot be imported{pin}: pip install 'mitsuba>=3.9,<3.10'"
 
 
 def _try(name: str) -> Record:

@@ -16,7 +16,6 @@ from ..backend.types import PathLike, Record
 from ..image.color import to_coded
 from ..image.space import DATA, LINEAR, RADIANCE, Space
 from ..plugins import register_plugins  # first: its error says what to install
-from ..plugins.versions import texture_kind
 
 # isort: split
 import mitsuba as mi
@@ -121,7 +120,11 @@ def parse(scene: PathLike | Record, parameters: Mapping[str, str] | None = None)
         for node in state.nodes:
             _make_absolute(node.props)
     for node in state.nodes:
-        kinds = {GAUSSIANS: texture_kind(), SKY: mi.ObjectType.Emitter, RELIT: mi.ObjectType.BSDF}
+        kinds = {
+            GAUSSIANS: mi.ObjectType.Texture,
+            SKY: mi.ObjectType.Emitter,
+            RELIT: mi.ObjectType.BSDF,
+        }
         if kind := kinds.get(node.props.plugin_name()):  # Mitsuba does not know plugins in Python
             node.type = kind
     return Parsed(config, state)
@@ -212,7 +215,7 @@ def uses_of(
 
 def is_bitmap(node: mi.parser.SceneNode) -> bool:
     """Return whether a node of a parsed scene is a bitmap texture."""
-    return node.type == texture_kind() and node.props.plugin_name() == "bitmap"
+    return node.type == mi.ObjectType.Texture and node.props.plugin_name() == "bitmap"
 
 
 def label(props: mi.Properties, place: str) -> str:

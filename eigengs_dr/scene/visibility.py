@@ -28,7 +28,7 @@ from ..backend.arrays import upload
 from ..backend.types import Float, Floats
 from ..plugins.cone import PIXEL
 from ..plugins.properties import WRAPS, to_uv
-from ..plugins.versions import Texture, texture_class
+from ..plugins.versions import Texture
 from ..raster.lookup.points import fold
 from .bitmaps import Unsuitable
 
@@ -320,7 +320,7 @@ def _find(scene: mi.Scene, texture: str | Texture) -> tuple[Texture, list]:
     if isinstance(texture, str):
         entries = mi.traverse(scene).properties.items()
         nodes = {key.rpartition(".")[0]: entry[2] for key, entry in entries}
-        nodes = {key: n for key, n in nodes.items() if isinstance(n, texture_class())}
+        nodes = {key: n for key, n in nodes.items() if isinstance(n, mi.Texture)}
         if texture not in nodes:
             textures = ", ".join(name for name, t in nodes.items() if t.is_spatially_varying())
             raise ValueError(

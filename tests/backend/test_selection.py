@@ -124,4 +124,4 @@ def test_a_mitsuba_for_another_drjit_is_explained(tmp_path):
     code = f"{names}; print(describe_machine(report()))"
     told = run_python(code, PYTHONPATH=str(tmp_path)).stdout.splitlines()
     assert told[-1].startswith("mitsuba  3.8.0: cannot be imported; it needs drjit ==1.2.0, and")
-    assert told[-1].endswith("is installed: pip install 'mitsuba>=3.9,<4'")
+    assert told[-1].endswith("is installed: pip install 'mitsuba>=3.9,<3.10'")

@@ -266,7 +266,7 @@ def test_without_mitsuba(scene, tmp_path):
     command = [sys.executable, "-c", program, "scene", scene(), "-o", tmp_path / "x.png"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 2 and len(result.stderr.splitlines()) == 1
-    assert "pip install 'mitsuba>=3.9,<4'" in result.stderr
+    assert "pip install 'mitsuba>=3.9,<3.10'" in result.stderr
 
 
 def test_convert(tmp_path, monkeypatch):
