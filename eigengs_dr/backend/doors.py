@@ -8,6 +8,7 @@ Functions that are only called from doors need no lock. Work that starts elsewhe
 from __future__ import annotations
 
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ from functools import wraps
 from inspect import isfunction, signature
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+from .messages import shown
 
 if TYPE_CHECKING:
     from .types import Record
@@ -28,10 +31,10 @@ def door(function: Function) -> Function:
     """Decorate a public function that uses Dr.Jit.
 
     No other thread uses Dr.Jit during a call. Without the lock, threads crash the process or hang,
-    see `eigengs_dr.backend.recording`. NumPy numbers are accepted, see `takes_numbers`. Errors of
+    see `eigengs_dr.backend.recording`. NumPy numbers are accepted, see `checks_types`. Errors of
     functions of the user pass as they are.
     """
-    plain = takes_numbers(function)
+    plain = checks_types(function)
 
     @wraps(function)
     def call(*values: object, **options: object) -> object:
@@ -60,32 +63,89 @@ def class_of_doors(kind: Kind) -> Kind:
     return kind
 
 
-KINDS: dict[str, type] = {"int": int, "int | None": int, "float": float, "float | None": float}
-"""The numeric type that each annotation stands for."""
+def _is_number(kind: type) -> Callable[[object], bool]:
+    # NumPy registers its numbers with these classes, but not its booleans.
+    return lambda value: isinstance(value, kind) and not isinstance(value, bool)
 
 
-def plain_numbers(values: Mapping[str, object], annotations: Mapping[str, str]) -> Record:
-    """Return the numbers among named values as Python numbers.
+def _is_named(*names: str) -> Callable[[object], bool]:
+    # By the names of classes, since importing them here would load Dr.Jit and NumPy.
+    return lambda value: any(base.__name__ in names for base in type(value).__mro__)
 
-    NumPy numbers would promote Dr.Jit arrays to double precision, and JSON cannot store them.
+
+def _is_iterable(value: object) -> bool:
+    return hasattr(value, "__iter__") or hasattr(value, "__getitem__")
+
+
+def _is_mapping(value: object) -> bool:
+    return hasattr(value, "keys")
+
+
+def _is_path(value: object) -> bool:
+    return isinstance(value, (str, os.PathLike))
+
+
+def _are(kind: str) -> Callable[[object], bool]:
+    return lambda value: hasattr(value, "__len__") and all(map(KINDS[kind][0], cast(list, value)))
+
+
+# For annotations that are checked: what accepts a value, and what it is in messages.
+KINDS: dict[str, tuple[Callable[[object], bool], str]] = {
+    "int": (_is_number(Integral), "a whole number"),
+    "float": (_is_number(Real), "a number"),
+    "bool": (_is_named("bool", "bool_"), "True or False"),
+    "str": (_is_named("str"), "a string"),
+    "str | os.PathLike[str]": (_is_path, "a path"),
+    "Images": (lambda value: _is_path(value) or _is_iterable(value), "a path or several images"),
+    "Sequence[int]": (_are("int"), "a list of whole numbers"),
+    "Sequence[ArrayLike]": (_is_iterable, "a sequence of arrays"),
+    "Iterable[ArrayLike]": (_is_iterable, "several images"),
+    "Sequence[TextureMap]": (_is_iterable, "a sequence of TextureMap"),
+    "Mapping[str, Tensor]": (_is_mapping, "a mapping of names to tensors"),
+    "Mapping[str, object]": (_is_mapping, "parameters, as of mitsuba.traverse"),
+    "Mapping[str, str]": (_is_mapping, "a mapping of strings"),
+    "PathLike | Record": (lambda value: _is_path(value) or _is_mapping(value), "a file or a dict"),
+    "mi.SceneParameters": (_is_mapping, "parameters, as of mitsuba.traverse"),
+    "mi.Sensor": (_is_named("Sensor"), "a sensor"),
+    "Texture": (_is_named("Object"), "a texture, an emitter or a BSDF of Mitsuba"),
+    "Gaussians": (_is_named("Gaussians"), "a set of Gaussians"),
+    "Sequence[Gaussians]": (_are("Gaussians"), "a list of sets of Gaussians"),
+    "TileLists": (_is_named("TileLists"), "the result of eigengs_dr.tile_lists"),
+}
+KINDS |= {"TrainingImages": KINDS["Images"], "PathLike": KINDS["str | os.PathLike[str]"]}
+
+
+def check_types(values: Mapping[str, object], annotations: Mapping[str, str]) -> Record:
+    """Return those of named values whose annotations are in `KINDS`; refuse other types.
+
+    Numbers become Python numbers: those of NumPy would promote Dr.Jit arrays to double precision,
+    and JSON cannot store them.
 
     Parameters
     ----------
     values : mapping of str to object
     annotations : mapping of str to str
-        Annotations of the values. Those of numbers are "int" or "float", optionally with "| None".
+        Annotations of the values, optionally with "| None".
 
     Raises
     ------
-    ValueError
-        If an argument that is annotated as a number has another type.
+    TypeError
+        If a value has another type than its annotation.
     """
-    return {
-        name: _plain(name, value, KINDS[annotations[name]])
-        for name, value in values.items()
-        if annotations.get(name) in KINDS
-        and not (value is None and annotations[name].endswith("None"))
-    }
+    checked: Record = {}
+    for name, value in values.items():
+        kind = _kind_of(annotations.get(name))
+        if kind in KINDS and (value is not None or kind == annotations[name]):
+            accepts, expected = KINDS[kind]
+            if not accepts(value):
+                raise TypeError(f"{name} is {shown(value)}; it must be {expected}")
+            numbers: Record = {"int": int, "float": float}
+            checked[name] = numbers[kind](value) if kind in numbers else value
+    return checked
+
+
+def _kind_of(annotation: object) -> str:
+    return str(annotation).removesuffix(" | None")
 
 
 def check_fields(record: Any, **ranges: str) -> None:
@@ -99,15 +159,17 @@ def check_fields(record: Any, **ranges: str) -> None:
 
     Raises
     ------
+    TypeError
+        If a field is no number.
     ValueError
-        If a field is no number, not finite, or out of range.
+        If a field is not finite, or out of range.
     """
     kinds = {field.name: str(field.type) for field in fields(record) if field.name in ranges}
     kind = type(record).__name__
     try:
-        plain = plain_numbers(vars(record), kinds)
-    except ValueError as error:
-        raise ValueError(f"{kind}: {error}") from None
+        plain = check_types(vars(record), kinds)
+    except TypeError as error:
+        raise TypeError(f"{kind}: {error}") from None
     for name, value in plain.items():
         low, high = map(float, ranges[name][1:-1].split(","))
         inside = low < value < high or value == (low if ranges[name][0] == "[" else None)
@@ -117,19 +179,11 @@ def check_fields(record: Any, **ranges: str) -> None:
         object.__setattr__(record, name, value)
 
 
-def _plain(name: str, value: object, kind: type) -> Any:
-    # NumPy registers its numbers with these classes, but not its booleans.
-    if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
-        expected = "a whole number" if kind is int else "a number"
-        raise ValueError(f"{name} is {value!r}; it must be {expected}")
-    return kind(value)
-
-
-def takes_numbers(function: Function) -> Function:
-    """Decorate a function so that it accepts NumPy numbers, see `plain_numbers`."""
+def checks_types(function: Function) -> Function:
+    """Decorate a function whose arguments `check_types` checks; NumPy numbers become Python's."""
     arguments = signature(function)
     annotations = {name: p.annotation for name, p in arguments.parameters.items()}
-    if not any(annotation in KINDS for annotation in annotations.values()):
+    if not any(_kind_of(annotation) in KINDS for annotation in annotations.values()):
         return function
 
     @wraps(function)
@@ -138,7 +192,7 @@ def takes_numbers(function: Function) -> Function:
             bound = arguments.bind(*values, **options)
         except TypeError as error:  # as Python says it, which names the function
             raise TypeError(f"{function.__qualname__}() {error}") from None
-        bound.arguments.update(plain_numbers(bound.arguments, annotations))
+        bound.arguments.update(check_types(bound.arguments, annotations))
         return function(*bound.args, **bound.kwargs)
 
     return call  # type: ignore[return-value]
@@ -191,7 +245,7 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
         yield progress
         return
     if not (progress is None or isinstance(progress, bool)):
-        raise ValueError(f"progress is {progress!r}; pass True, False or a function")
+        raise TypeError(f"progress is {shown(progress)}; pass True, False or a function")
     if progress is False or not _is_watched():
         yield None
         return

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..backend.doors import shows_progress, takes_numbers
+from ..backend.doors import checks_types, shows_progress
 from ..backend.messages import to_html, warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..image.folder import TrainingImages
@@ -65,7 +65,7 @@ class Eigenbasis:
 
     @classmethod
     @shows_progress
-    @takes_numbers
+    @checks_types
     def from_images(
         cls,
         images: TrainingImages,
@@ -167,6 +167,7 @@ class Eigenbasis:
         """Height in pixels."""
         return self.mean.shape[1]
 
+    @checks_types
     def project(self, image: ArrayLike, encoding: str | None = None) -> tuple[Singles, ...]:
         """Return the coefficients w_j of an image, a tuple of C float32 arrays of shape (k_c,).
 
@@ -176,6 +177,7 @@ class Eigenbasis:
         """
         return self._coefficients(self._centred(image, encoding))
 
+    @checks_types
     def reconstruct(self, coefficients: Sequence[ArrayLike]) -> Singles:
         """Return the image for C arrays of coefficients, shape (k_c,), as `project` returns them.
 
@@ -199,6 +201,7 @@ class Eigenbasis:
         pairs = zip(self.eigenvalues, self.variance, strict=True)
         return tuple(np.minimum(np.cumsum(v) / (total or 1), 1) for v, total in pairs)
 
+    @checks_types
     def truncation_curve(
         self, images: Iterable[ArrayLike] | None = None, encoding: str | None = None
     ) -> TruncationCurve:
@@ -236,11 +239,13 @@ class Eigenbasis:
             eigenvalues=tuple(e[:k] for e, k in zip(self.eigenvalues, counts, strict=True)),
         )
 
+    @checks_types
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
         write_basis(path, vars(self))
 
     @classmethod
+    @checks_types
     def load(cls, path: str | os.PathLike[str]) -> Eigenbasis:
         """Read a file that `save` wrote.
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.messages import warn
+from ..backend.messages import printable, shown, warn
 from ..backend.types import ArrayLike, Singles, Tensor
 from .strips import Pixels, by_strips
 
@@ -40,6 +40,9 @@ C1, C2 = 0.01**2, 0.03**2
 
 class ImageError(ValueError):
     """An image cannot be used; one line names the image, the reason and what to do."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))  # names in a file may hold control characters
 
 
 def reason_of(error: BaseException) -> str:
@@ -245,7 +248,9 @@ def check_size(size: Iterable[int]) -> tuple[int, int]:
     try:
         width, height = map(index, size)
     except (TypeError, ValueError):
-        raise ValueError(f"size is {size!r}; expected (width, height) in whole pixels") from None
+        raise ValueError(
+            f"size is {shown(size)}; expected (width, height) in whole pixels"
+        ) from None
     if min(width, height) < 1:
         raise ValueError(f"size is {width}x{height}; both sides must be at least 1 pixel")
     return width, height

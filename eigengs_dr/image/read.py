@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.messages import printable
 from ..storage.memory import check_content
 from .formats import HAS_HEIF, HEIF_SUFFIXES, STARTS
 from .notes import GAIN_MAP, depth_notes, png_notes, primaries_note, profile_note, tell
@@ -164,7 +165,9 @@ def _image_errors(path: Path) -> Iterator[None]:
         yield
     except ImageError as error:
         text = str(error)
-        raise ImageError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
+        raise ImageError(
+            text if text.startswith(printable(f"{path}: ")) else f"{path}: {text}"
+        ) from None
     except Exception as error:  # on damaged files decoders raise many types
         from PIL import UnidentifiedImageError
 
