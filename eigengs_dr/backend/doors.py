@@ -105,6 +105,7 @@ KINDS: dict[str, tuple[Callable[[object], bool], str]] = {
     "Mapping[str, object]": (_is_mapping, "parameters, as of mitsuba.traverse"),
     "Mapping[str, str]": (_is_mapping, "a mapping of strings"),
     "PathLike | Record": (lambda value: _is_path(value) or _is_mapping(value), "a file or a dict"),
+    "str | Sequence[str]": (_is_iterable, "a name, or several"),
     "mi.SceneParameters": (_is_mapping, "parameters, as of mitsuba.traverse"),
     "mi.Sensor": (_is_named("Sensor"), "a sensor"),
     "Texture": (_is_named("Object"), "a texture, an emitter or a BSDF of Mitsuba"),
