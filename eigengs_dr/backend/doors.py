@@ -8,7 +8,6 @@ Functions that are only called from doors need no lock. Work that starts elsewhe
 from __future__ import annotations
 
 import math
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -63,57 +62,40 @@ def class_of_doors(kind: Kind) -> Kind:
     return kind
 
 
-def _is_number(kind: type) -> Callable[[object], bool]:
-    # NumPy registers its numbers with these classes, but not its booleans.
-    return lambda value: isinstance(value, kind) and not isinstance(value, bool)
-
-
-def _is_named(*names: str) -> Callable[[object], bool]:
-    # By the names of classes, since importing them here would load Dr.Jit and NumPy.
-    return lambda value: any(base.__name__ in names for base in type(value).__mro__)
-
-
-def _is_iterable(value: object) -> bool:
-    return hasattr(value, "__iter__") or hasattr(value, "__getitem__")
-
-
-def _is_mapping(value: object) -> bool:
-    return hasattr(value, "keys")
-
-
-def _is_path(value: object) -> bool:
-    return isinstance(value, (str, os.PathLike))
-
-
-def _are(kind: str) -> Callable[[object], bool]:
-    return lambda value: hasattr(value, "__len__") and all(map(KINDS[kind][0], cast(list, value)))
-
-
-# For annotations that are checked: what accepts a value, and what it is in messages.
-KINDS: dict[str, tuple[Callable[[object], bool], str]] = {
-    "int": (_is_number(Integral), "a whole number"),
-    "float": (_is_number(Real), "a number"),
-    "bool": (_is_named("bool", "bool_"), "True or False"),
-    "str": (_is_named("str"), "a string"),
-    "str | os.PathLike[str]": (_is_path, "a path"),
-    "Images": (lambda value: _is_path(value) or _is_iterable(value), "a path or several images"),
-    "Sequence[int]": (_are("int"), "a list of whole numbers"),
-    "Sequence[ArrayLike]": (_is_iterable, "a sequence of arrays"),
-    "Iterable[ArrayLike]": (_is_iterable, "several images"),
-    "Sequence[TextureMap]": (_is_iterable, "a sequence of TextureMap"),
-    "Mapping[str, Tensor]": (_is_mapping, "a mapping of names to tensors"),
-    "Mapping[str, object]": (_is_mapping, "parameters, as of mitsuba.traverse"),
-    "Mapping[str, str]": (_is_mapping, "a mapping of strings"),
-    "PathLike | Record": (lambda value: _is_path(value) or _is_mapping(value), "a file or a dict"),
-    "str | Sequence[str]": (_is_iterable, "a name, or several"),
-    "mi.SceneParameters": (_is_mapping, "parameters, as of mitsuba.traverse"),
-    "mi.Sensor": (_is_named("Sensor"), "a sensor"),
-    "Texture": (_is_named("Object"), "a texture, an emitter or a BSDF of Mitsuba"),
-    "Gaussians": (_is_named("Gaussians"), "a set of Gaussians"),
-    "Sequence[Gaussians]": (_are("Gaussians"), "a list of sets of Gaussians"),
-    "TileLists": (_is_named("TileLists"), "the result of eigengs_dr.tile_lists"),
+# For annotations that are checked: the classes that are accepted, or what these have; in messages.
+# Classes stand by their names, since importing them here would load Dr.Jit and NumPy.
+KINDS = {
+    "int": ("", "a whole number"),
+    "float": ("", "a number"),
+    "bool": ("bool bool_", "True or False"),
+    "str": ("str", "a string"),
+    "str | os.PathLike[str]": ("str __fspath__", "a path"),
+    "PathLike": ("str __fspath__", "a path"),
+    "Images": ("__fspath__ __iter__ __getitem__", "a path or several images"),
+    "TrainingImages": ("__fspath__ __iter__ __getitem__", "a path or several images"),
+    "Sequence[TextureMap]": ("__iter__", "several of TextureMap"),
+    "Mapping[str, Tensor]": ("keys", "a mapping of names to tensors"),
+    "Mapping[str, object]": ("keys", "parameters, as of mitsuba.traverse"),
+    "mi.SceneParameters": ("keys", "parameters, as of mitsuba.traverse"),
+    "mi.Sensor": ("Sensor", "a sensor of Mitsuba"),
+    "Texture": ("Object", "a texture, an emitter or a BSDF of Mitsuba"),
+    "TileLists": ("TileLists", "the result of eigengs_dr.tile_lists"),
+    "Gaussians": ("Gaussians", "a set of Gaussians"),
+    "Sequence[Gaussians]": ("", "a list of sets of Gaussians"),
+    "Sequence[int]": ("", "a list of whole numbers"),
 }
-KINDS |= {"TrainingImages": KINDS["Images"], "PathLike": KINDS["str | os.PathLike[str]"]}
+
+
+def _accepts(kind: str, value: Any) -> bool:
+    """Return whether a value is of a kind."""
+    if kind in ("int", "float"):  # NumPy registers its numbers, but not its booleans
+        return not isinstance(value, bool) and isinstance(
+            value, Integral if kind == "int" else Real
+        )
+    if kind in ("Sequence[int]", "Sequence[Gaussians]"):
+        return hasattr(value, "__len__") and all(_accepts(kind[9:-1], one) for one in value)
+    classes = {base.__name__ for base in type(value).__mro__}
+    return any(name in classes or hasattr(value, name) for name in KINDS[kind][0].split())
 
 
 def check_types(values: Mapping[str, object], annotations: Mapping[str, str]) -> Record:
@@ -137,9 +119,8 @@ def check_types(values: Mapping[str, object], annotations: Mapping[str, str]) ->
     for name, value in values.items():
         kind = _kind_of(annotations.get(name))
         if kind in KINDS and (value is not None or kind == annotations[name]):
-            accepts, expected = KINDS[kind]
-            if not accepts(value):
-                raise TypeError(f"{name} is {shown(value)}; it must be {expected}")
+            if not _accepts(kind, value):
+                raise TypeError(f"{name} is {shown(value)}; it must be {KINDS[kind][1]}")
             numbers: Record = {"int": int, "float": float}
             checked[name] = numbers[kind](value) if kind in numbers else value
     return checked

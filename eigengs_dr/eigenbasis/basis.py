@@ -167,7 +167,6 @@ class Eigenbasis:
         """Height in pixels."""
         return self.mean.shape[1]
 
-    @checks_types
     def project(self, image: ArrayLike, encoding: str | None = None) -> tuple[Singles, ...]:
         """Return the coefficients w_j of an image, a tuple of C float32 arrays of shape (k_c,).
 
@@ -177,7 +176,6 @@ class Eigenbasis:
         """
         return self._coefficients(self._centred(image, encoding))
 
-    @checks_types
     def reconstruct(self, coefficients: Sequence[ArrayLike]) -> Singles:
         """Return the image for C arrays of coefficients, shape (k_c,), as `project` returns them.
 
@@ -201,7 +199,6 @@ class Eigenbasis:
         pairs = zip(self.eigenvalues, self.variance, strict=True)
         return tuple(np.minimum(np.cumsum(v) / (total or 1), 1) for v, total in pairs)
 
-    @checks_types
     def truncation_curve(
         self, images: Iterable[ArrayLike] | None = None, encoding: str | None = None
     ) -> TruncationCurve:

@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import checks_types
 from ..backend.messages import warn
 from ..backend.types import Doubles
 
@@ -44,7 +43,6 @@ class TruncationCurve(NamedTuple):
     counts: NDArray[np.int64]
     psnr: Doubles
 
-    @checks_types
     def rank_for_psnr(self, target_psnr: float) -> tuple[int, ...]:
         """Return the fewest components of each channel that reach a PSNR.
 

@@ -353,15 +353,11 @@ def _arrays(
     given = {"mean": mean, "factor": factor, "color": color, "background": background}
     if background is None:
         del given["background"]
-    for name, values in given.items():
-        try:
-            array = np.asarray(values)
-        except ValueError:  # rows of unequal length
-            raise ValueError(f"Gaussians: {name} is no array; give rows of equal length") from None
+    arrays = {name: np.asarray(values) for name, values in given.items()}
+    for name, array in arrays.items():
         if array.dtype.kind not in "biufc":
-            raise TypeError(f"Gaussians: {name} is {shown(values)}; give an array of real numbers")
-        given[name] = array
-    return given  # type: ignore[return-value]
+            raise TypeError(f"Gaussians: {name} is {shown(given[name])}; give real numbers")
+    return arrays
 
 
 def _received(data: SetData, backend: str, kind: DTypeLike) -> Gaussians:

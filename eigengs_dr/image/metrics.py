@@ -16,7 +16,6 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from ..backend.doors import checks_types
-from ..backend.messages import shown
 from ..backend.types import ArrayLike, Doubles, DrJitArray, Float, Singles
 from .color import RGB_TO_YCBCR, rgb_to_ycbcr, to_linear, to_pu21
 from .io import pixels_of, to_8bit
@@ -287,10 +286,7 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
 
 def _scaled(image: ArrayLike) -> Pixels:
     """Scale integers to [0, 1] by their type; floats are not changed."""
-    try:
-        image = np.asarray(pixels_of(image))
-    except ValueError:  # rows of unequal length, or a set
-        raise ValueError(f"an image is {shown(image)}; expected an array, (H, W, C)") from None
+    image = np.asarray(pixels_of(image))
     peak = peak_of(image.dtype)
     return image if image.dtype.kind == "f" else image / np.float64(peak)
 

@@ -153,8 +153,8 @@ def _opened(
             ) from None
         except Exception as error:  # zlib, lzma, zipfile and NumPy raise many types
             raise ValueError(
-                f"{text}: not a readable {name} file ({printable(' '.join(str(error).split())[:80])}); "
-                "it may be damaged or of another kind"
+                f"{text}: not a readable {name} file ({printable(str(error)[:80])}); it may be "
+                "damaged or of another kind"
             ) from None
 
 
