@@ -125,6 +125,8 @@ class Gaussians:
 
         Raises
         ------
+        TypeError
+            If an array does not hold numbers, or an argument has another type.
         ValueError
             If shapes do not match, or a value is out of range or not finite.
         """
@@ -400,10 +402,12 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     -------
     Gaussians
         The Gaussians of the first set, then those of the second, and so on. A single set is
-        returned unchanged.
+        returned unchanged. Values are not checked; `Gaussians.bounded` clips them.
 
     Raises
     ------
+    TypeError
+        If it is no list or tuple of sets.
     ValueError
         If there are no sets, or they differ in one of these properties.
     """
@@ -543,7 +547,7 @@ def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     ValueError
         If shapes do not match.
     TypeError
-        If a value is not a Dr.Jit tensor.
+        If a value is not a Dr.Jit tensor of floats, or `tensors` is no mapping.
 
     Examples
     --------

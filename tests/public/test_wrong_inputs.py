@@ -168,6 +168,25 @@ def test_images_of_a_family():
         assert complaint(TypeError, eg.fit_many, wrong).startswith("images is ")
 
 
+@pytest.mark.parametrize("channels", [2, 4])
+def test_images_of_too_many_channels_are_refused_in_a_list_as_alone(channels):
+    """They are not taken for as many grey images as they have rows."""
+    wrong = np.ones((16, 16, channels), np.float32) / 2
+    basis = eg.Eigenbasis.from_images([IMAGE, IMAGE[::-1]], size=(16, 16), components=1)
+    for function in (basis.project, eg.fit, lambda one: eg.Eigenbasis.from_images([IMAGE, one])):
+        assert f"shape (16, 16, {channels})" in complaint(ValueError, function, wrong)
+
+
+@pytest.mark.parametrize("text", ["1GB", "-5", "0", "1.5", "x"])
+def test_a_limit_in_the_environment_that_is_no_number(text, tmp_path, monkeypatch):
+    eg.save_image(tmp_path / "a.png", IMAGE)
+    monkeypatch.setenv("EIGENGS_DR_MAX_FILE_MB", text)
+    message = complaint(ValueError, eg.load_image, tmp_path / "a.png")
+    assert f"EIGENGS_DR_MAX_FILE_MB is {text!r}; set a whole number" in message
+    monkeypatch.setenv("EIGENGS_DR_MAX_FILE_MB", "50")
+    assert eg.load_image(tmp_path / "a.png").shape == (16, 16, 3)
+
+
 def test_phases_of_a_method():
     assert "'shake' is unknown" in complaint(ValueError, eg.DEFAULT.without, "shake")
     complaint(ValueError, eg.DEFAULT.without, np.ones(3))
@@ -180,6 +199,22 @@ def test_steps_without_end_are_refused():
 
 def test_judges_are_functions():
     assert "judge is 'x'" in complaint(TypeError, eg.Loss, lambda picture, step: 0, judge="x")
+
+
+def test_what_is_no_plugin_of_mitsuba(gaussians):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    eg.register_plugins()
+    plugins = eg.plugins
+    for wrong in (None, "x", 5, [], object(), np.ones(3)):
+        assert "sensor is " in complaint(TypeError, plugins.pixel_angle, wrong)
+        assert "texture is " in complaint(TypeError, plugins.resident_bytes, wrong)
+        for function in (plugins.gaussians_of, plugins.keep_in_bounds):
+            assert "parameters is " in complaint(TypeError, function, wrong, "a", gaussians)
+            assert "like is " in complaint(TypeError, function, {}, "a", wrong)
+        for function in (plugins.texture_of, plugins.bake_environment):
+            complaint(TypeError, function, wrong)
+    assert plugins.resident_bytes(mi.load_dict(plugins.texture_of(gaussians))) > 0
 
 
 ESCAPE = "a\x1b[31m\nb\u202e"
