@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..backend.doors import checks_types, shows_progress
-from ..backend.messages import to_html, warn
+from ..backend.messages import shown, to_html, warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..image.folder import TrainingImages
 from ..image.io import check_member
@@ -290,7 +290,9 @@ def check_components(
         numbers = components if isinstance(components, Iterable) else (components,) * 3
         y, cb, cr = map(index, numbers)
     except (TypeError, ValueError):
-        raise ValueError(f"components is {components!r}; expected a number, or three") from None
+        raise ValueError(
+            f"components is {shown(components)}; expected a number, or three"
+        ) from None
     if min(y, cb, cr) < 0:
         raise ValueError(f"components is {components!r}; expected no negative number")
     return y, cb, cr

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from ..backend.doors import check_types, checks_types
-from ..backend.messages import printable
+from ..backend.messages import printable, shown
 from ..gaussian.file import check_index_range, check_sides
 from ..gaussian.gaussians import Fitted, Gaussians
 from ..image.metrics import MAX_PSNR
@@ -162,7 +162,9 @@ class FitOptions:
         if self.space is not None:
             object.__setattr__(self, "space", space_of(self.space))
         if not isinstance(self.method, Method):
-            raise TypeError(f"method is {self.method!r}; pass a Method, such as eigengs_dr.DEFAULT")
+            raise TypeError(
+                f"method is {shown(self.method)}; pass a Method, such as eigengs_dr.DEFAULT"
+            )
         if self.method.needs_model and not isinstance(self.start, Model):
             raise ValueError(
                 "this method starts from a model; give one as the start, such as "

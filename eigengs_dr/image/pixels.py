@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.doors import check_types
 from ..backend.messages import printable, shown, warn
 from ..backend.types import ArrayLike, Singles, Tensor
 from .strips import Pixels, by_strips
@@ -65,6 +66,7 @@ class EncodedImage(NamedTuple):
 
 def check_encoding(encoding: str | None) -> None:
     """Raise ValueError if the encoding is unknown; None stands for the default."""
+    check_types({"encoding": encoding}, {"encoding": "str | None"})
     if encoding is not None and encoding not in ENCODINGS:
         known = ", ".join(ENCODINGS)
         raise ValueError(f"encoding {encoding!r} is unknown; use one of {known}")

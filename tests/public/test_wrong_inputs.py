@@ -192,6 +192,16 @@ def test_phases_of_a_method():
     complaint(ValueError, eg.DEFAULT.without, np.ones(3))
 
 
+def test_arrays_in_place_of_options_give_one_line():
+    """NumPy prints them in many."""
+    wrong = np.ones((16, 16, 3))
+    for name in ("method", "encoding", "backend"):
+        complaint(TypeError, eg.fit, IMAGE, 5, iterations=1, **{name: wrong})
+    for name in ("gaussians", "space"):
+        complaint(ValueError, eg.fit, IMAGE, **{"gaussians": 5, name: wrong})
+    complaint(ValueError, eg.Eigenbasis.from_images, [IMAGE], components=wrong)
+
+
 def test_steps_without_end_are_refused():
     """Their lists would fill the memory."""
     assert "iterations" in complaint(ValueError, eg.fit, IMAGE, 5, iterations=10**12)
