@@ -227,6 +227,8 @@ def fit(
 
     Raises
     ------
+    TypeError
+        If an argument has another type.
     ValueError
         If the image is unusable or an argument is out of range; if maps differ in size, or
         arguments contradict each other.
