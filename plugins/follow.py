@@ -7,7 +7,7 @@ from numbers import Integral
 import mitsuba as mi
 
 from eigengs_dr.backend.doors import door
-from eigengs_dr.backend.messages import warn
+from eigengs_dr.backend.messages import shown, warn
 
 from .cone import pixel_angle
 from .versions import Texture
@@ -89,7 +89,7 @@ def sensor_of(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
     if isinstance(sensor, mi.Sensor):
         return sensor
     if isinstance(sensor, bool) or not isinstance(sensor, Integral):
-        raise TypeError(f"{sensor!r} is no sensor; give one, or its number in the scene")
+        raise TypeError(f"{shown(sensor)} is no sensor; give one, or its number in the scene")
     known, number = scene.sensors(), int(sensor)
     if not -len(known) <= number < len(known):
         raise ValueError(f"there is no sensor {number}; the scene has {len(known)}")
@@ -98,7 +98,7 @@ def sensor_of(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
 
 def check_scene(function: str, scene: object) -> None:
     """Raise `TypeError` if the argument of a function is no scene, but its file or dictionary."""
-    if not isinstance(scene, mi.Scene):
+    if mi.variant() is None or not isinstance(scene, mi.Scene):
         raise TypeError(
             f"{function}: scene is a {type(scene).__name__}; give a loaded one, by mi.load_file or "
             "mi.load_dict"

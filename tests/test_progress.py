@@ -55,7 +55,7 @@ def test_no_bar_where_it_is_switched_off_or_nobody_looks(at_once, photo):
 
 @pytest.mark.parametrize("progress", [5, "yes", 0])
 def test_what_is_no_progress(photo, progress):
-    with pytest.raises(ValueError, match=rf"progress is {progress!r}; pass True, False or a fun"):
+    with pytest.raises(TypeError, match=rf"progress is {progress!r}; pass True, False or a fun"):
         eg.fit(photo, progress=progress, **QUICK)
 
 

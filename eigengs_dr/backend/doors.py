@@ -19,6 +19,8 @@ from inspect import isfunction, signature
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+from .messages import shown
+
 if TYPE_CHECKING:
     from .types import Record
 
@@ -30,10 +32,10 @@ def door(function: Function) -> Function:
     """Decorate a public function that uses Dr.Jit.
 
     No other thread uses Dr.Jit during a call. Without the lock, threads crash the process or hang,
-    see `eigengs_dr.backend.recording`. NumPy numbers are accepted, see `takes_numbers`. Errors of
+    see `eigengs_dr.backend.recording`. NumPy numbers are accepted, see `checks_types`. Errors of
     functions of the user pass as they are.
     """
-    plain = takes_numbers(function)
+    plain = checks_types(function)
 
     @wraps(function)
     def call(*values: object, **options: object) -> object:
@@ -62,32 +64,72 @@ def class_of_doors(kind: Kind) -> Kind:
     return kind
 
 
-KINDS: dict[str, type] = {"int": int, "int | None": int, "float": float, "float | None": float}
-"""The numeric type that each annotation stands for."""
+# For annotations that are checked: the classes that are accepted, or what these have; in messages.
+# Classes stand by their names, since importing them here would load Dr.Jit and NumPy.
+KINDS = {
+    "int": ("", "a whole number"),
+    "float": ("", "a number"),
+    "bool": ("bool bool_", "True or False"),
+    "str": ("str", "a string"),
+    "str | os.PathLike[str]": ("str __fspath__", "a path"),
+    "PathLike": ("str __fspath__", "a path"),
+    "Images": ("__fspath__ __iter__ __getitem__", "a path or several images"),
+    "TrainingImages": ("__fspath__ __iter__ __getitem__", "a path or several images"),
+    "Sequence[TextureMap]": ("__iter__", "several of TextureMap"),
+    "Mapping[str, Tensor]": ("keys", "a mapping of names to tensors"),
+    "Mapping[str, object]": ("keys", "parameters, as of mitsuba.traverse"),
+    "mi.SceneParameters": ("keys", "parameters, as of mitsuba.traverse"),
+    "mi.Sensor": ("Sensor", "a sensor of Mitsuba"),
+    "Texture": ("Object", "a texture, an emitter or a BSDF of Mitsuba"),
+    "TileLists": ("TileLists", "the result of eigengs_dr.tile_lists"),
+    "Gaussians": ("Gaussians", "a set of Gaussians"),
+    "Sequence[Gaussians]": ("", "a list of sets of Gaussians"),
+    "Sequence[int]": ("", "a list of whole numbers"),
+}
 
 
-def plain_numbers(values: Mapping[str, object], annotations: Mapping[str, str]) -> Record:
-    """Return the numbers among named values as Python numbers.
+def _accepts(kind: str, value: Any) -> bool:
+    """Return whether a value is of a kind."""
+    if kind in ("int", "float"):  # NumPy registers its numbers, but not its booleans
+        return not isinstance(value, bool) and isinstance(
+            value, Integral if kind == "int" else Real
+        )
+    if kind in ("Sequence[int]", "Sequence[Gaussians]"):
+        return hasattr(value, "__len__") and all(_accepts(kind[9:-1], one) for one in value)
+    classes = {base.__name__ for base in type(value).__mro__}
+    return any(name in classes or hasattr(value, name) for name in KINDS[kind][0].split())
 
-    NumPy numbers would promote Dr.Jit arrays to double precision, and JSON cannot store them.
+
+def check_types(values: Mapping[str, object], annotations: Mapping[str, str]) -> Record:
+    """Return those of named values whose annotations are in `KINDS`; refuse other types.
+
+    Numbers become Python numbers: those of NumPy would promote Dr.Jit arrays to double precision,
+    and JSON cannot store them.
 
     Parameters
     ----------
     values : mapping of str to object
     annotations : mapping of str to str
-        Annotations of the values. Those of numbers are "int" or "float", optionally with "| None".
+        Annotations of the values, optionally with "| None".
 
     Raises
     ------
-    ValueError
-        If an argument that is annotated as a number has another type.
+    TypeError
+        If a value has another type than its annotation.
     """
-    return {
-        name: _plain(name, value, KINDS[annotations[name]])
-        for name, value in values.items()
-        if annotations.get(name) in KINDS
-        and not (value is None and annotations[name].endswith("None"))
-    }
+    checked: Record = {}
+    for name, value in values.items():
+        kind = _kind_of(annotations.get(name))
+        if kind in KINDS and (value is not None or kind == annotations[name]):
+            if not _accepts(kind, value):
+                raise TypeError(f"{name} is {shown(value)}; it must be {KINDS[kind][1]}")
+            numbers: Record = {"int": int, "float": float}
+            checked[name] = numbers[kind](value) if kind in numbers else value
+    return checked
+
+
+def _kind_of(annotation: object) -> str:
+    return str(annotation).removesuffix(" | None")
 
 
 def check_fields(record: Any, **ranges: str) -> None:
@@ -101,15 +143,17 @@ def check_fields(record: Any, **ranges: str) -> None:
 
     Raises
     ------
+    TypeError
+        If a field is no number.
     ValueError
-        If a field is no number, not finite, or out of range.
+        If a field is not finite, or out of range.
     """
     kinds = {field.name: str(field.type) for field in fields(record) if field.name in ranges}
     kind = type(record).__name__
     try:
-        plain = plain_numbers(vars(record), kinds)
-    except ValueError as error:
-        raise ValueError(f"{kind}: {error}") from None
+        plain = check_types(vars(record), kinds)
+    except TypeError as error:
+        raise TypeError(f"{kind}: {error}") from None
     for name, value in plain.items():
         low, high = map(float, ranges[name][1:-1].split(","))
         inside = low < value < high or value == (low if ranges[name][0] == "[" else None)
@@ -119,19 +163,11 @@ def check_fields(record: Any, **ranges: str) -> None:
         object.__setattr__(record, name, value)
 
 
-def _plain(name: str, value: object, kind: type) -> Any:
-    # NumPy registers its numbers with these classes, but not its booleans.
-    if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
-        expected = "a whole number" if kind is int else "a number"
-        raise ValueError(f"{name} is {value!r}; it must be {expected}")
-    return kind(value)
-
-
-def takes_numbers(function: Function) -> Function:
-    """Decorate a function so that it accepts NumPy numbers, see `plain_numbers`."""
+def checks_types(function: Function) -> Function:
+    """Decorate a function whose arguments `check_types` checks; NumPy numbers become Python's."""
     arguments = signature(function)
     annotations = {name: p.annotation for name, p in arguments.parameters.items()}
-    if not any(annotation in KINDS for annotation in annotations.values()):
+    if not any(_kind_of(annotation) in KINDS for annotation in annotations.values()):
         return function
 
     @wraps(function)
@@ -140,7 +176,7 @@ def takes_numbers(function: Function) -> Function:
             bound = arguments.bind(*values, **options)
         except TypeError as error:  # as Python says it, which names the function
             raise TypeError(f"{function.__qualname__}() {error}") from None
-        bound.arguments.update(plain_numbers(bound.arguments, annotations))
+        bound.arguments.update(check_types(bound.arguments, annotations))
         return function(*bound.args, **bound.kwargs)
 
     return call  # type: ignore[return-value]
@@ -193,7 +229,7 @@ def progress_bar(progress: Progress = None, name: str = "") -> Iterator[Callable
         yield progress
         return
     if not (progress is None or isinstance(progress, bool)):
-        raise ValueError(f"progress is {progress!r}; pass True, False or a function")
+        raise TypeError(f"progress is {shown(progress)}; pass True, False or a function")
     if progress is False or not _is_watched():
         yield None
         return

@@ -15,7 +15,7 @@ def warn(text: str) -> None:
     frame, level = sys._getframe(), 1
     while frame.f_globals.get("__name__", "").partition(".")[0] in SKIPPED_MODULES and frame.f_back:
         frame, level = frame.f_back, level + 1
-    warnings.warn(text, stacklevel=level)
+    warnings.warn(printable(text), stacklevel=level)
 
 
 def no_attribute(module: str, name: str, names: Iterable[str]) -> AttributeError:
@@ -38,6 +38,13 @@ def _escaped(character: str) -> str:
     number = ord(character)
     is_byte = 0xDC80 <= number <= 0xDCFF  # Python's surrogate escapes in file names
     return f"\\x{number - 0xDC00:02x}" if is_byte else repr(character)[1:-1]
+
+
+def shown(value: object) -> str:
+    """Return a value for a message: in one line, and its type if it is long."""
+    text = repr(value)
+    short = len(text) <= 60 and text.isprintable()
+    return text if short else f"of the type {type(value).__name__}"
 
 
 make_html: Callable[[object], str] = repr

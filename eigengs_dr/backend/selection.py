@@ -59,7 +59,7 @@ def select(backend: str | None = None) -> ModuleType:
     >>> select().Float(1, 2).shape
     (2,)
     """
-    if backend not in (None, *BACKENDS):
+    if backend is not None and str(backend) not in BACKENDS:
         raise ValueError(f"backend {backend!r} is unknown; use {', '.join(map(repr, BACKENDS))}")
     dr = _import_drjit()
     backend = backend or ("cuda" if _has(dr, "cuda") else "llvm")

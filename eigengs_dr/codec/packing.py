@@ -182,7 +182,7 @@ def pack(
 
 def _section_rows(count: int, sections: Sequence[int] | None) -> list[slice]:
     """Return the range of the Gaussians of each section."""
-    counts = [count] if sections is None else [int(k) for k in sections]
+    counts = [count] if sections is None else list(sections)
     if not counts or min(counts) < 1 or sum(counts) != count or len(counts) > MAX_SECTIONS:
         raise ValueError(
             f"pack: sections are {counts[:8]}, expected 1 to {MAX_SECTIONS} numbers of Gaussians "

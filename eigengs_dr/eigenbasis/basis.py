@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..backend.doors import shows_progress, takes_numbers
-from ..backend.messages import to_html, warn
+from ..backend.doors import checks_types, shows_progress
+from ..backend.messages import shown, to_html, warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..image.folder import TrainingImages, find_lists
 from ..image.io import check_member
@@ -65,7 +65,7 @@ class Eigenbasis:
 
     @classmethod
     @shows_progress
-    @takes_numbers
+    @checks_types
     def from_images(
         cls,
         images: TrainingImages,
@@ -238,11 +238,13 @@ class Eigenbasis:
             eigenvalues=tuple(e[:k] for e, k in zip(self.eigenvalues, counts, strict=True)),
         )
 
+    @checks_types
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
         write_basis(path, vars(self))
 
     @classmethod
+    @checks_types
     def load(cls, path: str | os.PathLike[str]) -> Eigenbasis:
         """Read a file that `save` wrote.
 
@@ -290,7 +292,9 @@ def check_components(
         numbers = components if isinstance(components, Iterable) else (components,) * 3
         y, cb, cr = map(index, numbers)
     except (TypeError, ValueError):
-        raise ValueError(f"components is {components!r}; expected a number, or three") from None
+        raise ValueError(
+            f"components is {shown(components)}; expected a number, or three"
+        ) from None
     if min(y, cb, cr) < 0:
         raise ValueError(f"components is {components!r}; expected no negative number")
     return y, cb, cr

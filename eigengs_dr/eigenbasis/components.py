@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..backend.doors import door, plain_numbers
+from ..backend.doors import check_types, door
 from ..backend.types import Doubles, Record, Singles
 from ..fitting.place import grid_of
 from ..gaussian.gaussians import Gaussians, concatenate, with_colors
@@ -69,7 +69,7 @@ class TrainOptions:
     encoding: str | None = None
 
     def __post_init__(self) -> None:
-        for name, value in plain_numbers(vars(self), TrainOptions.__annotations__).items():
+        for name, value in check_types(vars(self), TrainOptions.__annotations__).items():
             object.__setattr__(self, name, value)
         check_components(self.components, self.energy)
         check_encoding(self.encoding)

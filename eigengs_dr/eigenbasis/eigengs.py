@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..backend.doors import door, shows_progress, takes_numbers
+from ..backend.doors import checks_types, door, shows_progress
 from ..backend.messages import to_html
 from ..backend.types import ArrayLike, Doubles, Record, Singles
 from ..gaussian.gaussians import Gaussians, with_colors
@@ -77,7 +77,7 @@ class EigenGS:
 
     @classmethod
     @shows_progress
-    @takes_numbers
+    @checks_types
     def fit(
         cls,
         basis: Eigenbasis | TrainingImages,
@@ -271,7 +271,7 @@ class EigenGS:
         return self._colored(columns, (pixels.shape[1], pixels.shape[0]))
 
     @shows_progress
-    @takes_numbers
+    @checks_types
     def encode_many(
         self,
         images: Images,
@@ -323,16 +323,18 @@ class EigenGS:
         result = with_colors(self.gaussians, columns, self.gaussians.space)
         return result.scaled(*size) if size else result
 
-    @takes_numbers
+    @checks_types
     def dense_mean(self, width: int, height: int) -> Singles:
         """Return the mean image as pixels, shape (height, width, C), in the space of the model."""
         return resample(np.moveaxis(self.mean_image, 0, 2), width, height)
 
+    @checks_types
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
         write_model(path, vars(self))
 
     @classmethod
+    @checks_types
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> EigenGS:
         """Read a model that `save` wrote, or a model of this package.
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import door, shows_progress
+from ..backend.doors import checks_types, door, shows_progress
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import to_html
 from ..backend.types import ArrayLike
@@ -120,6 +120,7 @@ class Fit:
 
     _repr_html_ = to_html  # what a notebook shows
 
+    @checks_types
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the set with its PSNR, steps and source; see `eigengs_dr.Gaussians.save`."""
         figures = FitFigures(self.psnr_ycbcr, self.psnr_rgb, self.iterations, self.source)
@@ -226,6 +227,8 @@ def fit(
 
     Raises
     ------
+    TypeError
+        If an argument has another type.
     ValueError
         If the image is unusable or an argument is out of range; if maps differ in size, or
         arguments contradict each other.
@@ -265,7 +268,7 @@ def fit(
         target_psnr=target_psnr,
         start=start,
         space=None if space is None else space_of(space),
-        method=method or (COARSE_TO_FINE if image is None else DEFAULT),
+        method=(COARSE_TO_FINE if image is None else DEFAULT) if method is None else method,
         seed=seed,
         backend=backend,
         encoding=encoding,

@@ -20,7 +20,8 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import types_of
-from ..backend.doors import plain_numbers
+from ..backend.doors import check_types
+from ..backend.messages import shown
 from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor, UInt
 from ..gaussian.gaussians import Gaussians, whole
@@ -128,7 +129,7 @@ class Loss:
                 "Loss: the function is a Loss; change one by dataclasses.replace(loss, bounds=...)"
             )
         if not callable(self.function):
-            raise TypeError(f"Loss: {self.function!r} is no function of (picture, step)")
+            raise TypeError(f"Loss: {shown(self.function)} is no function of (picture, step)")
         if hasattr(self.function, "n_recordings"):
             raise TypeError(
                 "Loss: the function is frozen by drjit.freeze, which passes no derivative on; give "
@@ -136,6 +137,8 @@ class Loss:
             )
         _check_arguments("function", self.function, "picture, step")
         if self.judge is not None:
+            if not callable(self.judge):
+                raise TypeError(f"Loss: judge is {shown(self.judge)}; give a function of a picture")
             _check_arguments("judge", self.judge, "picture")
         steps = hasattr(self.parameters, "step") and hasattr(self.parameters, "values")
         if self.parameters is not None and not steps:
@@ -146,12 +149,12 @@ class Loss:
         plain = isinstance(self.function, FunctionType) and self.parameters is None
         if not isinstance(self.frozen, bool) or (self.frozen and not plain):
             raise TypeError(
-                f"Loss: frozen is {self.frozen!r}; give True or False, and True only with a plain "
-                "function and no parameters"
+                f"Loss: frozen is {shown(self.frozen)}; give True or False, and True only with a "
+                "plain function and no parameters"
             )
         if self.bounds is not None:
             object.__setattr__(self, "bounds", _check_bounds(self.bounds))
-        for name, value in plain_numbers(vars(self), Loss.__annotations__).items():
+        for name, value in check_types(vars(self), Loss.__annotations__).items():
             object.__setattr__(self, name, value)
         if self.target is not None and not 0 < self.target < math.inf:
             raise ValueError(f"Loss: target is {self.target}; it must be finite and above 0")
@@ -162,11 +165,11 @@ class Loss:
 def _check_bounds(bounds: Any) -> tuple[float, float]:
     """Return bounds as two numbers; raise ValueError unless they are finite and rise."""
     try:
-        low, high = (plain_numbers({"": b}, {"": "float"})[""] for b in bounds)
+        low, high = (check_types({"": b}, {"": "float"})[""] for b in bounds)
         if not math.isfinite(high - low):
             raise ValueError
     except (TypeError, ValueError):
-        raise ValueError(f"Loss: bounds are {bounds!r}; give two numbers, such as (0, 1)") from None
+        raise ValueError(f"Loss: bounds are {shown(bounds)}; give two numbers") from None
     if not low < high:
         raise ValueError(f"Loss: bounds are {bounds}; the first must be the smaller")
     return low, high

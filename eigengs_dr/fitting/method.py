@@ -6,12 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from numbers import Real
-from typing import Protocol, runtime_checkable
+from typing import Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.doors import check_fields
+from ..backend.messages import shown
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
 from .control import (
@@ -131,12 +132,12 @@ class Method:
         kinds = {"place": Placement, "optimizer": Optimizer, "coordinates": Coordinates}
         parts = [(name, getattr(self, name), kind) for name, kind in kinds.items()]
         if not isinstance(self.controls, (tuple, list)):
-            raise TypeError(f"Method: controls is {self.controls!r}; give a tuple of controls")
+            raise TypeError(f"Method: controls is {shown(self.controls)}; give a tuple of controls")
         for name, part, kind in [*parts, *(("controls", c, Control) for c in self.controls)]:
             if isinstance(part, type) or not isinstance(part, kind):
                 raise TypeError(
-                    f"Method: {name} holds {part!r}, which lacks what a {kind.__name__} has; see "
-                    f"{kind.__module__}.{kind.__name__}"
+                    f"Method: {name} holds {shown(part)}, which lacks what a {kind.__name__} has; "
+                    f"see {kind.__module__}.{kind.__name__}"
                 )
         rates = self.rates if isinstance(self.rates, Mapping) else {}
         plain = all(isinstance(r, Real) and not isinstance(r, bool) for r in rates.values())
@@ -182,6 +183,10 @@ class Method:
         >>> eg.DEFAULT.without("grows", "places", "moves", "shakes").controls
         (Retreat(rise=4.0, factor=0.4, first=10),)
         """
+        known = get_args(Phase)
+        for phase in phases:
+            if not isinstance(phase, str) or phase not in known:
+                raise ValueError(f"phase {shown(phase)} is unknown; use one of {', '.join(known)}")
         kept = tuple(c for c in self.controls if phase_of(c) not in phases)
         return replace(self, controls=kept)
 

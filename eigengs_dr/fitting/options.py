@@ -13,7 +13,8 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from ..backend.doors import plain_numbers, takes_numbers
+from ..backend.doors import check_types, checks_types
+from ..backend.messages import printable, shown
 from ..gaussian.file import check_index_range, check_sides
 from ..gaussian.gaussians import Fitted, Gaussians
 from ..image.metrics import MAX_PSNR
@@ -97,7 +98,7 @@ class Goal:
     max_gaussians: int | None = None
 
     def __post_init__(self) -> None:
-        for name, value in plain_numbers(vars(self), Goal.__annotations__).items():
+        for name, value in check_types(vars(self), Goal.__annotations__).items():
             object.__setattr__(self, name, value)
         if not 0 < self.psnr <= MAX_PSNR:
             raise ValueError(
@@ -148,17 +149,23 @@ class FitOptions:
         kinds = FitOptions.__annotations__
         if not isinstance(self.gaussians, tuple):
             kinds = kinds | {"gaussians": "int | None"}
-        for name, value in plain_numbers(vars(self), kinds).items():
+        for name, value in check_types(vars(self), kinds).items():
             object.__setattr__(self, name, value)
         for name, least in (("gaussians", 1), ("iterations", 0), ("seed", 0), ("levels", 1)):
             count = getattr(self, name)
             if isinstance(count, int) and count < least:
                 raise ValueError(f"{name} is {count!r}; it must be at least {least}")
+        if self.iterations > MAX_ITERATIONS:
+            raise ValueError(
+                f"iterations is {self.iterations}; it must be at most {MAX_ITERATIONS}"
+            )
         check_encoding(self.encoding)
         if self.space is not None:
             object.__setattr__(self, "space", space_of(self.space))
         if not isinstance(self.method, Method):
-            raise TypeError(f"method is {self.method!r}; pass a Method, such as eigengs_dr.DEFAULT")
+            raise TypeError(
+                f"method is {shown(self.method)}; pass a Method, such as eigengs_dr.DEFAULT"
+            )
         if self.method.needs_model and not isinstance(self.start, Model):
             raise ValueError(
                 "this method starts from a model; give one as the start, such as "
@@ -255,6 +262,9 @@ class FitOptions:
         )
 
 
+MAX_ITERATIONS = 10_000_000  # lists of what happens at which step take memory
+
+
 def default_count(pixels: int) -> int:
     """Return the default number of Gaussians: `DEFAULT_COUNT`, at most one per pixel."""
     return min(DEFAULT_COUNT, pixels)
@@ -265,7 +275,7 @@ def max_gaussians_for(pixels: int, channels: int) -> int:
     return max(1, pixels * channels // (COLOR_PARAMETERS + channels))
 
 
-@takes_numbers
+@checks_types
 def level_counts(count: int, levels: Levels) -> list[int]:
     """Return the number of Gaussians up to each level.
 
@@ -297,8 +307,9 @@ def level_counts(count: int, levels: Levels) -> list[int]:
     """
     if count < 1:
         raise ValueError(f"count is {count}; it must be at least 1")
-    if not isinstance(levels, (int, np.integer)):
+    if isinstance(levels, Sequence):
         return _check_counts(count, levels)
+    check_types({"levels": levels}, {"levels": "int"})
     max_levels = 1
     while count >= LEVEL_RATIO**max_levels:
         max_levels += 1
@@ -309,7 +320,7 @@ def level_counts(count: int, levels: Levels) -> list[int]:
 
 def _check_counts(count: int | None, levels: Sequence[int]) -> list[int]:
     """Return numbers of Gaussians that rise up to `count`, if that is known."""
-    counts, written = list(levels), ", ".join(map(str, levels))
+    counts, written = list(levels), printable(", ".join(map(str, levels)))[:60]
     if not all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) for n in counts):
         raise ValueError(f"levels {written}: numbers of Gaussians must be whole")
     if not counts or not all(a < b for a, b in pairwise([0, *counts])):

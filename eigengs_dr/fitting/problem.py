@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_in, types_of
-from ..backend.doors import plain_numbers
+from ..backend.doors import check_types
 from ..backend.selection import select
 from ..backend.types import ArrayLike, PathLike, Values
 from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space
@@ -357,7 +357,7 @@ def _problem_of_loss(
 
 def _unknown_channels(spaces: Spaces) -> tuple[Channels, ...]:
     """Return channels by their spaces, of a picture or of maps by name."""
-    named = spaces if isinstance(spaces, Mapping) else {"": spaces or YCBCR}
+    named = spaces if isinstance(spaces, Mapping) else {"": YCBCR if spaces is None else spaces}
     known = {name: space_of(space) for name, space in named.items()}
     maps = [TextureMap(name, s, 1 if s.by_range else 3) for name, s in known.items()]
     if isinstance(spaces, Mapping):
@@ -401,14 +401,14 @@ def _read_map(
 ) -> Channels:
     check_name(name)
     try:
-        numbers = plain_numbers(vars(given), Map.__annotations__)
+        numbers = check_types(vars(given), Map.__annotations__)
         if not MIN_WEIGHT <= numbers["weight"] <= 1 / MIN_WEIGHT:
             raise ValueError(f"weight is {given.weight}; it must be from 1e-6 to 1e6")
         space = usual_space(name) if given.space is None else space_of(given.space)
         pixels, space = pixels_in(given.image, space, weight, encoding)
         reached = goal.psnr if goal else None
         reached = Goal(numbers["goal"]).psnr if "goal" in numbers else reached
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         text = str(error).removeprefix("image: ")
         raise type(error)(f"map {name!r}: {text}") from None
     if space.by_range and pixels.shape[2] == 3 and (pixels == pixels[..., :1]).all():

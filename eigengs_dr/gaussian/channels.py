@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..backend.messages import shown
 from ..image.space import DATA, LINEAR, NORMAL, SPACES, Space, space_of
 from ..storage.npz import BadValue
 
@@ -77,6 +78,8 @@ def check_maps(maps: Sequence[TextureMap], channels: int) -> tuple[TextureMap, .
     BadValue
         If maps are invalid, or their total number of channels differs.
     """
+    if not all(isinstance(m, TextureMap) for m in maps):
+        raise TypeError(f"maps are {shown(maps)}; give a sequence of TextureMap")
     names = [m.name for m in maps]
     for m in maps:
         check_name(m.name)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..backend.messages import printable
+from ..backend.messages import printable, shown
 from ..backend.types import Arrays
 from ..image.color import MAX_CHANNELS
 from ..image.formats import SUFFIXES
@@ -192,11 +192,11 @@ def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     try:
         yield
     except BadValue as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise ValueError(printable(f"{path}: {error}")) from None
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file; check the path") from None
+        raise FileNotFoundError(f"{printable(str(path))}: no such file; check the path") from None
     except IsADirectoryError:
-        raise IsADirectoryError(f"{path}: is a folder; give a file in it") from None
+        raise IsADirectoryError(f"{printable(str(path))}: is a folder; give a file in it") from None
 
 
 def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
@@ -347,7 +347,7 @@ def _known(name: str) -> Space:
     try:
         return space_of(name)
     except ValueError:
-        raise BadValue(f"space is {name!r}, expected one of {', '.join(SPACES)}") from None
+        raise BadValue(f"space is {shown(name)}, expected one of {', '.join(SPACES)}") from None
 
 
 MAX_VALUES = (1 << 32) - 1

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
 from ..backend.doors import class_of_doors, door
-from ..backend.messages import to_html
+from ..backend.messages import shown, to_html
 from ..backend.selection import BackendError, select
 from ..backend.types import Array2f, Array3f, Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size
@@ -125,6 +125,8 @@ class Gaussians:
 
         Raises
         ------
+        TypeError
+            If an array does not hold numbers, or an argument has another type.
         ValueError
             If shapes do not match, or a value is out of range or not finite.
         """
@@ -349,9 +351,15 @@ class Gaussians:
 def _arrays(
     mean: ArrayLike, factor: ArrayLike, color: ArrayLike, background: ArrayLike | None
 ) -> Arrays:
-    """Return the arrays of a set by their names."""
+    """Return the arrays of a set by their names; refuse what holds no real numbers."""
     given = {"mean": mean, "factor": factor, "color": color, "background": background}
-    return {name: np.asarray(values) for name, values in given.items() if values is not None}
+    if background is None:
+        del given["background"]
+    arrays = {name: np.asarray(values) for name, values in given.items()}
+    for name, array in arrays.items():
+        if array.dtype.kind not in "biufc":
+            raise TypeError(f"Gaussians: {name} is {shown(given[name])}; give real numbers")
+    return arrays
 
 
 def _received(data: SetData, backend: str, kind: DTypeLike) -> Gaussians:
@@ -394,10 +402,12 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     -------
     Gaussians
         The Gaussians of the first set, then those of the second, and so on. A single set is
-        returned unchanged.
+        returned unchanged. Values are not checked; `Gaussians.bounded` clips them.
 
     Raises
     ------
+    TypeError
+        If it is no list or tuple of sets.
     ValueError
         If there are no sets, or they differ in one of these properties.
     """
@@ -537,7 +547,7 @@ def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     ValueError
         If shapes do not match.
     TypeError
-        If a value is not a Dr.Jit tensor.
+        If a value is not a Dr.Jit tensor of floats, or `tensors` is no mapping.
 
     Examples
     --------
@@ -547,10 +557,10 @@ def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """
     given = {name: tensors[name] for name in FIELDS if name in tensors}
     for name, tensor in given.items():
-        if not dr.is_tensor_v(tensor):
+        if not (dr.is_tensor_v(type(tensor)) and dr.is_float_v(type(tensor))):
             raise TypeError(
                 f"{name} is a {type(tensor).__module__}.{type(tensor).__name__}, expected a Dr.Jit "
-                "tensor; drjit.wrap converts those of PyTorch and JAX functions"
+                "tensor of floats; drjit.wrap converts those of PyTorch and JAX functions"
             )
     counts = [given[name].shape[0] for name in ("mean", "factor", "color") if name in given]
     # The number of Gaussians may differ from `like` only if all parameters of Gaussians are given.

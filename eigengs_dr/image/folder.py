@@ -377,5 +377,5 @@ def _images(item: Any) -> Sequence[Values]:
     if not (isinstance(item, np.ndarray) or is_drjit(item)) or item.ndim not in (3, 4):
         kind = f"shape {item.shape}" if isinstance(item, np.ndarray) else type(item).__name__
         raise ImageError(f"images: got {kind}, expected (n, H, W, 3) or (n, H, W); pass arrays")
-    # A last axis of length 1 or 3 holds channels: no grey image is so narrow.
-    return [item] if item.ndim == 3 and item.shape[2] in (1, 3) else list(item)
+    # A last axis of up to 4 holds channels, perhaps too many: no grey image is so narrow.
+    return [item] if item.ndim == 3 and 1 <= item.shape[2] <= 4 else list(item)

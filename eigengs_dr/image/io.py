@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import takes_numbers
-from ..backend.types import ArrayLike
+from ..backend.doors import checks_types
+from ..backend.messages import printable
+from ..backend.types import ArrayLike, PathLike
 from ..storage.atomic import atomic_write, refuse_url
 from .color import to_coded, to_linear
 from .formats import BITS, SUFFIXES, write_file
@@ -43,8 +44,9 @@ from .space import Space
 from .strips import Pixels, by_strips
 
 
+@checks_types
 def load_image(
-    path: str | Path, keep_grey: bool = False, upright: bool = True
+    path: PathLike, keep_grey: bool = False, upright: bool = True
 ) -> NDArray[np.float32]:
     """Read an image file as RGB.
 
@@ -92,7 +94,7 @@ def load_image(
 
 
 def read_file(
-    path: str | Path,
+    path: PathLike,
     keep_grey: bool = False,
     encoding: str | None = None,
     upright: bool = True,
@@ -108,7 +110,7 @@ def read_file(
         try:
             return _read_local(file, str(path), keep_grey, encoding, upright)
         except ImageError as error:
-            raise ImageError(str(error).replace(str(file), str(path))) from None
+            raise ImageError(str(error).replace(printable(str(file)), str(path))) from None
 
 
 def _read_local(
@@ -130,7 +132,7 @@ def read_image(image: object, keep_grey: bool = False, encoding: str | None = No
     without a known encoding count as sRGB.
     """
     if isinstance(image, (str, os.PathLike)):
-        return read_file(image, keep_grey, encoding)  # type: ignore[arg-type]
+        return read_file(image, keep_grey, encoding)
     if isinstance(image, EncodedImage):
         return image._replace(encoding=encoding or image.encoding)
     return EncodedImage(pixels_of(image), encoding_of(image, encoding) or "srgb")
@@ -296,9 +298,9 @@ def displayed(image: ArrayLike, space: Space, encoding: str | None = None) -> ND
     return check_data(image, copy=False)
 
 
-@takes_numbers
+@checks_types
 def save_image(
-    path: str | Path, image: ArrayLike, encoding: str | None = None, bits: int | None = None
+    path: PathLike, image: ArrayLike, encoding: str | None = None, bits: int | None = None
 ) -> None:
     """Write an image file atomically.
 
@@ -453,6 +455,7 @@ SAMPLES = {
 """Files in the scikit-image wheel, by name; its other photos need a download."""
 
 
+@checks_types
 def sample(name: str) -> NDArray[np.float32]:
     """Load a photo that ships with scikit-image, without a download.
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from ..backend.doors import checks_types
 from ..backend.types import ArrayLike, Doubles, DrJitArray, Float, Singles
 from .color import RGB_TO_YCBCR, rgb_to_ycbcr, to_linear, to_pu21
 from .io import pixels_of, to_8bit
@@ -28,6 +29,7 @@ SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of MS-SSIM from the finest scale to the coarsest, Wang et al. 2003, section 3.2."""
 
 
+@checks_types
 def psnr(a: ArrayLike, b: ArrayLike, space: str = "rgb", weight: ArrayLike | None = None) -> float:
     """Compute the peak signal-to-noise ratio of two images, in decibels.
 
@@ -213,7 +215,7 @@ def ssim(a: Any, b: Any, weight: Any = None) -> Any:
     if is_tensor(a) or is_tensor(b):
         from .structure import similarity  # the command line reads this file without Dr.Jit
 
-        x, y = (v if is_tensor(v) else _scaled(np.asarray(pixels_of(v))) for v in (a, b))
+        x, y = (v if is_tensor(v) else _scaled(v) for v in (a, b))
         _check_shapes(x.shape, y.shape)
         return similarity(x, y, _weight_of_windows(x.shape, weight), _window(x.shape))
     a, b = pixels_of(a), pixels_of(b)
@@ -222,6 +224,7 @@ def ssim(a: Any, b: Any, weight: Any = None) -> Any:
     return float(_similarity(x, y, lambda rows: np.clip(rows, 0, 1), factors)[0].mean())
 
 
+@checks_types
 def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     r"""Compute the multi-scale structural similarity of two images (Wang et al. 2003).
 
@@ -281,15 +284,16 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     return float(product.mean())
 
 
-def _scaled(image: Pixels) -> Pixels:
+def _scaled(image: ArrayLike) -> Pixels:
     """Scale integers to [0, 1] by their type; floats are not changed."""
+    image = np.asarray(pixels_of(image))
     peak = peak_of(image.dtype)
     return image if image.dtype.kind == "f" else image / np.float64(peak)
 
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[Pixels, Pixels]:
     """Return both images as RGB of one shape (H, W, 3) without a copy; grey is replicated."""
-    x, y = (_scaled(np.asarray(pixels_of(image))) for image in (a, b))
+    x, y = map(_scaled, (a, b))
     _check_shapes(x.shape, y.shape, (1, 3))
     shape = (*x.shape[:2], 3)
     return np.broadcast_to(x, shape), np.broadcast_to(y, shape)

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.messages import warn
+from ..backend.doors import check_types
+from ..backend.messages import printable, shown, warn
 from ..backend.types import ArrayLike, Singles, Tensor
 from ..storage.memory import ALWAYS, check_usable
 from .strips import Pixels, by_strips
@@ -43,6 +44,9 @@ C1, C2 = 0.01**2, 0.03**2
 class ImageError(ValueError):
     """An image cannot be used; one line names the image, the reason and what to do."""
 
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))  # names in a file may hold control characters
+
 
 def reason_of(error: BaseException) -> str:
     """Return the first line of an error, or its type."""
@@ -64,6 +68,7 @@ class EncodedImage(NamedTuple):
 
 def check_encoding(encoding: str | None) -> None:
     """Raise ValueError if the encoding is unknown; None stands for the default."""
+    check_types({"encoding": encoding}, {"encoding": "str | None"})
     if encoding is not None and encoding not in ENCODINGS:
         known = ", ".join(ENCODINGS)
         raise ValueError(f"encoding {encoding!r} is unknown; use one of {known}")
@@ -264,7 +269,9 @@ def check_size(size: Iterable[int]) -> tuple[int, int]:
     try:
         width, height = map(index, size)
     except (TypeError, ValueError):
-        raise ValueError(f"size is {size!r}; expected (width, height) in whole pixels") from None
+        raise ValueError(
+            f"size is {shown(size)}; expected (width, height) in whole pixels"
+        ) from None
     if min(width, height) < 1:
         raise ValueError(f"size is {width}x{height}; both sides must be at least 1 pixel")
     return width, height

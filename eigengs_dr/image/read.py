@@ -10,6 +10,7 @@ import math
 import re
 import stat
 import sys
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.messages import printable
 from ..storage.memory import check_content
 from .formats import HAS_HEIF, HEIF_SUFFIXES, STARTS
 from .notes import GAIN_MAP, depth_notes, png_notes, primaries_note, profile_note, tell
@@ -164,7 +166,9 @@ def _image_errors(path: Path) -> Iterator[None]:
         yield
     except ImageError as error:
         text = str(error)
-        raise ImageError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
+        raise ImageError(
+            text if text.startswith(printable(f"{path}: ")) else f"{path}: {text}"
+        ) from None
     except Exception as error:  # on damaged files decoders raise many types
         from PIL import UnidentifiedImageError
 
@@ -239,6 +243,8 @@ def _opened(path: Path) -> Iterator[oiio.ImageInput]:
 
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
+    if _format_of(path) == "png":
+        _check_png(path, b"IDAT")
     with _text_of(path) as name:
         file = oiio.ImageInput.open(name, config)
     if not file:
@@ -432,6 +438,22 @@ def _radiance(path: Path) -> tuple[int, tuple[str, ...]]:
     return orientation, primaries_note([float(number) for number in primaries[1].split()], 0.05)
 
 
+def _check_png(path: Path, last: bytes) -> None:
+    """Raise `_Unread` at a damaged chunk before the last, where libpng prints a line of its own."""
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        file.seek(8)
+        while head := file.read(8):
+            kind = head[4:]
+            if kind == last:
+                return
+            content = file.read(min(int.from_bytes(head[:4], "big"), size))
+            needed = not kind.isalpha() or kind[:1].isupper()  # others may be damaged
+            if needed and zlib.crc32(kind + content) != int.from_bytes(file.read(4), "big"):
+                raise _Unread(f"its chunk {kind.decode('latin-1')} is damaged or cut")
+            file.seek(0 if needed else 4, 1)
+
+
 def _png_frames(path: Path) -> int:
     """Return the number of frames of an animated PNG file, 1 if it is not animated."""
     with path.open("rb") as file:
@@ -442,6 +464,8 @@ def _png_frames(path: Path) -> int:
 def _pixels(path: Path, header: Header) -> tuple[Pixels, str]:
     """Return the pixels of a file with its orientation applied, and what their alpha is."""
     try:
+        if _format_of(path) == "png":
+            _check_png(path, b"IEND")
         with _opened(path) as file:
             spec = file.spec()
             if _is_palette(spec):

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.messages import shown
 from ..storage.npz import BadValue
 from . import color
 from .color import Samples
@@ -507,10 +508,11 @@ def space_of(name: object, spaces: Sequence[Space] = SPACES) -> Space:
     >>> space_of("linear").is_light
     True
     """
-    for space in spaces:
-        if space == name:
-            return space
-    raise ValueError(f"space {name!r} is unknown; use one of {', '.join(spaces)}")
+    if isinstance(name, str):
+        for space in spaces:
+            if space == name:
+                return space
+    raise ValueError(f"space {shown(name)} is unknown; use one of {', '.join(spaces)}")
 
 
 def to_planes(image: Image, space: str) -> Image:

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.doors import shows_progress, takes_numbers
+from ..backend.doors import checks_types, shows_progress
 from ..backend.executor import Executor, Value, completed
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.selection import select
@@ -93,7 +93,7 @@ class LargeFit:
 
 @named_options
 @shows_progress
-@takes_numbers
+@checks_types
 def fit_large(
     image: ArrayLike | os.PathLike[str],
     output: str | os.PathLike[str] | None = None,

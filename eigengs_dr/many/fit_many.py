@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
-from ..backend.doors import shows_progress
+from ..backend.doors import checks_types, shows_progress
 from ..backend.selection import name_of, select
 from ..fitting.control import Diverged
 from ..fitting.fit import Fit, fit_images
@@ -37,6 +37,7 @@ times the time of 4, and larger groups are not faster per image (H200, 100 steps
 
 
 @shows_progress
+@checks_types
 def fit_many(
     images: Images,
     output: str | os.PathLike[str] | None = None,

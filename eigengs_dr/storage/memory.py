@@ -140,4 +140,6 @@ def download_limit() -> int:
 def _setting() -> int | None:
     """Return the value of the environment variable in bytes, or None."""
     text = os.environ.get(SETTING, "")
-    return int(text) << 20 if text.isdecimal() else None
+    if text and not (text.isdecimal() and int(text)):
+        raise ValueError(f"{SETTING} is {text!r}; set a whole number of MB, or unset it")
+    return int(text) << 20 if text else None

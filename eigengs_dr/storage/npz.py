@@ -13,6 +13,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from ..backend.messages import printable
 from ..backend.types import Arrays, Record, Values
 from .atomic import atomic_write
 from .memory import check_content, open_regular
@@ -137,6 +138,7 @@ def _opened(
     path: str | os.PathLike[str], name: str = "eigengs_dr", version: int | None = None
 ) -> Iterator[zipfile.ZipFile]:
     """Open a file of a format and a version; turn every error in the block into one line."""
+    text = printable(os.fspath(path))
     with open_regular(path) as file:
         try:
             with _archive(file) as archive:
@@ -144,15 +146,15 @@ def _opened(
                     _check_format(archive, name, version)
                 yield archive
         except BadValue as error:
-            raise ValueError(f"{path}: {error}") from None
+            raise ValueError(printable(f"{path}: {error}")) from None
         except MemoryError:
             raise ValueError(
-                f"{path}: needs more memory than there is; if it should be small, it is damaged"
+                f"{text}: needs more memory than there is; if it should be small, it is damaged"
             ) from None
         except Exception as error:  # zlib, lzma, zipfile and NumPy raise many types
             raise ValueError(
-                f"{path}: not a readable {name} file ({' '.join(str(error).split())[:80]}); "
-                "it may be damaged or of another kind"
+                f"{text}: not a readable {name} file ({printable(str(error)[:80])}); it may be "
+                "damaged or of another kind"
             ) from None
 
 

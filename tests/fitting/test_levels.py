@@ -58,7 +58,6 @@ def test_bad_levels_are_refused(count, levels, message):
         ({"gaussians": [0, 9]}, "must rise, from 1 or more"),
         ({"gaussians": []}, "must rise, from 1 or more"),
         ({"gaussians": [True, 9]}, "levels True, 9: numbers of Gaussians must be whole"),
-        ({"gaussians": b"5"}, "gaussians is b'5'; it must be a whole number"),
         ({"gaussians": np.array([4.5, 9])}, "levels 4.5, 9.0: numbers of Gaussians must be whole"),
         ({"gaussians": [9, 48 * 48 + 1]}, "gaussians is 2305; an image of 48x48 takes 1 to 2304"),
         ({"target_psnr": 30}, "gaussians and target_psnr exclude each other"),
@@ -70,6 +69,11 @@ def test_levels_that_cannot_be_fitted_are_refused(image, options, message):
     with pytest.raises(ValueError, match=message) as caught:
         fit(image, **{"gaussians": [5, 9], **options})
     assert "\n" not in str(caught.value)
+
+
+def test_numbers_of_another_type_are_refused(image):
+    with pytest.raises(TypeError, match="gaussians is b'5'; it must be a whole number"):
+        fit(image, b"5")
 
 
 def test_counts_may_be_those_of_numpy(image):

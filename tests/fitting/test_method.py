@@ -75,7 +75,6 @@ def test_rates_times_a_factor():
         ({"cutoff": 13}, r"cutoff is 13.0; it must be in \(0, 12\]"),
         ({"cutoff": np.nan}, "cutoff is nan"),
         ({"solve_steps": -1}, r"solve_steps is -1; it must be in \[0, inf\)"),
-        ({"solve_steps": 2.5}, "solve_steps is 2.5; it must be a whole number"),
         ({"controls": (Surplus(),)}, "controls: a Surplus leaves by a Relocate that comes as ofte"),
         ({"controls": (Surplus(), Relocate(every=90))}, "add one, or leave the Surplus out"),
         ({"rates": {}}, "rates are {}; each must be above 0"),
@@ -97,6 +96,7 @@ def test_bad_values_are_refused(changed, words):
         ({"controls": None}, "controls is None; give a tuple of controls"),
         ({"controls": (print,)}, "controls holds .*see eigengs_dr.fitting.control.Control"),
         ({"optimizer": 3}, "optimizer holds 3"),
+        ({"solve_steps": 2.5}, "solve_steps is 2.5; it must be a whole number"),
         ({"coordinates": Adaptive()}, r"coordinates holds Adaptive\(\)"),
     ],
 )

@@ -168,7 +168,6 @@ def test_progress():
     ("options", "reason"),
     [
         ({"block": 8}, "block is 8; it must be at least 32"),
-        ({"block": 64.5}, "block is 64.5"),
         ({"gaussians": 10}, "at least 64: use more, or fit a smaller version"),
         ({"gaussians": 128 * 128 + 1}, "takes 1 to 16384"),
         ({"gaussians": 0}, "gaussians is 0; it must be at least 1"),
@@ -186,6 +185,8 @@ def test_a_method_of_the_caller():
     assert found.gaussians.cutoff == 4 and found.psnr_rgb > 20
     with pytest.raises(ValueError, match="cutoff is 0"):
         eg.fit_large(mosaic(96), **FEW, method=replace(eg.DEFAULT, cutoff=0))
+    with pytest.raises(TypeError, match=r"block is 64\.5; it must be a whole"):
+        eg.fit_large(mosaic(96), **FEW | {"block": 64.5})
     with pytest.raises(TypeError, match="method is 'default'; pass a Method"):
         eg.fit_large(mosaic(96), **FEW, method="default")
 

@@ -241,7 +241,6 @@ def test_photos_that_do_not_fit_are_refused():
         ({"held_out": 1e-9}, "held_out is 1e-09, 0 of the 576 pixels of photo 0"),
         ({"held_out": 1 - 1e-9}, "held_out is 0.999999999, 576 of the 576 pixels of photo 0"),
         ({"spp": 0}, "spp is 0"),
-        ({"spp": 2.0}, "spp is 2.0; it must be a whole number"),
         ({"seed": -1}, "seed is -1"),
         ({"bounds": (0, np.inf)}, "bounds are"),
         ({"encoding": "sRGB"}, "encoding 'sRGB' is unknown"),
@@ -252,6 +251,7 @@ def test_photos_that_do_not_fit_are_refused():
     for options, message in (
         ({"integrator": "path"}, "integrator is 'path'; give a loaded one"),
         ({"sensors": 5}, "sensors is 5; give a list"),
+        ({"spp": 2.0}, "spp is 2.0; it must be a whole number"),
         ({"sensors": [0, 1, 2.0]}, "2.0 is no sensor"),
         ({"parameters": {}.items()}, "give an optimiser"),
     ):
