@@ -211,10 +211,11 @@ def sum_pyramid(
         return types.Int(dr.ceil(middle - half)), types.Int(dr.floor(middle + half))
 
     def add(i: UInt, stop: UInt, j: UInt, seen_from: tuple, sums: list) -> tuple:
-        u, v, *inverse = seen_from
+        u, v, *moved = seen_from
+        metric = moved or inverse
         here = i <= stop
         across, down = types.Float(i) - u, types.Float(j) - v
-        q = inverse[0] * across * across + (inverse[1] * across + inverse[2] * down) * down
+        q = metric[0] * across * across + (metric[1] * across + metric[2] * down) * down
         q = dr.clip(q, 0, last)
         w = dr.fma(q, dr.fma(-fall / last**2, q, LIFT / last), falloff(q))
         wrap_x, wrap_y = axes_of(lattice.wrap)
@@ -228,11 +229,12 @@ def sum_pyramid(
         begin, end = row_of(j)
         return dr.select(ran, begin, i), dr.select(ran, end, stop), j, seen_from, sums
 
+    state = inverse if dr.grad_enabled(inverse) else []  # see `filtered_terms`
     bottom = types.Int(dr.select(active, dr.floor(dr.detach(v) + reach), -(2.0**30)))
     j = types.Int(dr.ceil(dr.detach(v) - reach))
     i, stop = row_of(j)
     sums = dr.while_loop(
-        (i, stop, j, (u, v, *inverse), [types.Float(0) for _ in range(lattice.channels)]),
+        (i, stop, j, (u, v, *state), [types.Float(0) for _ in range(lattice.channels)]),
         lambda i, stop, j, *rest: j <= bottom,
         add,
         label="sum pyramid",
