@@ -7,8 +7,8 @@ Hilbert curve. Each Gaussian is stretched along the direction of the smallest se
 constants were chosen on training images of faces and of ImageNet classes by the error after 10
 steps of the colour solve.
 
-This runs on the host, in NumPy and SciPy: a fit places once or twice, and kernels for it would take
-longer to compile than all others of a first fit.
+This runs on the host, in NumPy and SciPy: a fit places once or twice, and kernels for it were a
+quarter of all that a first fit compiled (0.7 of 3.0 MB of intermediate code).
 """
 
 from __future__ import annotations

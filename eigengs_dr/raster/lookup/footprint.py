@@ -151,5 +151,5 @@ def filtered_terms(packed: Packed, footprint: list) -> tuple[Terms, tuple[Float,
     shared = fxx, fxy, fyy, determinant
     if dr.grad_enabled(shared):
         return terms, shared
-    # What a loop need not differentiate stays out of its state, which would cost a step 10 %.
+    # What a loop need not differentiate stays out of its state, which would cost a step 8 %.
     return lambda shape, color, x, y: terms(shape, color, x, y, *shared), ()
