@@ -161,11 +161,11 @@ def fit(
         channel. Without an image, give a loss and the size of its picture.
     gaussians : int or sequence of int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
-        images; with a start, the number of its Gaussians; without an image, one for 4 pixels, or
-        as many as the judge of the loss finds best, see `eigengs_dr.Loss`. Several rising numbers
-        such as ``[5000, 7000, 9000]`` are levels of detail, see `level_counts`: the first Gaussians
-        form the image too, and ``result.gaussians[:n]`` is a level. Inside a level, Gaussians with
-        a larger removal cost come first, so that every prefix forms an image.
+        images; with a start, the number of its Gaussians; without an image, one for 4 pixels.
+        Several rising numbers such as ``[5000, 7000, 9000]`` are levels of detail, see
+        `level_counts`: the first Gaussians form the image too, and ``result.gaussians[:n]`` is a
+        level. Inside a level, Gaussians with a larger removal cost come first, so that every prefix
+        forms an image.
     iterations : int, optional
         Largest number of refinement steps; 0 keeps the colours of the solve.
     target_psnr : float or Goal, optional

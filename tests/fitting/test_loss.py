@@ -184,24 +184,6 @@ def test_double_precision_by_a_double_start():
     assert set(kinds) == {dr.VarType.Float64} and found.loss < found.trace[0]["loss"]
 
 
-def test_a_judge_chooses_the_number():
-    """The texels are noisy; a judge without noise sees how many Gaussians keep it out."""
-
-    def noisy(picture, step):
-        noise = np.random.default_rng(step).normal(0, 0.3, IMAGE.shape).astype(np.float32)
-        return dr.mean(dr.square(picture - type(picture)(IMAGE + noise)), axis=None)
-
-    loss = eg.Loss(noisy, judge=squares)
-    found = eg.fit(loss=loss, size=(SIDE, SIDE), iterations=150, space="rgb")
-    texels, *rows = found.trace
-    same = [row for row in rows if row["iteration"] == texels["iteration"]]
-    tried = [(row["gaussians"], row["loss"]) for row in same[:-1]]  # the last begins the descent
-    counts, losses = zip(*tried, strict=True)
-    assert list(counts) == [18 * 2**k for k in range(len(counts))] and len(counts) > 1
-    assert len(found.gaussians) == min(tried, key=lambda pair: pair[1])[0]
-    assert found.loss <= min(losses)
-
-
 def test_the_last_set_counts_without_a_judge():
     """The loss of the first step does not compare with that of another one."""
 
@@ -469,8 +451,6 @@ STOPS = {"first": 0, "texels": 2, "later": 13}
     [
         *product(("image", "target"), ("first", "later", "judge", "from a judge on")),
         *product(("free", "free target"), (*STOPS, "judge", "from a judge on")),
-        ("number", "judge"),
-        ("number", "from a judge on"),
     ],
 )
 def test_a_loss_or_a_judge_may_end_the_fit(kind, stop):
@@ -489,7 +469,7 @@ def test_a_loss_or_a_judge_may_end_the_fit(kind, stop):
         return squares(picture)
 
     given = {"image": IMAGE} if kind in ("image", "target") else {"size": (SIDE, SIDE)}
-    given |= {} if "target" in kind or kind == "number" else {"gaussians": 30}
+    given |= {} if "target" in kind else {"gaussians": 30}
     asked = eg.Loss(loss, judge=judge, target=1e-4 if "target" in kind else None)
     errors = KeyboardInterrupt(), StopIteration("mine"), RuntimeError("mine")
     for error in errors if stop == "first" else errors[:2]:

@@ -93,20 +93,6 @@ def test_photos_of_few_pixels_get_few_gaussians():
     side = math.ceil(2 * math.sqrt(seen))
     few, many = (eg.fit(loss=loss, size=(s, s), iterations=2).gaussians for s in (8, side))
     assert len(few) == 16 and len(many) == seen // 3 < side**2 // 4
-    held_out = photo_loss(scene, NAME, photos, held_out=0.5)
-    assert seen - 4 * photos[0][..., 0].size < held_out.pixels < seen
-
-
-def test_held_out_pixels_choose_the_number():
-    from eigengs_dr.plugins import photo_loss
-
-    scene, photos = wall(GREY), photos_of(wall(true_texture()))
-    loss = photo_loss(scene, NAME, photos, held_out=0.2)
-    found = eg.fit(loss=loss, size=(32, 32), iterations=30, space="linear")
-    texels, *rows = found.trace
-    same = [row for row in rows if row["iteration"] == texels["iteration"]]
-    tried = {row["gaussians"]: row["loss"] for row in same}
-    assert len(found.gaussians) == min(tried, key=tried.get) and len(tried) > 1
 
 
 def test_the_derivative_is_a_forward_difference():
@@ -190,15 +176,6 @@ def test_a_light_is_found_along():
     assert light[key][0] == pytest.approx(1.5, abs=0.05)
 
 
-def test_a_judge_renders_with_the_parameters():
-    from eigengs_dr.plugins import photo_loss
-
-    photos = photos_of(wall(true_texture(), light=1.5))
-    light = mi.ad.Adam(lr=0.03, params={"sky.radiance.value": mi.Float(1.5)})
-    loss = photo_loss(wall(GREY), NAME, photos, held_out=0.2, parameters=light)
-    assert abs(loss.judge(mi.TensorXf(true_texture())).array[0]) < 5e-3  # 0.06 without
-
-
 def test_bounds_are_those_of_textures_or_none():
     from eigengs_dr.plugins import photo_loss
 
@@ -237,9 +214,6 @@ def test_photos_that_do_not_fit_are_refused():
     for options, message in (
         ({"sensors": [0, 1]}, "3 photos, but 2 sensors"),
         ({"sensors": [0, 1, 3]}, "there is no sensor 3; the scene has 3"),
-        ({"held_out": 1}, "held_out is 1"),
-        ({"held_out": 1e-9}, "held_out is 1e-09, 0 of the 576 pixels of photo 0"),
-        ({"held_out": 1 - 1e-9}, "held_out is 0.999999999, 576 of the 576 pixels of photo 0"),
         ({"spp": 0}, "spp is 0"),
         ({"seed": -1}, "seed is -1"),
         ({"bounds": (0, np.inf)}, "bounds are"),
