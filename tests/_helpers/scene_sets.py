@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import eigengs_dr as eg
-from eigengs_dr.gaussian.channels import TextureMap
 
 
 def save_halves(folder):
@@ -18,7 +17,7 @@ def save_halves(folder):
     save("roughness", [0.2], [0.6], "data")
     maps = [("albedo", "linear", 3), ("roughness", "data", 1), ("normal", "normal", 3)]
     both = halves([*red, 0.2, 0.5, 0.5, 1], [*blue, 0.6, 0.6, 0.4, 0.9], "data")
-    replace(both, maps=tuple(TextureMap(*m) for m in maps)).save(folder / "tiles.npz")
+    replace(both, maps=tuple(maps)).save(folder / "tiles.npz")
     return folder
 
 
