@@ -251,10 +251,7 @@ def test_the_last_set_counts_without_a_judge():
     assert found.loss == found.trace[-1]["loss"]
 
 
-NUMBERS = [float, np.float32, np.float64, np.asarray, lambda x: np.array([x]), lambda x: int(1e6 * x)]
-
-
-@pytest.mark.parametrize("kind", NUMBERS)
+@pytest.mark.parametrize("kind", [float, np.float32, np.asarray, lambda x: int(1e6 * x)])
 def test_a_judge_chooses_the_best_set_by_any_number(kind):
     loss = eg.Loss(squares, judge=lambda p: kind(np.mean((p.numpy() - IMAGE) ** 2)))
     found = fit(loss, 20, 4, image=IMAGE)
