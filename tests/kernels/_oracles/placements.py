@@ -34,8 +34,7 @@ def images_and_counts(draw):
     height, width, channels = draw(
         st.tuples(st.integers(1, 24), st.integers(1, 24), st.sampled_from([1, 3]))
     )
-    elements = draw(
-        st.sampled_from([st.floats(0, 1, width=32), st.sampled_from([0.0, 1.0]), st.just(0.5)])
-    )
+    kinds = [st.floats(0, 1, width=32), st.sampled_from([0.0, 1.0]), st.just(0.5)]
+    elements = draw(st.sampled_from(kinds))
     image = draw(hnp.arrays(np.float32, (height, width, channels), elements=elements))
     return image, draw(st.integers(1, height * width))

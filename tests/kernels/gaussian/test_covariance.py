@@ -34,15 +34,9 @@ seeds = given(st.integers(0, 2**32 - 1))
 def test_factors_of_covariances(seed):
     factor, covariance = draw(seed)
     found = factor_from_covariance(covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1])
-    precision = np.linalg.inv(covariance)
     well = np.linalg.cond(covariance) < 1e6  # entries of needles do not hold their determinant
-    a, b, c = found[well].T
-    np.testing.assert_allclose(a * a, precision[well, 0, 0], rtol=1e-6)
-    np.testing.assert_allclose(
-        a * b, precision[well, 0, 1], rtol=1e-6, atol=1e-9 * np.abs(a * a).max()
-    )
     np.testing.assert_allclose(found[well], factor[well], rtol=1e-5, atol=1e-6)
-    assert c.min() > 0
+    assert found[well, 2].min() > 0
 
 
 @few

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import correlate1d, maximum_filter
 
 from _helpers.sets import few
-from _helpers.tiles import to_tiles
+from _oracles.tiles import to_tiles
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.fitting.placement.peaks import RADIUS, SIZE, Canvas, residual_peaks
 
@@ -86,10 +86,6 @@ def test_the_colour_of_a_gaussian_of_the_size_is_found(backend, at):
     np.testing.assert_allclose(found.mean, [np.add(at, 0.5)])
     inside = min(at) > 1 and at[0] < 32  # else a part of it is missed
     np.testing.assert_allclose(found.color, [[0.7, 0, -0.2]], rtol=0.01 if inside else 0.6)
-
-
-def test_of_equal_neighbours_one_is_a_peak(backend):
-    assert len(found_peaks(np.ones((8, 8, 1), np.float32), 64, backend=backend).mean) == 1
 
 
 def test_an_image_without_error_has_no_peaks(backend):
