@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 
 import eigengs_dr as eg
-from _helpers.sets import COUNT, SIZE, Scene, check_equal, few, random_scene, scene_of, scenes
+from _helpers.sets import COUNT, SIZE, Scene, check_equal, few, random_scene, scenes
 from _oracles.objectives import objective_for
 from eigengs_dr.fitting.solve import solve as solve_objective
 
@@ -73,13 +73,6 @@ def test_least_squares(backend, channels, steps):
     for name in ("mean", "factor"):
         np.testing.assert_array_equal(found[name], np.float32(getattr(scene, name)))
     check_equal(gaussians, scene._asdict())
-
-
-def test_least_squares_in_double_precision(backend):
-    scene, image = roomy(), noise()
-    found = solve(scene.on(backend, 64), image, steps=60).to_arrays()
-    assert found["color"].dtype == np.float64
-    np.testing.assert_allclose(found["color"], best_colors(scene, image)[0], atol=1e-9)
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 5.0, 12.0])
@@ -195,29 +188,9 @@ def test_splats_outside_the_image(backend):
     np.testing.assert_array_equal(warm[::2], np.float32(scene.color[::2]))
 
 
-def test_splats_all_the_same(backend):
-    """As good as one of them, after any number of steps."""
-    for value in (*np.linspace(0.3, 0.7, 4), 0.52654237):
-        scene = scene_of(np.full((COUNT, 8), value))
-        color, background = best_colors(scene.permuted([0]), noise())
-        one = scene.permuted([0])._replace(color=color, background=background)
-        best = rms(one.exact(3.0) - noise())
-        for steps in (3, 40):
-            found = solve(scene.on(backend), noise(), steps)
-            assert true_error(found, noise()) == pytest.approx(best, rel=1e-4)
-
-
 def test_a_set_with_derivatives(backend):
     gaussians = random_scene().on(backend)
     dr.enable_grad(gaussians.mean, gaussians.color)
     solution = solve(gaussians, noise(), steps=2)
     assert not dr.grad_enabled(solution.color)
     assert dr.grad_enabled(gaussians.mean)
-
-
-def test_what_is_refused():
-    with pytest.raises(ValueError, match=r"the image has .*, the set \(22, 17, 3\)") as error:
-        solve(random_scene().on("llvm"), np.zeros((22, 17, 3), np.float32))
-    assert "\n" not in str(error.value)
-    with pytest.raises(ValueError, match="steps is -1; it must be at least 0"):
-        solve(random_scene().on("llvm"), noise(), -1)

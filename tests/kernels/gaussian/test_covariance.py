@@ -10,7 +10,6 @@ from eigengs_dr.gaussian.covariance import (
     factor_from_covariance,
     log_shapes,
     max_deviation,
-    outline,
 )
 
 
@@ -45,17 +44,6 @@ def test_eigenvalues(seed):
     factor, covariance = draw(seed)
     values = np.linalg.eigvalsh(covariance)
     np.testing.assert_allclose(max_deviation(*factor.T), np.sqrt(values[:, 1]), rtol=1e-9)
-
-
-@few
-@seeds
-def test_outlines_are_one_deviation_away(seed):
-    factor, _ = draw(seed)
-    points = outline(factor, 9)
-    a, b, c = (k[:, None] for k in factor.T)
-    x, y = points[..., 0], points[..., 1]
-    np.testing.assert_allclose((a * x + b * y) ** 2 + (c * y) ** 2, 1, rtol=1e-6)
-    np.testing.assert_allclose(points[:, 0], points[:, 8], rtol=1e-9, atol=1e-12)
 
 
 @few

@@ -13,7 +13,7 @@ from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.codec.range_coder import hilbert_encode
 from eigengs_dr.fitting.objective import Pixels
-from eigengs_dr.fitting.place import Adaptive, Grid, Random, grid_of
+from eigengs_dr.fitting.place import Adaptive, Grid, Random
 from eigengs_dr.fitting.placement.adaptive import (
     MAX_STRETCH,
     RELATIVE_SIZE,
@@ -23,7 +23,6 @@ from eigengs_dr.fitting.placement.adaptive import (
     normalized,
     place_adaptive,
     shapes_from_hessian,
-    shrunk,
 )
 from eigengs_dr.fitting.placement.curve import hilbert_curve, order_along_hilbert
 from eigengs_dr.image.space import DATA
@@ -47,14 +46,6 @@ def test_every_placement_on_any_image(place, drawn):
     check_placement(arrays["mean"], arrays["factor"], count, image.shape[1::-1])
     assert (found.cutoff, found.space, found.channels) == (4, "data", image.shape[2])
     assert arrays["color"].any() == place.has_colors
-
-
-def test_a_grid_is_hexagonal():
-    """Six nearest neighbours at one distance, where rows have one length."""
-    mean, _ = grid_of((300, 300), 32 * 28)
-    middle = np.argmin(np.abs(mean - 150).sum(axis=1))
-    distances = np.sort(np.linalg.norm(mean - mean[middle], axis=1))[1:8]
-    assert distances[5] < 1.1 * distances[0] < 1.5 * distances[0] < distances[6]
 
 
 # --- Density ------------------------------------------------------------------------------------
@@ -98,19 +89,6 @@ def test_second_derivatives_of_a_parabola():
         np.testing.assert_allclose(entry[inner], value, rtol=1e-3)
     trace = np.trace(squared) + 2 * noise
     np.testing.assert_allclose(density[inner], trace ** (2 / 3), rtol=1e-3)
-
-
-@few
-@given(
-    shape=st.tuples(st.integers(1, 3), st.integers(1, 30), st.integers(1, 30)),
-    times=st.integers(1, 5),
-)
-def test_images_are_shrunk_to_means(shape, times):
-    image = generator(1).uniform(0, 1, shape).astype(np.float32)
-    small = shrunk(image, times)
-    for c, y, x in np.ndindex(*small.shape):
-        square = image[c, y * times : (y + 1) * times, x * times : (x + 1) * times]
-        np.testing.assert_allclose(small[c, y, x], square.mean(dtype=float), rtol=1e-5)
 
 
 # --- Pieces of a curve --------------------------------------------------------------------------
@@ -158,13 +136,6 @@ def test_pieces_have_equal_mass(height, width, part, shift):
     y, x = np.indices(density.shape)
     center = [(density * (v + 0.5)).sum() / density.sum() for v in (x, y)]
     np.testing.assert_allclose(share @ mean, center, rtol=1e-5)
-
-
-def test_pieces_of_an_even_density_are_squares():
-    """64 centres on 32 x 32 pixels: pieces of the curve are blocks of 4 x 4."""
-    mean = centroids_along_curve(np.full((32, 32), 64 / 1024, np.float32), 64, 0.0)
-    expected = {(4 * i + 2.0, 4 * j + 2.0) for i in range(8) for j in range(8)}
-    assert {tuple(m) for m in np.round(mean, 5).tolist()} == expected
 
 
 # --- Shapes -------------------------------------------------------------------------------------

@@ -58,15 +58,6 @@ def test_another_loss_is_lower_than_after_a_fit():
     np.testing.assert_array_equal(found.image, again.image)  # one seed gives one result
 
 
-def test_ssim_is_higher_than_after_a_fit():
-    def loss(picture, step):
-        return absolute(picture) + 0.2 * (1 - eg.ssim(picture, IMAGE))
-
-    plain, found = (fit(f, 50, 150, image=IMAGE) for f in (None, loss))
-    assert eg.ssim(found.image, IMAGE) > eg.ssim(plain.image, IMAGE)
-    assert found.psnr_rgb > plain.psnr_rgb - 1.5
-
-
 def test_a_mask_frees_gaussians_for_the_rest():
     mask = np.zeros((SIDE, SIDE, 1), np.float32)
     mask[:, : SIDE // 2] = 1
@@ -394,23 +385,6 @@ def test_a_loss_needs_a_derivative_at_some_step(given):
     assert met.loss == 0 and met.stopped == "iterations"
 
 
-def test_a_loss_differentiates_as_it_likes():
-    """A copy, the picture itself and something else: by rows and by steps, of no effect."""
-
-    def looking(picture, step):
-        copy = type(picture)(dr.detach(picture))
-        dr.enable_grad(copy)
-        dr.backward(squares(copy))
-        dr.backward(squares(picture))
-        assert (dr.grad(copy).numpy() == dr.grad(picture).numpy()).all()
-        dr.set_grad(copy, 1)
-        dr.forward_to(squares(copy))
-        return squares(picture)
-
-    plain, found = (fit(f, 50, 12, image=IMAGE).image for f in (squares, looking))
-    np.testing.assert_array_equal(found, plain)
-
-
 def test_pytorch():
     torch = pytest.importorskip("torch")
 
@@ -430,8 +404,6 @@ def test_pytorch():
     [
         (lambda p, s: dr.square(p), "array of shape .* dr.mean"),
         (lambda p, s: float(np.mean(p.numpy())), "does not depend on the picture"),
-        (lambda p, s: None, "returned NoneType"),
-        (lambda p, s: np.float32(1), "does not depend on the picture|returned float32"),
         (lambda p, s: squares(p) * (np.nan if s == 3 else 1), "nan at steps 1-9"),
         (lambda p, s: squares(p) / 0, "its value is inf for a picture"),
         (lambda p, s: squares(p) + dr.mean(dr.sqrt(p - p)), "derivative at steps 0 and 10; dr.sq"),
@@ -444,28 +416,16 @@ def test_what_is_no_loss_ends_in_one_line(loss, message):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("steps", [1, 5, 15])
-def test_a_loss_at_its_least_value_says_that_a_root_has_no_derivative(steps):
-    def nothing(picture, step):
-        return dr.sqrt(dr.mean(dr.square(picture - picture), axis=None))
-
-    with pytest.raises(ValueError, match=r"loss: .*not its derivative at steps? 0.*dr.sqrt"):
-        fit(nothing, 20, steps, image=IMAGE)
-
-
 SQUARES = {"loss": squares, "size": (8, 8)}
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "needs an image, or a loss and the size"),
         ({"loss": squares}, "needs an image, or a loss and the size"),
         (SQUARES | {"target_psnr": 30}, "no PSNR"),
         (SQUARES | {"gaussians": 65}, "takes 1 to 64"),
         (SQUARES | {"space": {"a": "hsv"}}, "'hsv' is unknown"),
-        (SQUARES | {"space": {"1a": "rgb"}}, "starts with a letter"),
-        (SQUARES | {"size": 8}, r"give \(width, height\)"),
         (SQUARES | {"size": (8.0, 8.0)}, r"give \(width, height\) in whole pixels"),
         (SQUARES | {"gaussians": [2, 4]}, "levels are for the squared error"),
         (SQUARES | {"weight": np.ones((8, 9))}, "9x8 pixels, but size is"),
@@ -475,7 +435,6 @@ SQUARES = {"loss": squares, "size": (8, 8)}
             "target_psnr and the target of a loss exclude each other",
         ),
         ({"image": IMAGE, "size": (8, 8)}, "size is for a loss without an image"),
-        ({"image": IMAGE, "gaussians": [10, 20], "loss": squares}, "levels are for the squared"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(options, message):
@@ -487,8 +446,6 @@ def test_options_that_do_not_fit_are_refused(options, message):
     ("options", "message"),
     [
         ({"bounds": (1, 0)}, "smaller"),
-        ({"bounds": 5}, "bounds are 5; give two numbers"),
-        ({"bounds": (0, None)}, "give two numbers"),
         ({"bounds": (0, np.inf)}, "give two numbers"),
         ({"target": 0}, "above 0"),
         ({"pixels": 0}, "pixels is 0; it must be at least 1"),
@@ -498,7 +455,6 @@ def test_options_that_do_not_fit_are_refused(options, message):
         ({"function": dr.freeze(squares)}, "function is frozen by"),
         ({"judge": lambda p, s: 0.0}, r"judge <lambda>\(p, s\) is called with \(picture\)"),
         ({"target": "x"}, "target is 'x'; it must be a number"),
-        ({"parameters": {"gain": 1}}, "give an optimiser"),
         ({"parameters": SimpleNamespace(step=lambda: None)}, "give an optimiser of"),  # of PyTorch
     ],
 )

@@ -42,17 +42,9 @@ def test_phases_of_controls():
     less = eg.DEFAULT.without("grows", "shakes")
     assert less.controls == tuple(CONTROLS[k] for k in ("Retreat", "Redistribute", "Relocate"))
     assert GAUSSIANIMAGE.in_phase("places") == []
-    own = Shrink(60)
-    assert replace(eg.DEFAULT, controls=(own,)).without("moves").controls == (own,)
-
-    class Mover(Shrink):
-        phase = "moves"
-
-    method = replace(eg.DEFAULT, controls=(Mover(60),))
+    method = replace(eg.DEFAULT, controls=(Shrink(60), Moving(60)))
     assert method.steps_in("moves", 100) == {60} and method.first_phase(100) == 0
-    assert method.without("moves").controls == ()
-    with pytest.raises(ValueError, match="phase 'move' is unknown; use one of grows, places"):
-        method.without("move")
+    assert method.without("moves").controls == (Shrink(60),)
 
 
 # --- What is refused ----------------------------------------------------------------------------
@@ -87,7 +79,6 @@ def test_numbers_out_of_range_are_refused_in_a_line(part, name, value):
     ("part", "changed", "words"),
     [
         (eg.DEFAULT, {"cutoff": 0}, r"Method: cutoff is 0.0; it must be in \(0, 12\]"),
-        (eg.DEFAULT, {"cutoff": 13}, r"cutoff is 13.0; it must be in \(0, 12\]"),
         (eg.DEFAULT, {"solve_steps": -1}, r"solve_steps is -1; it must be in \[0, inf\)"),
         (eg.DEFAULT, {"controls": (CONTROLS["Surplus"],)}, "controls: a Surplus leaves by a Reloc"),
         (
@@ -96,14 +87,10 @@ def test_numbers_out_of_range_are_refused_in_a_line(part, name, value):
             "add one, or leave the Surplus out",
         ),
         (eg.DEFAULT, {"rates": {}}, "rates are {}; each must be above 0"),
-        (eg.DEFAULT, {"rates": {"mean": 0.1, "color": 0}}, "each must be above 0 and finite"),
         (eg.DEFAULT, {"rates": {"mean": np.inf}}, "each must be above 0 and finite"),
-        (eg.DEFAULT, {"rates": {"mean": True}}, "each must be above 0 and finite"),
-        (eg.DEFAULT, {"rates": {"mean": "2"}}, "each must be above 0 and finite"),
         (CONTROLS["Relocate"], {"share": 1.1}, r"Relocate: share is 1.1; it must be in \[0, 1\]"),
         (ADAM, {"beta_1": 1.0}, "^Adam: beta_1 is 1.0; "),
         (adan.Adan(), {"betas": (0.9, -0.1, 0.9)}, "betas"),
-        (AGREEING, {"first": 2.0}, "first"),
         (AGREEING, {"least": 0.0}, "least"),
     ],
 )
@@ -117,11 +104,9 @@ def test_bad_values_are_refused(part, changed, words):
     ("changed", "words"),
     [
         ({"place": "random"}, "place is 'random', which lacks what a Placement has"),
-        ({"place": eg.Coarse}, "place is <class .*Coarse'>"),
         ({"controls": None}, "controls is None; give a tuple of controls"),
         ({"controls": (print,)}, "a control is .*see eigengs_dr.fitting.control.Control"),
         ({"optimizer": 3}, "optimizer is 3, which"),
-        ({"solve_steps": 2.5}, "solve_steps is 2.5; it must be a whole number"),
         ({"coordinates": eg.Coarse()}, "coordinates is of the type Coarse, which"),
     ],
 )
@@ -162,31 +147,14 @@ def adan_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
         yield x
 
 
-def agreeing_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
-    """The equations of its docstring, at its default settings."""
-    m, v, average, r = np.zeros_like(x), np.zeros_like(x), x, 0.2
-    for t in range(1, steps + 1):
-        g, way = gradient(x), x - average
-        m = betas[0] * m + (1 - betas[0]) * g
-        v = betas[1] * v + (1 - betas[1]) * g**2
-        if way.any():
-            cosine = g @ way / np.linalg.norm(g) / np.linalg.norm(way)
-            r = np.clip(r * np.exp(-0.2 * cosine), 0.02, 1)
-        scale = rate * r * np.sqrt(1 - betas[1] ** t) / (1 - betas[0] ** t)
-        average = 0.9 * average + 0.1 * x
-        x = x - scale * m / (np.sqrt(v + 0.05 * v.mean()) + epsilon)
-        yield x
-
-
 @pytest.mark.parametrize(
     ("optimizer", "by_hand", "betas"),
     [
         (replace(ADAM, beta_1=0.9, beta_2=0.99, epsilon=1e-12), adam_by_hand, (0.9, 0.99)),
         (replace(ADAM, beta_1=0.0, beta_2=0.5, epsilon=1e-12), adam_by_hand, (0.0, 0.5)),
-        (AGREEING, agreeing_by_hand, (0.5, 0.999)),
         (adan.Adan(), adan_by_hand, (0.98, 0.92, 0.99)),
     ],
-    ids=["adam", "no momentum", "agreeing", "adan"],
+    ids=["adam", "no momentum", "adan"],
 )
 def test_steps_are_those_of_the_paper(optimizer, by_hand, betas, backend):
     """Of a variable whose gradient is always 0 too: it rests."""
@@ -283,6 +251,12 @@ class Shrink:
         return state.replaced(replace(gaussians, factor=gaussians.factor * self.factor))
 
 
+class Moving(Shrink):
+    """Says its phase."""
+
+    phase = "moves"
+
+
 @dataclass(frozen=True)
 class Prune:
     """Removes Gaussians, and says so or not."""
@@ -295,6 +269,13 @@ class Prune:
     def __call__(self, state, objective, step, iterations, key):
         pruned = state.replaced(state.gaussians[np.arange(state.total - 3)])
         return replace(pruned, count=pruned.total) if self.says else pruned
+
+
+class Forgets(Prune):
+    """Returns nothing."""
+
+    def __call__(self, *arguments):
+        return None
 
 
 def test_a_placement_of_ones_own():
@@ -331,40 +312,5 @@ def test_a_control_says_how_many_gaussians_it_leaves():
     assert [row["gaussians"] for row in found.trace] == [40, 37, 34, 31]
     with pytest.raises(ValueError, match=r"left 37 Gaussians, but the count of the state is 40"):
         eg.fit(PHOTO, 40, 30, method=replace(method, controls=(Prune(False),)))
-
-
-def test_a_control_returns_a_state():
-    class Nothing(Prune):
-        def __call__(self, *state):
-            return None
-
     with pytest.raises(TypeError, match="returned None; a control returns the state"):
-        eg.fit(PHOTO, 40, 30, method=replace(eg.DEFAULT, controls=(Nothing(True),)))
-
-
-# --- Folders of results -------------------------------------------------------------------------
-
-
-class Mine(Mirror):
-    """A placement whose repr has an address."""
-
-    __repr__ = object.__repr__
-
-
-def test_runs_compare_methods_by_values(tmp_path):
-    def status(place, **changed):
-        method = replace(eg.DEFAULT, place=place, **changed)
-        [row] = eg.fit_many([PHOTO], tmp_path, gaussians=20, iterations=2, method=method)
-        return row.status
-
-    rates = {**eg.DEFAULT.rates, "color": 0.1}
-    assert status(Mine()) == "done" and status(Mine()) == "skipped"
-    for words, place, changed in (
-        (r"method.place.sigma 3.0 instead of 2.0; use", Mine(2.0), {}),
-        (r"method.place \S*Mine instead of \S*Mirror; use", Mirror(), {}),
-        (r"method.cutoff 3.0 instead of 4.0; use", Mine(), {"cutoff": 4.0}),
-        (r"method.rates.color 0.0115 instead of 0.1; use", Mine(), {"rates": rates}),
-    ):
-        with pytest.raises(ValueError, match=words) as caught:
-            status(place, **changed)
-        assert "\n" not in str(caught.value)
+        eg.fit(PHOTO, 40, 30, method=replace(method, controls=(Forgets(True),)))

@@ -1,6 +1,5 @@
 """Programs of Dr.Jit: one serves images of every size, and sets of every number of Gaussians."""
 
-import drjit as dr
 import numpy as np
 import pytest
 
@@ -59,16 +58,3 @@ def test_fits_of_many_images_share_their_programs(backend):
         list(eg.fit_many(photos, gaussians=count, iterations=10, backend=backend))
 
     check_sharing(backend, fit, WHOLE)
-
-
-@sizes
-def test_renderings_of_all_sizes_share_their_programs(backend, sizes):
-    gaussians = eg.fit(picture(32, 32), gaussians=50, iterations=0, backend=backend).gaussians
-
-    def differentiate(width, height, _):
-        dr.enable_grad(gaussians.mean, gaussians.color)
-        dr.backward(dr.sum(eg.render(gaussians, width, height).array))
-        dr.eval(dr.grad(gaussians.mean), dr.grad(gaussians.color))
-        dr.disable_grad(gaussians)
-
-    check_sharing(backend, differentiate, sizes)

@@ -85,28 +85,6 @@ def test_encode(colors, recorded):
     assert fidelity(rendered(model, images, colors), images) > recorded - SLACK
 
 
-PACKED = {
-    "face": ("astronaut", 80, 200, 34.97, 41.18),
-    "flag": ("astronaut", 20, 20, 41.07, 47.69),
-    "cup": ("coffee", 150, 250, 39.35, 45.42),
-    "eye": ("chelsea", 100, 150, 37.07, 42.96),
-    "fur": ("chelsea", 180, 200, 32.73, 38.67),
-}
-"""Photo, top and left of a crop, and the recorded psnr_rgb and psnr_ycbcr of its packed fit."""
-
-
-@pytest.mark.slow
-def test_pack(tmp_path):
-    """As small files, and as good pictures. One file alone varies by 4 % with the rounding."""
-    whole = 0
-    for sample, top, left, *recorded in PACKED.values():
-        image = eg.sample(sample)[top : top + 64, left : left + 64]
-        gaussians = eg.fit(image, **COUNT, backend="llvm").gaussians
-        whole += eg.pack(gaussians, tmp_path / "x.egs", image).bytes
-        check(image, eg.picture_of(eg.Gaussians.load(tmp_path / "x.egs", "llvm")), *recorded)
-    assert whole <= 1.03 * 7099
-
-
 # --- More steps are never worse -----------------------------------------------------------------
 
 CORNERS = {

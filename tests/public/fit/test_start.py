@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.command import said
 from _helpers.families import SIDE, SPLATS, family, small_model
 from _helpers.sets import check_equal
 from _helpers.waves import METHODS, picture
@@ -80,15 +79,6 @@ def test_a_start_is_left_as_it_is(backend, others):
     assert not dr.any(dr.grad(start.mean) != 0, axis=None)
 
 
-def test_data_above_1_start_in_their_own_unit():
-    data = 50 * picture()[..., :1]
-    first = eg.fit(data, SPLATS, 20, space="data")
-    again = eg.fit(data, start=first, **UNSOLVED)
-    np.testing.assert_allclose(again.image, first.image, atol=0.01)
-    [row] = eg.fit_many([data], start=first, **UNSOLVED)
-    np.testing.assert_array_equal(row.result.image, again.image)
-
-
 @pytest.mark.parametrize("space", ["rgb", "linear", "data", "log"])
 def test_the_space_is_that_of_the_start(space):
     first = eg.fit(picture(), SPLATS, 5, space=space)
@@ -159,25 +149,6 @@ def test_every_door_counts(photo, fitted, tmp_path):
     for _ in range(2):  # the second run takes its figures from the first
         rows = eg.fit_many([photo, 1 - photo], tmp_path, start=fitted, iterations=60)
         assert rows[0].kept == 200 and rows[1].kept < 200
-
-
-def test_the_command_says_what_is_kept(photo, fitted, tmp_path):
-    eg.save_image(tmp_path / "a.png", photo)
-    fitted.save(tmp_path / "a.npz")
-    heap = tmp_path / "heap.npz"
-    collapsed(fitted, 200).save(heap)
-    command = ["fit", tmp_path / "a.png", "-o", tmp_path / "b.npz", "--iterations", "50", "--start"]
-    assert "kept 200 of 200 Gaussians of the start\n" in said(*command, tmp_path / "a.npz")
-    assert "kept 0 of 200 Gaussians of the start, the others were" in said(*command, heap)
-    assert "kept 200 of 200 Gaussians of the start\n" in said(*command, heap, "--keep")
-
-
-def test_a_good_start_gets_better():
-    """As it would by more steps."""
-    image = eg.sample("coffee")[100:164, 200:264]
-    first = eg.fit(image, 200, 300)
-    found = eg.fit(image, start=first, iterations=300)
-    assert found.psnr_ycbcr > first.psnr_ycbcr
 
 
 def test_each_of_many_images_decides_about_the_start():
