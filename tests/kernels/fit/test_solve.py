@@ -60,7 +60,7 @@ def true_error(found, image):
     return rms(scene.exact(found.cutoff) - image)
 
 
-@pytest.mark.parametrize(("channels", "steps"), [(1, 40), (2, 40), (3, 40), (3, 200), (4, 40)])
+@pytest.mark.parametrize(("channels", "steps"), [(1, 40), (3, 40), (3, 200)])
 def test_least_squares(backend, channels, steps):
     """Shapes stay as they are, and so does the set that was given."""
     scene, image = roomy(channels=channels), noise(channels)
@@ -75,7 +75,7 @@ def test_least_squares(backend, channels, steps):
     check_equal(gaussians, scene._asdict())
 
 
-@pytest.mark.parametrize("cutoff", [2.0, 5.0, 12.0])
+@pytest.mark.parametrize("cutoff", [2.0, 9.0])
 def test_cutoffs(backend, cutoff):
     scene, image = roomy(), noise()
     solution = solve(replace(scene.on(backend), cutoff=cutoff), image, steps=40)

@@ -52,7 +52,7 @@ def noise(*shape):
 @given(
     height=st.integers(1, 30),
     width=st.integers(1, 30),
-    channels=st.integers(1, 4),
+    channels=st.sampled_from([1, 3]),
     share=st.sampled_from([0, 0.3, 1]),
     layers=st.integers(0, 2),
 )
@@ -78,7 +78,7 @@ def test_peaks_are_those_of_a_plain_search(backend, height, width, channels, sha
 
 def test_each_image_of_a_batch_has_its_own_peaks(backend):
     """Those that it has alone, bit for bit: a neighbour in memory is no neighbour in space."""
-    missed = noise(3, 22, 17, 2)
+    missed = noise(3, 22, 17, 3)
     missed[1] = 0
     together = found_peaks(missed, 9, backend=backend)
     for k, own in enumerate(missed):

@@ -11,6 +11,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.command import said
 from _helpers.families import small_model
+from _helpers.materials import images
 from _helpers.sets import check_equal
 from _helpers.waves import SIDE, SPLATS, check_sound, figures, methods, often, picture
 
@@ -82,15 +83,12 @@ def test_one_seed_gives_one_result(method, backend):
     assert (figures(run(6)) != figures(first)) == (start is None)
 
 
-@pytest.mark.parametrize("options", [{"gaussians": 60}, {"target_psnr": 40}])
-def test_seeds_drive_the_noise(options):
-    image, traces, sets = eg.sample("coffee")[100:132, 200:232], [], []
-    for seed in (0, 0, 1):
-        result = eg.fit(image, iterations=150, seed=seed, **options)
-        traces.append(figures(result))
-        sets.append(result.gaussians)
-    assert traces[0] == traces[1] != traces[2]
-    check_equal(sets[1], sets[0].to_arrays())
+def test_one_seed_gives_one_search():
+    first, second, other = (
+        eg.fit(picture(), target_psnr=30, iterations=60, seed=seed) for seed in (0, 0, 1)
+    )
+    assert figures(first) == figures(second) != figures(other)
+    check_equal(second.gaussians, first.gaussians.to_arrays())
 
 
 @pytest.mark.parametrize("steps", [0, 15, 110])
@@ -102,6 +100,7 @@ def test_seeds_place_gaussians_elsewhere(steps):
     assert len({color.tobytes() for color in colors}) == 3
 
 
+@pytest.mark.slow
 def test_recording_changes_nothing(backend):
     """Although Gaussians come and go, a recorded step serves all their numbers."""
     ends = []
@@ -126,7 +125,7 @@ def test_constant_images(method, value, backend):
         assert value or result.stopped == "exact"
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 37), (37, 1), (2, 3)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 37), (3, 2)])
 @pytest.mark.parametrize("init", ["adaptive", "grid", "random"])
 def test_narrow_images(shape, init, tmp_path):
     """By every placement of the command line."""
@@ -140,10 +139,10 @@ def test_narrow_images(shape, init, tmp_path):
     assert np.isfinite(eg.picture_of(found)).all()
 
 
-@pytest.mark.parametrize("count", [1, 2, 9, SIDE * SIDE])
+@pytest.mark.parametrize("count", [1, 9, SIDE * SIDE])
 def test_fewest_and_most_gaussians(count):
     """Also in descents whose rounds move a share of them."""
-    result = fit(picture(), count, 100, method=often(45 if count > 9 else 5))
+    result = fit(picture(), count, 100 if count == 9 else 10, method=often())
     check_sound(result, picture())
     assert len(result.gaussians) == count
 
@@ -283,8 +282,7 @@ def test_ctrl_c_before_refinement(iterations):
 @pytest.mark.parametrize("kind", ["image", "maps"])
 def test_a_fit_leaves_no_arrays_to_the_collector(kind):
     """In a frozen function of the user, Dr.Jit waits forever if the collector frees an array."""
-    image = picture()
-    target = image if kind == "image" else {"albedo": image, "roughness": image[..., 0]}
+    target = picture() if kind == "image" else images()
 
     def run():
         fit(target, iterations=3, progress=False)

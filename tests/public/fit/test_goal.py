@@ -65,8 +65,8 @@ def test_the_search_finds_about_as_few():
     assert np.median(counts) <= 140
 
 
-@pytest.mark.parametrize("space", ["ycbcr", "linear", "log", "data"])
-@pytest.mark.parametrize("value", [0.0, 0.4])
+@pytest.mark.parametrize("space", ["ycbcr", "data"])
+@pytest.mark.parametrize("value", [0.4])
 def test_an_image_that_is_fitted_without_error(space, value):
     """The PSNR of a set without error is infinite."""
     image = np.full((SIDE, SIDE, 1 if space == "data" else 3), value, np.float32)

@@ -117,17 +117,10 @@ def test_packing(tmp_path):
     eg.pack(result.gaussians["albedo"], tmp_path / "a.egs", images()["albedo"])
     assert eg.Gaussians.load(tmp_path / "a.egs").maps == ()
     assert min(eg.pack(result, tmp_path / "n.egs").psnr.values()) > 25
-    for given, images_of, words in (
-        (result.gaussians["albedo"], images(), "the set has no maps; give a single image"),
-        (result, images()["albedo"], "has maps; give the images of albedo, roughness, normal"),
-        (result, {"albedo": images()["albedo"]}, "images of albedo; give one of each of albedo, r"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            eg.pack(given, tmp_path / "b.egs", images_of)
+    with pytest.raises(ValueError, match="has maps; give the images of albedo, roughness, normal"):
+        eg.pack(result, tmp_path / "b.egs", images()["albedo"])
     with pytest.raises(ValueError, match="a set with maps has one section"):
         eg.pack(result, tmp_path / "b.egs", images(), sections=[2, 2])
-    with pytest.raises(ValueError, match=r"pack writes \.egs files"):
-        eg.pack(result, tmp_path / "m.npz")
 
 
 SMALL = {"albedo": np.zeros((8, 8, 3)), "roughness": np.zeros((8, 8))}

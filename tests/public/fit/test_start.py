@@ -8,6 +8,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import SIDE, SPLATS, family, small_model
+from _helpers.materials import material
 from _helpers.sets import check_equal
 from _helpers.waves import METHODS, picture
 
@@ -222,10 +223,10 @@ def test_a_start_that_is_refused(options, words, others):
 
 
 def test_sets_that_are_no_start_of_an_image(others):
-    maps = eg.fit({"albedo": others[0], "roughness": others[0][..., 0]}, 30, iterations=0)
-    with pytest.raises(ValueError, match="the set has the maps albedo, roughness; choose one"):
+    maps = material()
+    with pytest.raises(ValueError, match="the set has the maps albedo, roughness, normal; choose"):
         eg.fit(others[0], start=maps, space="data")
     with pytest.raises(ValueError, match="the image has 3 channels, but the start has 1; use"):
-        eg.fit(others[0], start=maps.gaussians["roughness"], space="data")
+        eg.fit(others[0], start=maps["roughness"], space="data")
     with pytest.raises(ValueError, match="this method starts from a model"):
-        eg.fit(others[0], start=maps.gaussians["albedo"], method=EIGENGS)
+        eg.fit(others[0], start=maps["albedo"], method=EIGENGS)

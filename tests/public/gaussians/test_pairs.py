@@ -4,6 +4,8 @@ Dr.Jit ends the process where it meets an array in a state that an operation can
 pairs run in a process of their own, which names each pair before it tries it.
 """
 
+import pytest
+
 from _helpers.process import python_path, run_python
 
 PAIRS = """
@@ -117,6 +119,7 @@ print("all pairs", flush=True)
 """
 
 
+@pytest.mark.slow
 def test_every_function_takes_what_every_other_returns():
     process = run_python(PAIRS, PYTHONPATH=python_path())
     last = process.stdout.splitlines()[-1:]

@@ -16,9 +16,13 @@ MODULES = [
     for module in pkgutil.walk_packages(eg.__path__[:1], "eigengs_dr.")
     if not module.name.endswith("__main__")  # which runs the command line
 ]
+SLOW = [name for name in MODULES if name.startswith("eigengs_dr.plugins.")]
+"""Their examples are scenes, of which each compiles programs of its own."""
 
 
-@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize(
+    "module", [pytest.param(m, marks=pytest.mark.slow if m in SLOW else ()) for m in MODULES]
+)
 def test_examples_in_docstrings(module):
     if module.startswith("eigengs_dr.scene."):
         pytest.importorskip("mitsuba", reason="scenes need mitsuba")

@@ -52,16 +52,16 @@ def test_what_is_no_number_is_refused_in_one_line():
 
 def test_numbers_of_numpy_are_numbers(tmp_path):
     image, n = family(1, side=16)[0], np.int64
-    method = replace(eg.DEFAULT, solve_steps=2, cutoff=2.5)
+    method = replace(eg.DEFAULT, solve_steps=2, cutoff=4.0)
     plain = eg.fit(image, [5, 20], iterations=3, seed=1, method=method)
     assert eg.level_counts(n(20), n(2)) == [5, 20]
     numbers = {"iterations": np.int32(3), "seed": np.uint8(1)}
-    method = replace(eg.DEFAULT, solve_steps=n(2), cutoff=np.float32(2.5))
+    method = replace(eg.DEFAULT, solve_steps=n(2), cutoff=np.float32(4.0))
     result = eg.fit(image, np.array([5, 20]), method=method, **numbers)
     np.testing.assert_array_equal(result.image, plain.image)
     json.dumps([result.iterations, result.gaussians.cutoff])
     rows = eg.fit_many([image, image], tmp_path, gaussians=n(20), iterations=n(3))
     assert [row.gaussians for row in rows] == [20, 20]
-    assert eg.render(result, width=n(9), height=n(7), cutoff=np.float32(2)).shape == (7, 9, 3)
+    assert eg.render(result, width=n(9), height=n(7), cutoff=np.float32(4)).shape == (7, 9, 3)
     with pytest.raises(TypeError, match="gaussians is 'many'; it must be a whole number"):
         eg.fit_many([image], tmp_path, gaussians="many")
