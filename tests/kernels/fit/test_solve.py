@@ -186,11 +186,3 @@ def test_splats_outside_the_image(backend):
     np.testing.assert_allclose(cold.to_arrays()["color"][1::2], color, atol=1e-5)
     warm = solve(gaussians, noise(), steps=10, warm_start=True).to_arrays()["color"]
     np.testing.assert_array_equal(warm[::2], np.float32(scene.color[::2]))
-
-
-def test_a_set_with_derivatives(backend):
-    gaussians = random_scene().on(backend)
-    dr.enable_grad(gaussians.mean, gaussians.color)
-    solution = solve(gaussians, noise(), steps=2)
-    assert not dr.grad_enabled(solution.color)
-    assert dr.grad_enabled(gaussians.mean)

@@ -5,14 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import eigengs_dr as eg
 from _helpers.sets import few
 from _oracles.objectives import objective_of
 from _oracles.placements import check_placement, covariances_of, generator, images_and_counts
-from eigengs_dr.backend.arrays import types_in
-from eigengs_dr.backend.selection import select
 from eigengs_dr.codec.range_coder import hilbert_encode
-from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.place import Adaptive, Grid, Random
 from eigengs_dr.fitting.placement.adaptive import (
     MAX_STRETCH,
@@ -24,8 +20,7 @@ from eigengs_dr.fitting.placement.adaptive import (
     place_adaptive,
     shapes_from_hessian,
 )
-from eigengs_dr.fitting.placement.curve import hilbert_curve, order_along_hilbert
-from eigengs_dr.image.space import DATA
+from eigengs_dr.fitting.placement.curve import hilbert_curve
 from eigengs_dr.paper.gaussianimage import RandomColors
 
 
@@ -107,21 +102,6 @@ def test_the_curve_is_that_of_the_bits_of_places(height, width):
 
 
 @few
-@given(**sides, images=st.sampled_from([1, 3]))
-def test_sets_are_ordered_along_the_curve_through_tiles(backend, height, width, images):
-    random = np.random.default_rng(height)
-    mean = random.uniform(0, [width, height], (20 * images, 2)).astype(np.float32)
-    rows, size = ([[1, 0, 1]] * len(mean), [[0]] * len(mean)), (width, height)
-    gaussians = eg.Gaussians.from_arrays(mean, *rows, size=size, space="data", backend=backend)
-    column, row = hilbert_curve(-(-width // 4), -(-height // 4))
-    place = {tile: k for k, tile in enumerate(zip(column.tolist(), row.tolist(), strict=True))}
-    tiles = np.minimum(mean, [width - 1, height - 1]).astype(int) // 4
-    keys = [(k // 20, place[tuple(tile)]) for k, tile in enumerate(tiles.tolist())]
-    expected = sorted(range(len(mean)), key=keys.__getitem__)
-    np.testing.assert_array_equal(order_along_hilbert(gaussians, images).numpy(), expected)
-
-
-@few
 @given(**sides, part=st.floats(0, 1), shift=st.sampled_from([0, 0.3]))
 def test_pieces_have_equal_mass(height, width, part, shift):
     """Also where a pixel holds several of them; with all cuts but the ends moved back."""
@@ -180,17 +160,3 @@ def test_splats_far_apart_are_placed_on_a_smaller_image():
     np.testing.assert_allclose(mean, 3 * expected_mean, rtol=1e-4)
     np.testing.assert_allclose(factor, expected_factor / 3, rtol=1e-3, atol=1e-5)
     check_placement(mean, factor, 21, (158, 97))
-
-
-def test_sets_of_a_batch_are_those_of_its_images(backend):
-    batch = generator(7).uniform(0, 1, (3, 30, 33, 3)).astype(np.float32)
-
-    def placed_for(*images):
-        objective = Pixels.of(np.stack(images), DATA, types_in(select(backend)))
-        return place_adaptive(objective, 60)
-
-    together = placed_for(*batch)
-    for name in ("mean", "factor"):
-        rows = getattr(together, name).numpy().T
-        for image, part in zip(batch, np.split(rows, 3), strict=True):
-            np.testing.assert_array_equal(part, getattr(placed_for(image), name).numpy().T)

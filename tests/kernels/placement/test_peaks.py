@@ -74,15 +74,3 @@ def test_peaks_are_those_of_a_plain_search(backend, height, width, channels, sha
     if count:
         np.testing.assert_array_equal(found.mean, mean[:count])
         np.testing.assert_allclose(found.color, color[:count], rtol=1e-4, atol=1e-5)
-
-
-def test_each_image_of_a_batch_has_its_own_peaks(backend):
-    """Those that it has alone, bit for bit: a neighbour in memory is no neighbour in space."""
-    missed = noise(3, 22, 17, 3)
-    missed[1] = 0
-    together = found_peaks(missed, 9, backend=backend)
-    for k, own in enumerate(missed):
-        alone = found_peaks(own, 9, backend=backend)
-        for name in ("mean", "color", "rank"):
-            one = getattr(together, name)[together.image == k]
-            np.testing.assert_array_equal(one, getattr(alone, name))

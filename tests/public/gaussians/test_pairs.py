@@ -50,7 +50,6 @@ producers = {
     "from_arrays": lambda: made,
     "fit": lambda: eg.fit(image, 20, iterations=2, space="rgb", backend="llvm").gaussians,
     "load": lambda: eg.Gaussians.load(folder / "a.npz", "llvm"),
-    "load .egs": lambda: eg.Gaussians.load(folder / "a.egs", "llvm"),
     "concatenate": lambda: eg.concatenate([made, other]),
     "slice": lambda: made[:9],
     "mask": lambda: made[np.arange(len(made)) % 2 == 0],
@@ -59,7 +58,6 @@ producers = {
     "bounded": made.bounded,
     "from_tensors": brighter,
     "encode": lambda: model.encode(image),
-    "pickle": lambda: pickle.loads(pickle.dumps(made)),
     "scatter": scattered,
 }
 
@@ -76,7 +74,6 @@ consumers = {
     "to_tensors": lambda g: {name: t.numpy() for name, t in eg.to_tensors(g).items()},
     "from_tensors": lambda g: eg.from_tensors(eg.to_tensors(g), like=g).to_arrays(),
     "render": lambda g: eg.render(g).numpy(),
-    "ravel": lambda g: dr.ravel(type(g.color)([eg.render(g).array] * 2), order="F").numpy(),
     "tile_lists": lambda g: eg.render(g, lists=eg.tile_lists(g)).numpy(),
     "gradients": derivatives,
     "to_arrays": lambda g: g.to_arrays(),
@@ -87,9 +84,7 @@ consumers = {
     "bounded": lambda g: g.bounded().to_arrays(),
     "pickle": pickle.dumps,
     "picture_of": eg.picture_of,
-    "repr": repr,
     "fit": lambda g: eg.fit(image, start=g, space=g.space, iterations=1),
-    "view": eg.view,
 }
 try:
     import mitsuba as mi
@@ -109,7 +104,6 @@ else:
     consumers["texture_of"] = texture
 
 # Not with each of them, as packing takes half a second.
-eg.pack(eg.concatenate([made, other]), folder / "a.egs", max_psnr_drop=60)
 eg.pack(scattered(), folder / "b.egs", max_psnr_drop=60)
 for producer, make in producers.items():
     for consumer, use in consumers.items():

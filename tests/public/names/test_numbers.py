@@ -60,8 +60,6 @@ def test_numbers_of_numpy_are_numbers(tmp_path):
     result = eg.fit(image, np.array([5, 20]), method=method, **numbers)
     np.testing.assert_array_equal(result.image, plain.image)
     json.dumps([result.iterations, result.gaussians.cutoff])
-    rows = eg.fit_many([image, image], tmp_path, gaussians=n(20), iterations=n(3))
-    assert [row.gaussians for row in rows] == [20, 20]
     assert eg.render(result, width=n(9), height=n(7), cutoff=np.float32(4)).shape == (7, 9, 3)
     with pytest.raises(TypeError, match="gaussians is 'many'; it must be a whole number"):
         eg.fit_many([image], tmp_path, gaussians="many")
