@@ -99,6 +99,7 @@ def test_maps_by_another_method():
     assert result.psnr_ycbcr > result.trace[0]["psnr_ycbcr"]
 
 
+@pytest.mark.slow
 def test_packing(tmp_path):
     result = eg.fit(images(), 4, iterations=60)
     before = figures(result)
