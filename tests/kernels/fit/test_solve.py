@@ -143,18 +143,6 @@ def test_warm_start_continues(backend):
     assert true_error(second, image) < true_error(first, image)
 
 
-@pytest.mark.parametrize("warm_start", [False, True])
-def test_a_background_that_is_given_stays(backend, warm_start):
-    scene, image, given = roomy(), noise(), np.array([0.2, 0.5, 0.6], np.float32)
-    found = solve(scene.on(backend), image, 40, background=given, warm_start=warm_start)
-    unit = scene._replace(color=np.eye(len(scene.mean)), background=np.zeros(len(scene.mean)))
-    columns = unit.exact(3.0).reshape(-1, len(scene.mean))
-    best = np.linalg.lstsq(columns, (image - given.astype(float)).reshape(-1, 3), rcond=None)[0]
-    arrays = found.to_arrays()
-    np.testing.assert_array_equal(arrays["background"], given)
-    np.testing.assert_allclose(arrays["color"], best, atol=1e-4)
-
-
 def test_sets_and_images_of_several_sizes_one_after_the_other(backend):
     """The program of a step is frozen: it must not be replayed for another size."""
     for count, size in (

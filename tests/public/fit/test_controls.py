@@ -109,16 +109,6 @@ def test_a_retreat_returns_where_the_error_has_risen(factor):
         assert after.speed == 0.4
 
 
-def test_rates_that_are_too_high_are_lowered():
-    """At default steps, half of what good rates gain is left, at least."""
-    image = eg.sample("astronaut")[100:148, 200:248]
-    good, high = (
-        eg.fit(image, 100, method=eg.DEFAULT.at_rates(factor)).psnr_ycbcr for factor in (1, 8)
-    )
-    start = eg.fit(image, 100, 0).psnr_ycbcr
-    assert high > start + 0.5 * (good - start)
-
-
 def test_each_image_of_a_batch_retreats_for_itself():
     """Images of a batch that diverges are fitted one by one: with the bits of single fits."""
     images = [PHOTO[:SIDE, :SIDE], np.full((SIDE, SIDE, 3), 0.3, np.float32)]

@@ -167,14 +167,6 @@ def test_the_image_is_left_alone(space):
     np.testing.assert_array_equal(found.image, expected.image)
 
 
-def test_a_cutoff_stays_with_its_set():
-    result = fit(picture(), iterations=10, method=replace(eg.DEFAULT, cutoff=4))
-    assert result.gaussians.cutoff == 4
-    shown = eg.render(result.gaussians).numpy()
-    np.testing.assert_array_equal(shown, result.image)
-    assert not np.array_equal(eg.render(result.gaussians, cutoff=3).numpy(), shown)
-
-
 # --- Mistakes -----------------------------------------------------------------------------------
 
 

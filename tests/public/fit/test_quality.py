@@ -5,7 +5,6 @@ from itertools import pairwise
 import pytest
 
 import eigengs_dr as eg
-from _helpers.command import said
 from _helpers.photos import coffee
 from _helpers.waves import METHODS
 
@@ -52,14 +51,6 @@ def test_fit(name):
     if "start" in options:
         options = options | {"start": eg.EigenGS.load(options["start"], "llvm")}
     check(image, eg.fit(image, **options, backend="llvm").image, *recorded)
-
-
-def test_grid(tmp_path):
-    eg.save_image(tmp_path / "face.png", photo("face"))
-    options = ["--gaussians", 300, "--iterations", 0, "--init", "grid", "--backend", "llvm"]
-    said("fit", tmp_path / "face.png", "-o", tmp_path / "face.npz", *options)
-    gaussians = eg.Gaussians.load(tmp_path / "face.npz", "llvm")
-    check(photo("face"), eg.picture_of(gaussians), 25.87, 32.08)
 
 
 def test_search():

@@ -86,23 +86,6 @@ consumers = {
     "picture_of": eg.picture_of,
     "fit": lambda g: eg.fit(image, start=g, space=g.space, iterations=1),
 }
-try:
-    import mitsuba as mi
-except ImportError:
-    pass
-else:
-    mi.set_variant("llvm_ad_rgb")
-    eg.register_plugins()
-    dr.set_thread_count(1)
-    from eigengs_dr.plugins import texture_of
-    from _helpers.texture import at
-
-    def texture(g):
-        look_up = mi.load_dict({**texture_of(g), "wrap_mode": "clamp"}).eval_3
-        return np.array(look_up(at(mi.Float(0.3, 0.6), mi.Float(0.2, 0.7))))
-
-    consumers["texture_of"] = texture
-
 # Not with each of them, as packing takes half a second.
 eg.pack(scattered(), folder / "b.egs", max_psnr_drop=60)
 for producer, make in producers.items():
