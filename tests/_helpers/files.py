@@ -61,3 +61,11 @@ def packed(values, bits):
     text = "".join(format(value, f"0{bits}b") for value in values)
     text += "0" * (-len(text) % 8)
     return bytes(int(text[k : k + 8], 2) for k in range(0, len(text), 8))
+
+
+def rewrite(path, **changed):
+    """Change arrays of an .npz file; None leaves one out."""
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {**file, **changed}
+    with path.open("wb") as file:
+        np.savez(file, **{key: value for key, value in arrays.items() if value is not None})
