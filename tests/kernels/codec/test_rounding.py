@@ -1,22 +1,26 @@
-"""Gaussians as integers."""
+"""Gaussians as integers, and the search of the largest step that an error allows."""
+
+import math
 
 import numpy as np
 import pytest
 from hypothesis import given
 
 from _helpers.log_shapes import factors_from_log_shapes
-from _helpers.packed import STEPS
 from _helpers.sets import few, scenes
 from eigengs_dr.codec import quantization as qz
+from eigengs_dr.codec import rounding
 from eigengs_dr.codec.quantization import MAX_SYMBOL, Quantizer, Steps, quantize
+from eigengs_dr.codec.rounding import Attempt, largest_within
 from eigengs_dr.gaussian.covariance import log_shapes
+
+STEPS = Steps(0.03125, 0.25)
 
 
 def test_shapes_of_extreme_splats():
     factor = np.array([[1e-4, 0, 4], [4, 0, 1e-4], [1, 0, 1], [1e-30, 0, 1e-30], [4, -4, 1e-4]])
-    np.testing.assert_allclose(
-        factors_from_log_shapes(log_shapes(factor)), factor, rtol=1e-6, atol=1e-9
-    )
+    found = factors_from_log_shapes(log_shapes(factor))
+    np.testing.assert_allclose(found, factor, rtol=1e-6, atol=1e-9)
 
 
 @few
@@ -55,3 +59,43 @@ def test_numbers_beyond_the_largest_are_refused():
             quantize({**shape, "mean": np.full((1, 2), mean)}, Steps(1.0, 1.0))
     edge = quantize({**shape, "mean": np.full((1, 2), MAX_SYMBOL - 1.0)}, Steps(1.0, 1.0))
     assert (edge.cell == MAX_SYMBOL - 1).all()
+
+
+def noisy_attempts(crossing, noise, seed):
+    """An attempt whose error crosses the limit somewhere, and what was tried."""
+    tried = {}
+
+    def attempt(octaves):
+        luck = np.random.default_rng((seed, len(tried))).normal()
+        tried[octaves] = 4 ** (octaves - crossing) * math.exp(noise * luck)
+        return Attempt(tried[octaves], None, 0.0)
+
+    return attempt, tried
+
+
+@pytest.mark.parametrize("crossing", [-7.3, -0.5, 0.0, 1.3, 3.99])
+def test_without_noise_the_search_ends_at_the_limit(crossing):
+    attempt, tried = noisy_attempts(crossing, 0, 0)
+    octaves, best = largest_within(attempt)
+    assert crossing - 0.2 < octaves <= crossing + 1e-9
+    assert best.excess == tried[octaves] >= rounding.ACCEPTED_SHARE
+    assert len(tried) <= 7 + abs(crossing)
+
+
+@pytest.mark.parametrize(("noise", "least"), [(0.02, 0.95), (0.15, 0.85), (0.5, 0.7)])
+def test_with_noise_it_never_exceeds_the_limit(noise, least):
+    used = []
+    for seed in range(60):
+        attempt, tried = noisy_attempts(0.4 * math.sin(seed), noise, seed)
+        octaves, best = largest_within(attempt)
+        assert best.excess == tried[octaves] <= 1
+        assert octaves == max(k for k, excess in tried.items() if excess <= 1)
+        assert len(tried) <= rounding.MAX_ATTEMPTS + 4
+        used.append(best.excess)
+    assert np.mean(used) > least
+
+
+def test_an_error_that_no_step_changes():
+    assert largest_within(lambda octaves: Attempt(1.5, None, 0.0)) is None
+    octaves, _ = largest_within(lambda octaves: Attempt(0.0, None, 0.0))
+    assert octaves == rounding.MAX_OCTAVES
