@@ -10,7 +10,6 @@ from eigengs_dr.codec.exact_math import angle_in_turns, cos_turns, exp2, log2, s
 from eigengs_dr.codec.gaussian_model import SECTORS, Directions, passes_of
 from eigengs_dr.codec.range_coder import (
     EVENNESS,
-    MAX_LEVELS,
     TAILS,
     Decoder,
     Encoder,
@@ -97,13 +96,6 @@ def test_the_curve_visits_every_point_by_single_steps(levels):
     assert sorted(places) == list(range(side * side))
     path = points[np.argsort(places)]
     assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
-
-
-@given(hnp.arrays(np.int64, (7, 2), elements=st.integers(0, (1 << MAX_LEVELS) - 1)))
-def test_places_on_the_largest_curve_are_one_for_each_point(points):
-    places = hilbert_encode(points, MAX_LEVELS)
-    assert (places >> 2 * MAX_LEVELS == 0).all()
-    assert len(np.unique(places)) == len(np.unique(points, axis=0))
 
 
 @pytest.mark.parametrize("largest", [1, 2, SECTORS - 1, SECTORS, SECTORS + 1, 1 << 20])

@@ -44,14 +44,6 @@ def test_rounding_moves_by_half_a_step(scene):
     assert (np.abs(amplitude - scene.color / unit) <= 0.5 + 1e-3).all()
 
 
-def test_colors_near_zero_vanish_in_the_dead_zone():
-    arrays = {"mean": np.ones((3, 2)), "factor": np.array([[1.0, 0, 1]] * 3)}
-    arrays["color"] = np.array([[0.55], [-0.55], [1.0]])
-    for zone, expected in ((0.0, [1, -1, 1]), (0.1, [0, 0, 1])):
-        found = quantize(arrays, Steps(1.0, 1.0), zone).color[:, 0]
-        np.testing.assert_array_equal(found, expected)
-
-
 def test_numbers_beyond_the_largest_are_refused():
     shape = {"factor": np.array([[1.0, 0, 1]]), "color": np.zeros((1, 1))}
     for mean in (1e9, -1e9, np.nan):

@@ -48,8 +48,9 @@ def test_round_trip(image):
 
 
 def test_refuses_what_would_be_misread():
-    with pytest.raises(ValueError, match="uint8"):
-        rgb_to_ycbcr(np.zeros((2, 2, 3), np.uint8))
+    for convert in (rgb_to_ycbcr, to_linear, to_coded):
+        with pytest.raises(ValueError, match="uint8; convert to float32"):
+            convert(np.zeros((2, 2, 3), np.uint8))
     for shape in ((), (2, 2), (2, 2, 4)):
         with pytest.raises(ValueError, match="shape"):
             rgb_to_ycbcr(np.zeros(shape))
@@ -75,13 +76,6 @@ def test_srgb_round_trip(values):
             result = back(there(values.astype(dtype)))
             assert result.dtype == dtype
             np.testing.assert_allclose(result, values, atol=precision)
-
-
-def test_srgb_refuses_bytes_and_keeps_nan():
-    for convert in (to_linear, to_coded):
-        with pytest.raises(ValueError, match="uint8; convert to float32"):
-            convert(np.zeros(3, np.uint8))
-        assert np.isnan(convert(np.array([np.nan, 1.0]))).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("convert", [to_linear, to_coded])

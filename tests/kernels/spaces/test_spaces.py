@@ -1,6 +1,5 @@
 """Spaces: from pixels to values and back, for NumPy and Dr.Jit by the same lines."""
 
-
 import drjit as dr
 import numpy as np
 import pytest
@@ -53,19 +52,6 @@ def test_a_texture_clamps_and_passes_derivatives_on(space):
         assert shown[2] <= 1
     dr.backward(dr.sum(shown))
     assert (np.abs(dr.grad(values).numpy()) > 0).all()
-
-
-def test_light_above_white_has_a_space_without_an_end():
-    spaces = {str(space): str(space.above_white) for space in SPACES}
-    assert spaces == {
-        "ycbcr": "log",
-        "rgb": "log",
-        "linear": "radiance",
-        "data": "data",
-        "radiance": "radiance",
-        "log": "log",
-        "normal": "normal",
-    }
 
 
 def test_units_are_those_of_the_values():

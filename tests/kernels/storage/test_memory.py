@@ -1,10 +1,10 @@
-"""The memory of this process, and what one file may take of it."""
+"""The memory of this process in a container."""
 
 import sys
 
 import pytest
 
-from eigengs_dr.storage.memory import ALWAYS, SETTING, TIMES_FILE, check_content, usable_memory
+from eigengs_dr.storage.memory import usable_memory
 
 GROUPS = {
     "version 2": ("0::/job/task", {"job/memory.max": 5000, "job/task/memory.max": "max"}),
@@ -34,17 +34,3 @@ def test_memory_of_a_container_is_that_of_its_group(tmp_path, name):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"{limit}\n")
     assert usable_memory(tmp_path) == 5000
-
-
-def test_a_file_may_take_as_much_as_its_size_makes_likely(tmp_path, monkeypatch):
-    path = tmp_path / "photo.png"
-    path.write_bytes(bytes(10_000))
-    check_content(path, ALWAYS)
-    with pytest.raises(ValueError, match=f"photo.png: takes 537 MB.*{SETTING}=513"):
-        check_content(path, ALWAYS + 1)
-    monkeypatch.setenv(SETTING, "513")
-    check_content(path, ALWAYS + 1)
-    monkeypatch.delenv(SETTING)
-    with path.open("wb") as file:
-        file.truncate(ALWAYS // 10)
-    check_content(path, TIMES_FILE * (ALWAYS // 10) // 10)

@@ -168,7 +168,10 @@ def test_progress_counts_every_image_and_an_interruption_leaves_no_thread(tmp_pa
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             eg.Eigenbasis.from_images(
-                source, SIZE, 2, progress=lambda *call: calls.append(call)  # noqa: B023
+                source,
+                SIZE,
+                2,
+                progress=lambda *call: calls.append(call),  # noqa: B023
             )
         assert calls == [(done, total, {}) for done in range(1, 13)]
 

@@ -35,22 +35,6 @@ def test_16_bits_of_a_png_keep_their_precision(tmp_path, kind, channels):
     np.testing.assert_allclose(eg.load_image(tmp_path / "a.png"), colors / 65535, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("mode", "channels"), [("1", 1), ("L", 1), ("I;16", 1), ("F", 1), ("P", 3), ("CMYK", 3)]
-)
-def test_grey_is_one_channel_or_three(tmp_path, mode, channels):
-    grey = np.array([[0, 255, 0], [255, 255, 0]], np.uint8)
-    image = {
-        "I;16": lambda: Image.fromarray(grey.astype(np.uint16) * 257),
-        "F": lambda: Image.fromarray(grey.astype(np.float32) / 255),
-    }.get(mode, lambda: Image.fromarray(grey).convert(mode))()
-    image.save(tmp_path / "a.tif")
-    result = eg.load_image(tmp_path / "a.tif")
-    np.testing.assert_array_equal(result, np.repeat(grey[..., None], 3, axis=2) / 255)
-    kept = eg.load_image(tmp_path / "a.tif", keep_grey=True)
-    np.testing.assert_array_equal(kept, result[..., :channels])
-
-
 def test_a_big_endian_pfm_file(tmp_path):
     light = 5000 * np.random.default_rng(0).random((5, 7, 3)).astype(np.float32)
     (tmp_path / "a.pfm").write_bytes(b"PF\n7 5\n1.0\n" + light[::-1].astype(">f4").tobytes())
@@ -69,35 +53,30 @@ def test_orientations_of_tiff_are_those_of_pillow(tmp_path, orientation):
     np.testing.assert_allclose(stored, values / 255, atol=1e-6)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".exr"])
-def test_opaque_alpha_is_no_news(tmp_path, suffix):
-    pixels = np.full((2, 3, 4), 0.5, np.float32)
-    path, ground = tmp_path / f"a{suffix}", 1 if suffix == ".png" else 0
-    for alpha in (0.5, 1):
-        pixels[..., 3] = alpha
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            if suffix == ".png":
-                Image.fromarray(np.rint(255 * pixels).astype(np.uint8)).save(path)
-                shown = alpha * 0.5 + (1 - alpha) * ground
-            else:
-                assert oiio.ImageBuf(pixels).write(str(path))
-                shown = 0.5  # premultiplied
-            image = eg.load_image(path)
-        np.testing.assert_allclose(image, shown, atol=0.005)
-        assert len(caught) == (alpha < 1)
+@pytest.mark.parametrize(("mode", "channels"), [("1", 1), ("L", 1), ("P", 3), ("RGBA", 3)])
+def test_grey_may_stay_one_channel_and_opaque_alpha_is_no_news(tmp_path, mode, channels):
+    grey = np.array([[0, 255, 0], [255, 255, 0]], np.uint8)
+    Image.fromarray(grey).convert(mode).save(tmp_path / "a.png")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        kept = eg.load_image(tmp_path / "a.png", keep_grey=True)
+    np.testing.assert_array_equal(kept, np.repeat(grey[..., None], channels, axis=2) / 255)
 
 
-def test_an_exr_file_of_one_channel_needs_keep_grey(tmp_path):
-    spec = oiio.ImageSpec(3, 2, 1, "float")
-    spec.channelnames = ("Z",)
-    file = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
-    assert file.open(str(tmp_path / "a.exr"), spec)
-    assert file.write_image(np.zeros((2, 3, 1), np.float32)) and file.close()
-    with pytest.raises(eg.ImageError, match="holds one channel, not R, G and B") as error:
-        eg.load_image(tmp_path / "a.exr")
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [("Z", "holds one channel, not R, G and B"), ("RGBXYZ", "holds the channels R, G, B, X, Y, Z")],
+)
+def test_exr_files_of_other_channels(tmp_path, names, words):
+    pixels = np.zeros((2, 3, len(names)), np.float32)
+    image, path = oiio.ImageBuf(pixels), tmp_path / "a.exr"
+    image.specmod().channelnames = tuple(names)
+    assert image.write(str(path))
+    with pytest.raises(eg.ImageError, match=words) as error:
+        eg.load_image(path)
     assert "a.exr" in one_line(error)
-    assert eg.load_image(tmp_path / "a.exr", keep_grey=True).shape == (2, 3, 1)
+    if names == "Z":
+        assert eg.load_image(path, keep_grey=True).shape == (2, 3, 1)
 
 
 # --- Names ---
@@ -120,14 +99,6 @@ def test_a_name_that_is_no_text(tmp_path):
     eg.save_image(tmp_path / "a.png", PIXELS)
     path = (tmp_path / "a.png").rename(tmp_path / os.fsdecode(b"\xff.png"))
     assert eg.load_image(path).shape == (6, 8, 3)
-
-
-def test_a_jpeg_with_stray_bytes_is_read(tmp_path):
-    pixels = np.full((16, 24, 3), 200, np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=100)
-    content = (tmp_path / "a.jpg").read_bytes()
-    (tmp_path / "a.jpg").write_bytes(content[:20] + b"\0\1\2" + content[20:])
-    np.testing.assert_allclose(eg.load_image(tmp_path / "a.jpg"), pixels / 255, atol=0.01)
 
 
 def test_samples_need_no_download():
@@ -212,9 +183,7 @@ def test_folders_take_images_by_their_names(tmp_path):
 # --- PIL images ---
 
 
-@pytest.mark.parametrize(
-    "mode", ["1", "L", "P", "PA", "RGB", "RGBX", "CMYK", "YCbCr", "HSV", "I;16", "F"]
-)
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "CMYK", "YCbCr", "HSV", "I;16", "F"])
 def test_a_pil_image_counts_by_its_mode(mode, tmp_path):
     if mode in ("I;16", "F"):
         pixels = PIXELS[..., 0].astype(np.uint16) * 257

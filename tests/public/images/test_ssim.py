@@ -9,7 +9,6 @@ from skimage.metrics import structural_similarity
 
 import eigengs_dr as eg
 from _helpers.arrays import upload_rows
-from _helpers.kernels import jit, launches
 
 SHAPES = [(11, 40, 3), (37, 19, 2), (64, 70, 1)]
 SMALL = [(1, 1, 3), (2, 9, 1), (5, 6, 1)]
@@ -101,21 +100,14 @@ def test_arrays_are_clamped_and_tensors_are_not(backend):
     assert eg.ssim(a, b) == pytest.approx(exact(a.clip(0, 1), b.clip(0, 1)), abs=1e-12)
 
 
-def test_one_picture_may_be_an_array(backend):
+def test_one_picture_may_be_an_array_or_of_another_precision(backend):
     a, b = pictures((30, 20, 3))
+    mixed = eg.ssim(tensor(backend, 32, a), tensor(backend, 64, b))
+    assert type(mixed) is getattr(dr, backend).ad.Float64
+    assert value_of(mixed) == pytest.approx(exact(np.float64(np.float32(a)), b), abs=1e-12)
     codes = np.rint(a * 255).astype(np.uint8)
     for pair in ((codes, tensor(backend, 32, b)), (tensor(backend, 32, b), codes)):
         assert value_of(eg.ssim(*pair)) == pytest.approx(exact(codes / 255, b), abs=2e-6)
-
-
-def test_the_finer_precision_counts(backend):
-    a, b = (tensor(backend, n, v) for n, v in zip((32, 64), pictures((16, 16, 1)), strict=True))
-    dr.enable_grad(a)
-    found = eg.ssim(a, b)
-    assert type(found) is getattr(dr, backend).ad.Float64
-    dr.backward(found)
-    assert type(dr.grad(a)) is type(a)
-    assert np.abs(dr.grad(a).numpy()).max() > 1e-4
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (12, 40), (45, 50), (176, 180)])
@@ -230,15 +222,6 @@ def test_derivatives_pass_on_and_add_up(backend):
     assert dr.grad(other)[0] == 6
 
 
-def test_a_picture_equals_itself(backend):
-    a = tensor(backend, 32, pictures((20, 20, 3))[0])
-    dr.enable_grad(a)
-    found = eg.ssim(a, a)
-    dr.backward(found)
-    assert value_of(found) == pytest.approx(1, abs=1e-6)
-    assert np.abs(dr.grad(a).numpy()).max() < 1e-4 / 1200
-
-
 def test_frozen_functions_follow_their_arguments(backend):
     @dr.freeze
     def step(a, b, weight):
@@ -259,22 +242,6 @@ def test_frozen_functions_follow_their_arguments(backend):
         assert value_of(found) == pytest.approx(value_of(expected), abs=1e-6)
         np.testing.assert_allclose(gradient.numpy(), dr.grad(leaf).numpy(), atol=1e-8)
     assert step.n_recordings == 2
-
-
-def test_one_program_serves_all_sizes(backend):
-    def run(shape):
-        a, b = (tensor(backend, 32, v) for v in pictures(shape))
-        dr.enable_grad(a)
-        dr.eval(dr.backward(eg.ssim(a, b)), dr.grad(a))
-
-    run((40, 30, 3))
-    with launches() as launched:
-        for shape in ((40, 30, 3), (31, 55, 1)):
-            run(shape)
-    hashes = [kernel.hash for kernel in jit(launched)]
-    half = len(hashes) // 2
-    assert half >= 4
-    assert hashes[:half] == hashes[half:]
 
 
 # --- Weights ---
