@@ -12,6 +12,14 @@ import eigengs_dr as eg
 
 IMAGE = np.random.default_rng(0).random((16, 16, 3), np.float32)
 
+EIGHT = {"size": (8, 8)}
+SET = eg.Gaussians.from_arrays(
+    [[4, 4], [9, 9]],
+    [[0.5, 0, 0.5], [0.4, 0, 0.3]],
+    [[1, 0, 0], [0.5, 0.1, 0.1]],
+    size=(16, 16),
+)
+
 BAD_VALUES = (
     None,
     5,
@@ -27,16 +35,6 @@ BAD_VALUES = (
     np.full((16, 16, 3), np.nan),
 )
 """Values that are neither a string, a path nor a set."""
-
-
-@pytest.fixture(scope="module")
-def gaussians():
-    return eg.Gaussians.from_arrays(
-        [[4, 4], [9, 9]],
-        [[0.5, 0, 0.5], [0.4, 0, 0.3]],
-        [[1, 0, 0], [0.5, 0.1, 0.1]],
-        size=(16, 16),
-    )
 
 
 def complaint(kind, function, *arguments, **options):
@@ -97,16 +95,46 @@ def test_an_argument_of_another_type_is_named_in_a_type_error(kind):
     assert checked
 
 
-@pytest.mark.parametrize("wrong", [None, 5, "x", [None], ["x"], {"a": 1}, object(), np.ones(3)])
-def test_what_is_no_list_of_sets(wrong):
-    assert complaint(TypeError, eg.concatenate, wrong).startswith("sets is ")
+TYPES = {
+    "sets is ": (eg.concatenate, [None, 5, "x", [None], ["x"], {"a": 1}, object(), np.ones(3)]),
+    "list of sets": (lambda wrong: eg.concatenate([SET, wrong]), [None, "x", [], {}]),
+    "maps": (
+        lambda wrong: eg.Gaussians.from_arrays([[4, 4]], [[1, 0, 1]], [[1]], maps=wrong, **EIGHT),
+        [None, 5, "x", [None], np.ones(3)],
+    ),
+    "tensors is ": (lambda wrong: eg.from_tensors(wrong, SET), [None, 5, "x", [SET]]),
+    "Dr.Jit tensor": (
+        lambda wrong: eg.from_tensors({"mean": wrong}, SET),
+        [None, 5, np.ones((2, 2)), SET.mean],
+    ),
+    "region is ": (
+        lambda wrong: eg.render(SET, region=wrong),
+        [5, "abc", (1.5, 2, 3, 4), [True, 0, 4, 4], object()],
+    ),
+    "tile_lists": (lambda wrong: eg.render(SET, lists=wrong), [[SET]]),
+    "sections": (
+        lambda wrong: eg.pack(SET, "never.egs", sections=wrong),
+        [5, [1.5, 1], ["1", "1"], [True, True]],
+    ),
+    "images is ": (eg.Eigenbasis.from_images, [None, 5, object()]),
+    " images is ": (eg.fit_many, [None, 5, object()]),
+    "judge is 'x'": (lambda wrong: eg.Loss(lambda picture, step: 0, judge=wrong), ["x"]),
+}
+"""What the error of a call says, the call, and values of another type."""
 
 
-def test_sets_in_a_list(gaussians):
-    for wrong in (None, "x", [], gaussians.to_arrays()):
-        assert "list of sets" in complaint(TypeError, eg.concatenate, [gaussians, wrong])
-    assert len(eg.concatenate((gaussians, gaussians))) == 4
+@pytest.mark.parametrize("words", TYPES)
+def test_values_of_another_type(words):
+    call, values = TYPES[words]
+    for wrong in values:
+        assert words.strip() in complaint(TypeError, call, wrong)
+
+
+def test_values_that_do_not_do():
     assert "no sets" in complaint(ValueError, eg.concatenate, [])
+    assert "'shake' is unknown" in complaint(ValueError, eg.DEFAULT.without, "shake")
+    complaint(ValueError, eg.DEFAULT.without, np.ones(3))
+    assert len(eg.concatenate((SET, SET))) == 4
 
 
 @pytest.mark.parametrize("name", ["mean", "factor", "color", "background"])
@@ -122,39 +150,6 @@ def test_arrays_of_a_set(name):
         assert message.startswith(f"Gaussians: {name} is ")
     for wrong in ([[1], [1, 2]], [], [[np.nan]], [np.inf]):
         complaint(ValueError, eg.Gaussians.from_arrays, **(good | {name: wrong}), **options)
-
-
-def test_maps_of_a_set():
-    arrays = [[4, 4]], [[1, 0, 1]], [[1]]
-    for wrong in (None, 5, "x", [None], np.ones(3)):
-        complaint(TypeError, eg.Gaussians.from_arrays, *arrays, size=(8, 8), maps=wrong)
-
-
-def test_tensors_of_a_set(gaussians):
-    for wrong in (None, 5, "x", [gaussians]):
-        assert complaint(TypeError, eg.from_tensors, wrong, gaussians).startswith("tensors is ")
-    for wrong in (None, 5, np.ones((2, 2)), gaussians.mean):
-        assert "Dr.Jit tensor" in complaint(TypeError, eg.from_tensors, {"mean": wrong}, gaussians)
-
-
-@pytest.mark.parametrize("region", [5, "abc", (1.5, 2, 3, 4), [True, 0, 4, 4], object()])
-def test_regions(gaussians, region):
-    assert "region is " in complaint(TypeError, eg.render, gaussians, region=region)
-
-
-def test_lists_of_another_type(gaussians):
-    assert "tile_lists" in complaint(TypeError, eg.render, gaussians, lists=[gaussians])
-
-
-def test_sections_are_whole_numbers(gaussians, tmp_path):
-    for wrong in (5, [1.5, 1], ["1", "1"], [True, True]):
-        complaint(TypeError, eg.pack, gaussians, tmp_path / "a.egs", sections=wrong)
-
-
-def test_images_of_a_family():
-    for wrong in (None, 5, object()):
-        assert complaint(TypeError, eg.Eigenbasis.from_images, wrong).startswith("images is ")
-        assert complaint(TypeError, eg.fit_many, wrong).startswith("images is ")
 
 
 @pytest.mark.parametrize("channels", [2, 4])
@@ -176,11 +171,6 @@ def test_a_limit_in_the_environment_that_is_no_number(text, tmp_path, monkeypatc
     assert eg.load_image(tmp_path / "a.png").shape == (16, 16, 3)
 
 
-def test_phases_of_a_method():
-    assert "'shake' is unknown" in complaint(ValueError, eg.DEFAULT.without, "shake")
-    complaint(ValueError, eg.DEFAULT.without, np.ones(3))
-
-
 def test_arrays_in_place_of_options_give_one_line():
     """NumPy prints them in many."""
     wrong = np.ones((16, 16, 3))
@@ -196,11 +186,7 @@ def test_steps_without_end_are_refused():
     assert "iterations" in complaint(ValueError, eg.fit, IMAGE, 5, iterations=10**12)
 
 
-def test_judges_are_functions():
-    assert "judge is 'x'" in complaint(TypeError, eg.Loss, lambda picture, step: 0, judge="x")
-
-
-def test_what_is_no_plugin_of_mitsuba(gaussians):
+def test_what_is_no_plugin_of_mitsuba():
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("llvm_ad_rgb")
     eg.register_plugins()
@@ -209,18 +195,18 @@ def test_what_is_no_plugin_of_mitsuba(gaussians):
         assert "sensor is " in complaint(TypeError, plugins.pixel_angle, wrong)
         assert "texture is " in complaint(TypeError, plugins.resident_bytes, wrong)
         for function in (plugins.gaussians_of, plugins.keep_in_bounds):
-            assert "parameters is " in complaint(TypeError, function, wrong, "a", gaussians)
+            assert "parameters is " in complaint(TypeError, function, wrong, "a", SET)
             assert "like is " in complaint(TypeError, function, {}, "a", wrong)
         for function in (plugins.texture_of, plugins.bake_environment):
             complaint(TypeError, function, wrong)
-    assert plugins.resident_bytes(mi.load_dict(plugins.texture_of(gaussians))) > 0
+    assert plugins.resident_bytes(mi.load_dict(plugins.texture_of(SET))) > 0
 
 
 ESCAPE = "a\x1b[31m\nb\u202e"
 """A name that would colour a terminal, break a line and turn what follows."""
 
 
-def test_control_characters_of_names_are_escaped(tmp_path, gaussians):
+def test_control_characters_of_names_are_escaped(tmp_path):
     image, damaged = tmp_path / f"{ESCAPE}.png", tmp_path / f"{ESCAPE}.npz"
     message = complaint(ValueError, eg.load_image, image)
     assert r"a\x1b[31m\nb\u202e.png: no such file" in message
