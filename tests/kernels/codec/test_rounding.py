@@ -74,19 +74,6 @@ def test_without_noise_the_search_ends_at_the_limit(crossing):
     assert len(tried) <= 7 + abs(crossing)
 
 
-@pytest.mark.parametrize(("noise", "least"), [(0.02, 0.95), (0.15, 0.85), (0.5, 0.7)])
-def test_with_noise_it_never_exceeds_the_limit(noise, least):
-    used = []
-    for seed in range(60):
-        attempt, tried = noisy_attempts(0.4 * math.sin(seed), noise, seed)
-        octaves, best = largest_within(attempt)
-        assert best.excess == tried[octaves] <= 1
-        assert octaves == max(k for k, excess in tried.items() if excess <= 1)
-        assert len(tried) <= rounding.MAX_ATTEMPTS + 4
-        used.append(best.excess)
-    assert np.mean(used) > least
-
-
 def test_an_error_that_no_step_changes():
     assert largest_within(lambda octaves: Attempt(1.5, None, 0.0)) is None
     octaves, _ = largest_within(lambda octaves: Attempt(0.0, None, 0.0))

@@ -15,7 +15,6 @@ from eigengs_dr.image.color import (
     to_coded,
     to_linear,
     to_log,
-    to_pu21,
 )
 from eigengs_dr.image.space import YCBCR
 
@@ -130,10 +129,3 @@ def test_logarithms_come_back(backend):
     assert (np.diff(to_log(LIGHT)) > 0).all()
     assert from_log(np.float32([-50])) > -0.0101  # light below 0 is bounded
     assert to_log(LIGHT.astype(np.float32)).dtype == np.float32
-
-
-def test_pu21_of_known_luminances():
-    """Values of the authors' program, for 0.005, 100 and 10,000 cd/m^2, divided by that of 100."""
-    codes = to_pu21(np.array([5e-5, 1, 100.0]))
-    np.testing.assert_allclose(256.38 * codes, [0, 256.38, 595.39], atol=0.1)
-    np.testing.assert_array_equal(to_pu21(np.array([-1, 0, 1e9])), codes[[0, 0, 2]])

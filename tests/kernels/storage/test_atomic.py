@@ -1,19 +1,16 @@
 """Files and folders that appear in one step, one writer for each, and what killed runs leave."""
 
-import errno
 import hashlib
 import os
 import secrets
 
 import pytest
 
-from _helpers.process import python_path, run_python
 from eigengs_dr.storage.atomic import (
     atomic_folder,
     atomic_write,
     lock_folder,
     lock_output,
-    remove_folder,
     remove_stale,
     require_writable,
 )
@@ -51,39 +48,6 @@ def test_readers_see_the_old_file_or_the_new_one(target):
         pass
 
 
-@pytest.mark.parametrize(
-    "error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")]
-)
-def test_a_block_that_fails_leaves_the_old_file(target, error):
-    """The system reports a full disk without a name; the error has it."""
-    with pytest.raises(type(error)) as found, atomic_write(target) as temporary:
-        temporary.write_text("half")
-        raise error
-    assert target.read_text() == "old" and names(target) == ["x.txt"]
-    if isinstance(error, OSError):
-        assert found.value.filename == str(target)
-        assert "No space left" in str(found.value)
-
-
-@pytest.mark.parametrize(
-    ("path", "message"),
-    [
-        ("{}", "is a folder; choose another path"),
-        ("/dev/null", "is a device; choose another path"),
-        ("s3://bucket/x.npz", "results cannot be written to URLs"),
-        ("{}/missing/x.npz", "No such file|cannot create a file in .*missing"),
-    ],
-)
-def test_what_cannot_be_written_is_named(tmp_path, path, message):
-    path = path.format(tmp_path)
-    with pytest.raises(OSError, match=message) as error, atomic_write(path):
-        pass
-    assert path in str(error.value)
-    with pytest.raises(OSError, match=f"{path}: .*({message})"):
-        require_writable(path)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such modes")
 @pytest.mark.parametrize("mode", [0o600, 0o664])
 def test_a_replaced_file_keeps_its_mode(target, mode):
@@ -92,49 +56,6 @@ def test_a_replaced_file_keeps_its_mode(target, mode):
         assert not temporary.stat().st_mode & 0o777 & ~(mode | 0o200)  # nor do others read it now
         temporary.write_text("new")
     assert target.stat().st_mode & 0o777 == mode and target.read_text() == "new"
-
-
-def test_a_folder_appears_whole_and_goes_whole(target):
-    folder = target.with_name("made")
-    link = target.with_name("link")
-    link.symlink_to(folder, target_is_directory=True)
-    with pytest.raises(ValueError, match="stop"), atomic_folder(link) as temporary:
-        (temporary / "a").touch()
-        raise ValueError("stop")
-    assert sorted(names(target)) == ["link", "x.txt"]
-    with atomic_folder(link) as temporary:
-        (temporary / "a").touch()
-        assert not folder.exists()
-    assert os.listdir(folder) == ["a"] and link.is_symlink()
-    remove_folder(folder)
-    assert sorted(names(target)) == ["link", "x.txt"]
-
-
-KILLED = """
-import os
-from pathlib import Path
-from eigengs_dr.storage.atomic import atomic_folder, atomic_write
-from eigengs_dr.storage.atomic import lock_output
-folder = Path({folder!r})
-with lock_output(folder / "y.txt"), atomic_folder(folder / "made") as made:
-    (made / "half").touch()
-    with atomic_write(folder / "y.txt") as temporary:
-        temporary.write_text("half")
-        os.kill(os.getpid(), 9)
-"""
-
-
-def test_what_killed_processes_left_goes_at_once(target):
-    """Not what is worked on, nor what is of somebody else."""
-    code = KILLED.format(folder=str(target.parent))
-    run_python(code, PYTHONPATH=python_path())
-    assert len([name for name in names(target) if name.startswith(".eigengs_dr-")]) == 5
-    target.with_name(".0123456789abcdef.npz").touch()
-    with atomic_write(target) as temporary, atomic_folder(target.with_name("made")) as made:
-        temporary.write_text("new")
-        remove_stale(target.parent)
-        assert temporary.exists() and made.exists()
-    assert sorted(names(target)) == [".0123456789abcdef.npz", "made", "x.txt"]
 
 
 @pytest.mark.parametrize("kind", ["folder", "file"])

@@ -98,8 +98,6 @@ def test_truncated_is_what_fewer_components_give():
     few = basis.truncated((5, 3, 100))
     assert [len(c) for c in few.components] == [len(e) for e in few.eigenvalues] == [5, 3, 12]
     np.testing.assert_array_equal(few.components[1], basis.components[1][:3])
-    np.testing.assert_array_equal(few.variance, basis.variance)
-    assert [len(c) for c in basis.truncated(0).components] == [0, 0, 0]
     for three in (np.int64(3), [3, 3, 3], np.array([3, 3, 3])):
         assert [len(c) for c in basis.truncated(three).components] == [3, 3, 3]
 
@@ -223,14 +221,6 @@ def test_what_is_no_family(source, complaint):
         eg.Eigenbasis.from_images(source, SIZE, 1)
 
 
-def test_folders_that_hold_no_images(tmp_path):
-    (tmp_path / "notes.txt").write_bytes(b"")
-    cases = {"": "holds no images", "notes.txt": "is a file", "nowhere": "No such file"}
-    for name, complaint in cases.items():
-        with refused(eg.ImageError, complaint):
-            eg.Eigenbasis.from_images(tmp_path / name, SIZE, 1)
-
-
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
@@ -288,14 +278,6 @@ def test_cropping_takes_the_centre_undistorted():
     np.testing.assert_allclose(resized(noise, 9, 7).transpose(1, 0, 2), turned, atol=1e-6)
     mirrored = resized(noise[:, ::-1], 10, 10)[:, ::-1]
     np.testing.assert_allclose(mirrored, resized(noise, 10, 10), atol=1e-5)
-
-
-def test_other_sizes_are_said_once():
-    images = [*family(3), *family(2, size=(20, 9)), *family(1, size=(3, 2))]
-    with pytest.warns(UserWarning) as caught:
-        eg.Eigenbasis.from_images(images, SIZE, 1)
-    texts = [str(warning.message) for warning in caught]
-    assert texts == ["3 of 6 images were centre-cropped and resized to 14x11"]
 
 
 # --- Projecting ---

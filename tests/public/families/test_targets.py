@@ -119,14 +119,6 @@ def test_an_image_of_a_subspace_needs_no_more(backend):
     assert [len(w) for w in model.project(shown(model, (only[1],) * 3), 55)] == [0, 0, 0]
 
 
-def test_a_bound_with_a_dense_mean(backend):
-    model, image = small_model(backend), OTHERS[0]
-    left = eg.render(model.encode(image, "projected", "dense", target_psnr=24)).numpy()
-    planes = np.moveaxis(rgb2ycbcr(left.astype(np.float64)) / 255, 2, 0) + model.mean_image
-    error = planes - np.moveaxis(rgb2ycbcr(image.astype(np.float64)) / 255, 2, 0)
-    assert -10 * np.log10(np.square(error).mean()) >= 24 - 1e-3
-
-
 def test_wrong_or_unmet_bounds(backend):
     model = small_model(backend)
     with pytest.raises(ValueError, match="colors 'projected'"):

@@ -61,21 +61,6 @@ def test_a_checkpoint_of_deep_json_is_begun_anew_with_a_word(photos, tmp_path, d
     assert os.listdir(tmp_path) == ["m.npz"]
 
 
-def test_a_checkpoint_without_its_head_is_begun_anew_with_a_word(photos, tmp_path):
-    photo, out = eg.load_image(photos / "p0.png"), tmp_path / "large.npz"
-    few = {"gaussians": 4, "iterations": 1}
-
-    def stop(done, total, row):
-        if row.status == "fit":
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        eg.fit_large(photo, out, progress=stop, **few)
-    (tmp_path / "large.npz.checkpoint" / "run.json").write_bytes(b"\0")
-    with pytest.warns(UserWarning, match=r"large.npz.checkpoint: run.json is unreadable"):
-        assert eg.fit_large(photo, out, **few).resumed == 0
-
-
 def test_a_scheduler_file_of_deep_json_is_refused(photos, tmp_path, deep):
     (tmp_path / "s.json").write_text(deep)
     command = ("fit", photos, "-o", tmp_path / "out", "--cluster", tmp_path / "s.json")
@@ -125,6 +110,22 @@ def test_a_full_disk_is_told_by_the_name_of_the_output(full, limit):
         assert str(folder / name) in error and "\n" not in error
         assert names in ([], results.get(name) if limit == "300" else [])
     assert set(said) == {*OUTPUTS, "sets"}
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("{}", "is a folder; choose another path"),
+        ("/dev/null", "is a device; choose another path"),
+        ("{}/missing/x.npz", "No such file|cannot create a file in .*missing"),
+    ],
+)
+def test_what_cannot_be_written_is_named(tmp_path, path, words):
+    path = path.format(tmp_path)
+    with pytest.raises((OSError, ValueError), match=words) as error:
+        eg.EigenGS.load("natural").save(path)
+    assert path in str(error.value)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such modes")
