@@ -1,4 +1,4 @@
-"""Integers, cells and directions as bits of a range coder; exact arithmetic."""
+"""Integers as bits of a range coder; the curve through cells; exact arithmetic."""
 
 import numpy as np
 import pytest
@@ -7,15 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from eigengs_dr.codec.exact_math import angle_in_turns, cos_turns, exp2, log2, sin_turns
-from eigengs_dr.codec.gaussian_model import SECTORS, Directions, passes_of
 from eigengs_dr.codec.range_coder import (
-    EVENNESS,
     TAILS,
     Decoder,
     Encoder,
-    code_cells,
     hilbert_encode,
-    morton_encode,
 )
 
 # --- Numbers ---
@@ -45,11 +41,6 @@ def test_numbers_come_back_whatever_was_expected(values, center, width, tails):
     coded("numbers", np.full(len(values), center), np.full(len(values), width), tails, values)
 
 
-def test_every_integer_may_have_its_own_size():
-    sizes = np.array([1, 2, 1 << 20, 1, 7, 1 << 16])
-    coded("uniform", sizes, np.array([0, 1, 12345, 0, 6, 65535]))
-
-
 @pytest.mark.parametrize("tails", TAILS)
 @pytest.mark.parametrize("width", [0.3, 300.0])
 def test_numbers_come_close_to_their_entropy(tails, width):
@@ -63,29 +54,7 @@ def test_numbers_come_close_to_their_entropy(tails, width):
     assert 8 * len(data) / 20000 < 1.03 * least + 0.1 + (width > 100)
 
 
-# --- Cells and directions ---
-
-
-def coded_cells(cells, *arguments):
-    """Code cells, which come back in the order of `morton_encode`."""
-    encoder = Encoder()
-    code_cells(encoder, cells, *arguments)
-    found = code_cells(Decoder(encoder.to_bytes()), np.zeros_like(cells), *arguments)
-    order = np.argsort(morton_encode(cells, arguments[0]), kind="stable")
-    np.testing.assert_array_equal(found, cells[order])
-
-
-@given(
-    hnp.arrays(np.int64, st.tuples(st.integers(1, 60), st.just(2)), elements=st.integers(0, 15)),
-    st.sampled_from(EVENNESS),
-    st.sampled_from([4, 24]),
-)
-def test_cells_come_back(cells, evenness, levels):
-    coded_cells(cells, levels, evenness)
-
-
-def test_many_gaussians_in_one_cell():
-    coded_cells(np.full((1 << 21, 2), 3), 3, 1)
+# --- The curve through cells ---
 
 
 @pytest.mark.parametrize("levels", [0, 1, 5])
@@ -96,20 +65,6 @@ def test_the_curve_visits_every_point_by_single_steps(levels):
     assert sorted(places) == list(range(side * side))
     path = points[np.argsort(places)]
     assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
-
-
-@pytest.mark.parametrize("largest", [1, 2, SECTORS - 1, SECTORS, SECTORS + 1, 1 << 20])
-def test_directions_come_back(largest):
-    generator = np.random.default_rng(largest)
-    turns = generator.integers(1, largest + 1, 300)
-    turn, length = generator.integers(0, turns), generator.uniform(0, 3, 300)
-    passes = passes_of(np.arange(600).reshape(-1, 2))
-    encoder = Encoder()
-    sharpness = Directions(passes, length, turns).fit(turn)
-    Directions(passes, length, turns).code(encoder, sharpness, turn)
-    decoder = Decoder(encoder.to_bytes())
-    found = Directions(passes, length, turns).code(decoder, sharpness, np.zeros_like(turn))
-    np.testing.assert_array_equal(found, turn)
 
 
 # --- Exact arithmetic ---

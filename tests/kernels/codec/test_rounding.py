@@ -1,6 +1,4 @@
-"""Gaussians as integers, and the search of the largest step that an error allows."""
-
-import math
+"""Gaussians as integers."""
 
 import numpy as np
 import pytest
@@ -9,9 +7,7 @@ from hypothesis import given
 from _helpers.log_shapes import factors_from_log_shapes
 from _helpers.sets import few, scenes
 from eigengs_dr.codec import quantization as qz
-from eigengs_dr.codec import rounding
 from eigengs_dr.codec.quantization import MAX_SYMBOL, Quantizer, Steps, quantize
-from eigengs_dr.codec.rounding import Attempt, largest_within
 from eigengs_dr.gaussian.covariance import log_shapes
 
 STEPS = Steps(0.03125, 0.25)
@@ -51,30 +47,3 @@ def test_numbers_beyond_the_largest_are_refused():
             quantize({**shape, "mean": np.full((1, 2), mean)}, Steps(1.0, 1.0))
     edge = quantize({**shape, "mean": np.full((1, 2), MAX_SYMBOL - 1.0)}, Steps(1.0, 1.0))
     assert (edge.cell == MAX_SYMBOL - 1).all()
-
-
-def noisy_attempts(crossing, noise, seed):
-    """An attempt whose error crosses the limit somewhere, and what was tried."""
-    tried = {}
-
-    def attempt(octaves):
-        luck = np.random.default_rng((seed, len(tried))).normal()
-        tried[octaves] = 4 ** (octaves - crossing) * math.exp(noise * luck)
-        return Attempt(tried[octaves], None, 0.0)
-
-    return attempt, tried
-
-
-@pytest.mark.parametrize("crossing", [-7.3, -0.5, 0.0, 1.3, 3.99])
-def test_without_noise_the_search_ends_at_the_limit(crossing):
-    attempt, tried = noisy_attempts(crossing, 0, 0)
-    octaves, best = largest_within(attempt)
-    assert crossing - 0.2 < octaves <= crossing + 1e-9
-    assert best.excess == tried[octaves] >= rounding.ACCEPTED_SHARE
-    assert len(tried) <= 7 + abs(crossing)
-
-
-def test_an_error_that_no_step_changes():
-    assert largest_within(lambda octaves: Attempt(1.5, None, 0.0)) is None
-    octaves, _ = largest_within(lambda octaves: Attempt(0.0, None, 0.0))
-    assert octaves == rounding.MAX_OCTAVES

@@ -58,17 +58,6 @@ def test_solve_is_least_squares(backend):
     np.testing.assert_allclose(left, least, rtol=1e-3)
 
 
-def test_error_is_that_of_the_rendering(backend):
-    scene = random_scene(7)
-    equations = NormalEquations(scene.on(backend))
-    coefficients = np.random.default_rng(0).normal(size=(COUNT + 1, 3))
-    rendered = (weight_matrix(scene.on(backend)).T @ coefficients[:-1] + coefficients[-1]).T
-    error = np.square(rendered - images().reshape(3, -1)).sum(axis=1)
-    squares = np.square(images(), dtype=np.float64).sum(axis=(1, 2))
-    found = equations.error(coefficients, equations.correlate(images()), squares)
-    np.testing.assert_allclose(found, error, rtol=1e-4)
-
-
 def test_blocks_fit_what_is_left(backend):
     """First splats fit the image alone, with the background; the others the difference."""
     scene, low = random_scene(8), 9
@@ -90,14 +79,3 @@ def test_a_matrix_too_large_is_refused(backend):
     scene = random_scene(size=(4096, 4096))._replace(factor=np.tile([1e-5, 0, 1e-5], (COUNT, 1)))
     with pytest.raises(ValueError, match="cover 402,653,184 pixels in total, the limit is"):
         NormalEquations(scene.on(backend))
-
-
-def test_many_planes_at_once(backend):
-    """Sparse products, and back-substitutions in threads, give what single ones give."""
-    equations = NormalEquations(random_scene(3).on(backend), 4)
-    planes = images(17)
-    together = equations.correlate(planes)
-    alone = np.hstack([equations.correlate(plane[None]) for plane in planes])
-    np.testing.assert_allclose(together, alone, rtol=1e-6, atol=1e-6)
-    solved = np.hstack([equations.solve(alone[:, k : k + 1]) for k in range(17)])
-    np.testing.assert_allclose(equations.solve(together), solved, atol=1e-5)

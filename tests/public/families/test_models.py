@@ -51,19 +51,6 @@ def test_components_are_rendered(backend, split):
         assert np.square(shown - wanted).sum() < share * np.square(wanted).sum()
 
 
-def test_psnr_components_is_the_weighted_error(backend):
-    model, basis = small_model(backend), small_basis()
-    error = 0.0
-    for c, values in enumerate(basis.eigenvalues):
-        weights, arrays = model.weights[c], model.gaussians.to_arrays()
-        arrays |= {"color": weights[:, :-1].T, "background": weights[:, -1]}
-        found = eg.Gaussians.from_arrays(**arrays, size=(SIDE, SIDE), space="data", backend=backend)
-        planes = np.moveaxis(eg.render(found).numpy(), 2, 0)
-        error += values @ np.square(planes - basis.components[c]).sum(axis=(1, 2))
-    expected = -10 * np.log10(error / basis.mean.size)
-    assert model.figures["psnr_components"] == pytest.approx(expected, abs=0.05)
-
-
 def test_split_keeps_sides_apart(backend):
     model = small_model(backend, split=True)
     low, first = model.low, model.low_components
