@@ -7,7 +7,6 @@ import pytest
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, files_of
 from _helpers.process import run_python
-from _helpers.sets import check_equal
 from eigengs_dr.many.manifest import KEYS, NAME, list_sources, read_manifest
 from eigengs_dr.storage.atomic import lock_folder
 

@@ -88,7 +88,6 @@ def test_srgb_in_drjit_equals_numpy(backend, convert):
         (module.Float64(values), 1e-12),
         (module.Float(single), 2e-6),
         (module.TensorXf(single.reshape(2, 4, 3)), 2e-6),
-        (module.Array3f(single.reshape(3, 8)), 2e-6),
     ):
         result = convert(array)
         assert type(result) is type(array)

@@ -134,7 +134,6 @@ def test_values_that_do_not_do():
     assert "no sets" in complaint(ValueError, eg.concatenate, [])
     assert "'shake' is unknown" in complaint(ValueError, eg.DEFAULT.without, "shake")
     complaint(ValueError, eg.DEFAULT.without, np.ones(3))
-    assert len(eg.concatenate((SET, SET))) == 4
 
 
 @pytest.mark.parametrize("name", ["mean", "factor", "color", "background"])
