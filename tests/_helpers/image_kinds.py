@@ -104,10 +104,12 @@ def write_netpbm(path, white):
     return values / white
 
 
-def write_hdr(path, old=b"", new=b"", shown=LEVELS):
-    """A Radiance file in which bytes of the header are others."""
+def write_hdr(path, old, new, shown):
+    """A Radiance file in which bytes of the header are others, or of which primaries are named."""
     write_openimageio(path, LEVELS.astype(np.float32))
     content = path.read_bytes()
+    if new and not old:
+        old, new = b"\n\n", b"\nPRIMARIES= " + new + b"\n\n"
     assert old in content
     path.write_bytes(content.replace(old, new, 1))
     return shown
@@ -139,136 +141,131 @@ def wider(image):
 
 
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-SEPARATE = {"pixels": np.moveaxis(RGB, 2, 0), "photometric": "rgb", "planarconfig": "separate"}
-INKS = np.concatenate([255 - RGB, np.full((H, W, 1), 51, np.uint8)], axis=2)
 TABLE = np.ascontiguousarray(PALETTE.T.astype(np.uint16) * 257)
-FLOATS = {"pixels": GREY.astype(np.float32), "shown": None}
-REFUSED = {"shown": None}
-PRIMARIES = b"\nPRIMARIES= "
-P3 = PRIMARIES + b".68 .32 .265 .69 1.5e-1 .06 .3127 .329\n\n"
-ACES = (0.7347, 0.2653, 0, 1, 0.0001, -0.077, 0.32168, 0.33767)
+INKS = np.concatenate([255 - RGB, np.full((H, W, 1), 51, np.uint8)], axis=2)
+PLANES = np.moveaxis(RGB, 2, 0)
+UPRIGHT = [(274, "H", 1, 6, True)]
+"""A tag of TIFF: the left side is the top."""
 
-TIFFS = {
-    "grey": partial(write_tiff, pixels=GREY, shown=GREY / 255),
-    "RGB": partial(write_tiff, photometric="rgb"),
-    "white is 0": partial(
-        write_tiff, pixels=255 - GREY, shown=GREY / 255, photometric="miniswhite"
-    ),
-    "palette": partial(
-        write_tiff, pixels=GREY, shown=COLORS, photometric="palette", colormap=TABLE
-    ),
-    "CMYK": partial(write_tiff, pixels=INKS, shown=0.8 * LEVELS, photometric="separated"),
-    "YCbCr": partial(write_pillow, mode="YCbCr"),
-    "tiles": partial(write_tiff, photometric="rgb", tile=(16, 16), compression="zlib"),
-    "LZW": partial(write_openimageio, pixels=RGB, compression="lzw"),
-    "PACKBITS": partial(write_openimageio, pixels=RGB, compression="packbits"),
-    "JPEG": partial(write_pillow, compression="jpeg", quality=100),
-    "Zstandard": partial(write_pillow, compression="zstd"),
-    "fax": partial(write_pillow, mode="1", compression="group4"),
-    "channels in planes": partial(write_tiff, **SEPARATE),
-    "orientation": partial(
-        write_tiff, shown=TURNED, photometric="rgb", extratags=[(274, "H", 1, 6, True)]
-    ),
-    "alpha": partial(write_alpha, kind="unassalpha"),
-    "associated alpha": partial(write_alpha, kind="assocalpha"),
-    "a fourth band": partial(write_alpha, kind="unspecified", shown=LEVELS),
-    "several pages": write_frames,
-    "a profile of sRGB": partial(write_pillow, icc_profile=SRGB),
-    "a profile that is not sRGB": partial(write_pillow, icc_profile=other_profile()),
-    "white is 0, floats": partial(write_tiff, photometric="miniswhite", **FLOATS),
-    "CMYK, floats": partial(
-        write_tiff, pixels=INKS.astype(np.float32), photometric="separated", **REFUSED
-    ),
-    "CIELab": partial(write_tiff, photometric="cielab", **REFUSED),
-    "YCbCr, 16 bits": partial(
-        write_tiff, pixels=RGB.astype(np.uint16), photometric="ycbcr", subsampling=(1, 1), **REFUSED
-    ),
-    "signed, 16 bits": partial(
-        write_tiff, pixels=GREY.astype(np.int16), photometric="minisblack", **REFUSED
-    ),
-    "integers, 64 bits": partial(
-        write_tiff, pixels=GREY.astype(np.uint64), photometric="minisblack", **REFUSED
-    ),
+
+def tiff_kinds():
+    """Kinds of TIFF that tifffile writes: pixels, the picture, and options."""
+    color = {"photometric": "rgb"}
+    palette = {"photometric": "palette", "colormap": TABLE}
+    return {
+        "grey": (GREY, GREY / 255, {}),
+        "RGB": (RGB, LEVELS, color),
+        "white is 0": (255 - GREY, GREY / 255, {"photometric": "miniswhite"}),
+        "palette": (GREY, COLORS, palette),
+        "CMYK": (INKS, 0.8 * LEVELS, {"photometric": "separated"}),
+        "tiles": (RGB, LEVELS, color | {"tile": (16, 16), "compression": "zlib"}),
+        "channels in planes": (PLANES, LEVELS, color | {"planarconfig": "separate"}),
+        "orientation": (RGB, TURNED, color | {"extratags": UPRIGHT}),
+        "white is 0, floats": (GREY.astype("f4"), None, {"photometric": "miniswhite"}),
+        "CMYK, floats": (INKS.astype("f4"), None, {"photometric": "separated"}),
+        "CIELab": (RGB, None, {"photometric": "cielab"}),
+        "YCbCr, 16 bits": (RGB.astype("u2"), None, {"photometric": "ycbcr", "subsampling": (1, 1)}),
+        "signed, 16 bits": (GREY.astype("i2"), None, {"photometric": "minisblack"}),
+        "integers, 64 bits": (GREY.astype("u8"), None, {"photometric": "minisblack"}),
+    }
+
+
+def other_tiff_kinds():
+    return {
+        "YCbCr": partial(write_pillow, mode="YCbCr"),
+        "LZW": partial(write_openimageio, pixels=RGB, compression="lzw"),
+        "PACKBITS": partial(write_openimageio, pixels=RGB, compression="packbits"),
+        "JPEG": partial(write_pillow, compression="jpeg", quality=100),
+        "Zstandard": partial(write_pillow, compression="zstd"),
+        "fax": partial(write_pillow, mode="1", compression="group4"),
+        "alpha": partial(write_alpha, kind="unassalpha"),
+        "associated alpha": partial(write_alpha, kind="assocalpha"),
+        "a fourth band": partial(write_alpha, kind="unspecified", shown=LEVELS),
+        "several pages": write_frames,
+        "a profile of sRGB": partial(write_pillow, icc_profile=SRGB),
+        "a profile that is not sRGB": partial(write_pillow, icc_profile=other_profile()),
+    }
+
+
+def png_kinds():
+    modes = {"1": "1 bit", **{mode: f"{mode}, 8 bits" for mode in ("L", "P", "RGB", "LA", "RGBA")}}
+    gamma = {"name": b"gAMA", "data": (100_000).to_bytes(4, "big")}
+    return {
+        **{what: partial(write_pillow, mode=mode) for mode, what in modes.items()},
+        "orientation": partial(write_pillow, exif=exif(6), shown=TURNED),
+        "a transparent entry of a palette": write_key,
+        "a transparent value": partial(write_key, mode="L"),
+        "a gamma that is not that of sRGB": partial(write_chunk, **gamma),
+        "HDR (cICP)": partial(write_chunk, name=b"cICP", data=bytes([9, 16, 0, 1])),
+        "animated": write_frames,
+    }
+
+
+FORMATS = {
+    "JPEG": (".jpg", {"quality": 100, "subsampling": 0}),
+    "WebP": (".webp", {"lossless": True}),
+    "AVIF": (".avif", {"quality": 100, "subsampling": "4:4:4"}),
+    "BMP": (".bmp", {}),
+    "TGA": (".tga", {}),
+    "JPEG 2000": (".jp2", {}),
 }
-PNGS = {
-    "1 bit": partial(write_pillow, mode="1"),
-    "L, 8 bits": partial(write_pillow, mode="L"),
-    "P, 8 bits": partial(write_pillow, mode="P"),
-    "RGB, 8 bits": write_pillow,
-    "LA, 8 bits": partial(write_pillow, mode="LA"),
-    "RGBA, 8 bits": partial(write_pillow, mode="RGBA"),
-    "orientation": partial(write_pillow, exif=exif(6), shown=TURNED),
-    "a transparent entry of a palette": write_key,
-    "a transparent value": partial(write_key, mode="L"),
-    "a gamma that is not that of sRGB": partial(
-        write_chunk, name=b"gAMA", data=(100_000).to_bytes(4, "big")
-    ),
-    "HDR (cICP)": partial(write_chunk, name=b"cICP", data=bytes([9, 16, 0, 1])),
-    "animated": write_frames,
+"""Other formats that Pillow writes: suffixes, and options."""
+
+
+def other_kinds():
+    for kind, (suffix, options) in FORMATS.items():
+        yield kind, "RGB", suffix, partial(write_pillow, **options)
+    suffix, options = FORMATS["JPEG"]
+    sides = {"exif": b"Exif\0\0" + exif(6), "shown": TURNED}
+    profile = {"icc_profile": other_profile()}
+    yield "JPEG", "CMYK", suffix, partial(write_pillow, mode="CMYK", **options)
+    yield "JPEG", "orientation", suffix, partial(write_pillow, **sides, **options)
+    yield "JPEG", "a profile that is not sRGB", suffix, partial(write_pillow, **profile, **options)
+    yield "WebP", "RGBA", ".webp", partial(write_pillow, mode="RGBA", lossless=True)
+    yield "GIF", "grey", ".gif", partial(write_pillow, mode="L")
+    yield "GIF", "a transparent entry", ".gif", write_key
+    yield "GIF", "animated", ".gif", write_frames
+    yield "PGM, PPM", "RGB, white is 1023", ".ppm", partial(write_netpbm, white=1023)
+
+
+RADIANCE = {
+    "RGB": (b"", b"", LEVELS),
+    "order +Y, -X": (b"-Y 6 +X 8", b"+Y 6 -X 8", LEVELS[::-1, ::-1]),
+    "order +X, -Y": (b"-Y 6 +X 8", b"+X 6 -Y 8", LEVELS.swapaxes(0, 1)),
+    "primaries of Radiance": (b"", b".640 .330 .290 .600 .150 .060 .3333 .3333", LEVELS),
+    "other primaries": (b"", b".68 .32 .265 .69 1.5e-1 .06 .3127 .329", LEVELS),
+    "XYZ": (b"rle_rgbe", b"rle_xyze", None),
 }
-JPEG = {"quality": 100, "subsampling": 0}
-AVIF = {"quality": 100, "subsampling": "4:4:4"}
-OTHERS = [
-    ("JPEG", "RGB", ".jpg", partial(write_pillow, **JPEG)),
-    ("JPEG", "CMYK", ".jpg", partial(write_pillow, mode="CMYK", **JPEG)),
-    (
-        *("JPEG", "orientation", ".jpg"),
-        partial(write_pillow, exif=b"Exif\0\0" + exif(6), shown=TURNED, **JPEG),
-    ),
-    (
-        *("JPEG", "a profile that is not sRGB", ".jpg"),
-        partial(write_pillow, icc_profile=other_profile(), **JPEG),
-    ),
-    ("WebP", "RGB", ".webp", partial(write_pillow, lossless=True)),
-    ("WebP", "RGBA", ".webp", partial(write_pillow, mode="RGBA", lossless=True)),
-    ("AVIF", "RGB", ".avif", partial(write_pillow, **AVIF)),
-    ("BMP", "RGB", ".bmp", write_pillow),
-    ("TGA", "RGB", ".tga", write_pillow),
-    ("GIF", "grey", ".gif", partial(write_pillow, mode="L")),
-    ("GIF", "a transparent entry", ".gif", write_key),
-    ("GIF", "animated", ".gif", write_frames),
-    ("JPEG 2000", "RGB", ".jp2", write_pillow),
-    ("PGM, PPM", "RGB, white is 1023", ".ppm", partial(write_netpbm, white=1023)),
-    ("Radiance HDR", "RGB", ".hdr", write_hdr),
-    (
-        *("Radiance HDR", "order +Y, -X", ".hdr"),
-        partial(write_hdr, old=b"-Y 6 +X 8", new=b"+Y 6 -X 8", shown=LEVELS[::-1, ::-1]),
-    ),
-    (
-        *("Radiance HDR", "order +X, -Y", ".hdr"),
-        partial(write_hdr, old=b"-Y 6 +X 8", new=b"+X 6 -Y 8", shown=LEVELS.swapaxes(0, 1)),
-    ),
-    (
-        *("Radiance HDR", "primaries of Radiance", ".hdr"),
-        partial(
-            write_hdr, old=b"\n\n", new=PRIMARIES + b".640 .330 .290 .600 .150 .060 .3333 .3333\n\n"
-        ),
-    ),
-    ("Radiance HDR", "other primaries", ".hdr", partial(write_hdr, old=b"\n\n", new=P3)),
-    (
-        "Radiance HDR",
-        "XYZ",
-        ".hdr",
-        partial(write_hdr, old=b"rle_rgbe", new=b"rle_xyze", shown=None),
-    ),
-    ("EXR", "RGB", ".exr", write_exr),
-    ("EXR", "RGBA", ".exr", partial(write_exr, names="RGBA")),
-    ("EXR", "other channels", ".exr", partial(write_exr, shown=None, names="XYZ")),
-    (
-        *("EXR", "a smaller data window", ".exr"),
-        partial(write_exr, shown=wider(LEVELS), origin=(2, 1), window=(12, 9)),
-    ),
-    (
-        *("EXR", "a larger data window", ".exr"),
-        partial(write_exr, shown=LEVELS[:4, :5], window=(5, 4)),
-    ),
-    (
-        *("EXR", "primaries that are not those of sRGB", ".exr"),
-        partial(write_exr, chromaticities=ACES),
-    ),
-]
-KINDS = [
-    *(Kind("TIFF", what, ".tif", write) for what, write in TIFFS.items()),
-    *(Kind("PNG", what, ".png", write) for what, write in PNGS.items()),
-    *(Kind(*kind) for kind in OTHERS),
-]
+"""Kinds of Radiance files: bytes of the header, others or primaries in their place, the picture."""
+
+
+EXRS = {
+    "RGB": {},
+    "RGBA": {"names": "RGBA"},
+    "other channels": {"names": "XYZ", "shown": None},
+    "a smaller data window": {"shown": wider(LEVELS), "origin": (2, 1), "window": (12, 9)},
+    "a larger data window": {"shown": LEVELS[:4, :5], "window": (5, 4)},
+    "primaries that are not those of sRGB": {
+        "chromaticities": (0.7347, 0.2653, 0, 1, 0.0001, -0.077, 0.32168, 0.33767)
+    },
+}
+
+
+def all_kinds():
+    for what, (pixels, shown, options) in tiff_kinds().items():
+        write = partial(write_tiff, pixels=pixels, shown=shown, **options)
+        yield Kind("TIFF", what, ".tif", write)
+    for what, write in other_tiff_kinds().items():
+        yield Kind("TIFF", what, ".tif", write)
+    for what, write in png_kinds().items():
+        yield Kind("PNG", what, ".png", write)
+    for kind in other_kinds():
+        yield Kind(*kind)
+    for what, (old, new, shown) in RADIANCE.items():
+        write = partial(write_hdr, old=old, new=new, shown=shown)
+        yield Kind("Radiance HDR", what, ".hdr", write)
+    for what, options in EXRS.items():
+        yield Kind("EXR", what, ".exr", partial(write_exr, **options))
+
+
+KINDS = list(all_kinds())
