@@ -37,16 +37,9 @@ def test_bytes_come_back(tmp_path_factory, suffix, image):
     np.testing.assert_array_equal(eg.load_image(path), shown)
 
 
-@pytest.mark.parametrize(
-    ("suffix", "kind"),
-    [
-        *((f".{kind}", kind.upper()) for kind in ("png", "jpeg", "webp", "bmp", "ppm")),
-        (".jpg", "JPEG"),
-        (".tif", "TIFF"),
-    ],
-)
-def test_every_suffix_is_written_in_its_format(tmp_path, suffix, kind):
-    path, image = tmp_path / f"a{suffix}", np.full((8, 8, 3), (0.2, 0.4, 0.6))
+@pytest.mark.parametrize("kind", ["JPEG", "WEBP"])
+def test_lossy_formats_come_close(tmp_path, kind):
+    path, image = tmp_path / f"a.{kind.lower()}", np.full((8, 8, 3), (0.2, 0.4, 0.6))
     eg.save_image(path, image)
     np.testing.assert_allclose(eg.load_image(path), image, atol=0.02)
     assert Image.open(path).format == kind
