@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import eigengs_dr as eg
 from _helpers.errors import one_line, refused
-from _helpers.low_rank import HEIGHT, SIZE, WIDTH, assert_same, basis_of, family, planes
+from _helpers.low_rank import HEIGHT, PIXELS, SIZE, WIDTH, assert_same, basis_of, family, planes
 
 
 def flat(components):
@@ -60,6 +60,16 @@ def test_components_are_those_of_scikit_learn(space):
 def test_many_images_in_blocks_and_shards_are_exact_while_the_rank_suffices(count):
     images = family(count, noise=0, directions=8)
     check_exact(eg.Eigenbasis.from_images(images, SIZE, 8), images, 1e-3)
+
+
+def test_rows_stay_orthonormal_when_variances_differ_much():
+    """What rounding mixes into small components is as large as they are."""
+    rng = np.random.default_rng(0)
+    spread = np.logspace(-1, -4.5, 30)
+    directions = np.linalg.qr(rng.normal(size=(PIXELS, 30)))[0].T * np.sqrt(PIXELS)
+    grey = (0.5 + (rng.normal(size=(1100, 30)) * spread) @ directions).clip(-0.4, 1.4)
+    images = np.repeat(grey.reshape(-1, HEIGHT, WIDTH, 1), 3, axis=3).astype(np.float32)
+    assert_orthonormal(eg.Eigenbasis.from_images(images, SIZE, 30, space="rgb"))
 
 
 # --- Families of every kind ---
@@ -180,6 +190,22 @@ def test_progress_counts_every_image_and_an_interruption_leaves_no_thread(tmp_pa
     with pytest.raises(KeyboardInterrupt):
         eg.Eigenbasis.from_images(tmp_path, SIZE, 2, progress=interrupt)
     assert not [t for t in threading.enumerate() if t.name.startswith("decode")]
+
+
+def test_an_iterator_is_read_but_a_little_ahead():
+    """Images that wait take 32 MB: here 42 of them."""
+    given, ahead = [], []
+
+    def images():
+        for value in np.linspace(0, 1, 60):
+            given.append(value)
+            yield np.full((256, 256, 3), value, np.float32)
+
+    def progress(done, *_):
+        ahead.append(len(given) - done)
+
+    eg.Eigenbasis.from_images(images(), (256, 256), 1, progress=progress)
+    assert 1 < max(ahead) < 50
 
 
 def test_files_that_cannot_be_read_are_named_and_skipped(tmp_path):
