@@ -1,8 +1,5 @@
-"""Lists of Gaussians: complete and tight; their pieces, and the order of lanes."""
+"""Lists of Gaussians: complete and tight, and their pieces, which are the transpose."""
 
-import tracemalloc
-
-import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,25 +8,20 @@ from hypothesis import strategies as st
 from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in, upload_rows
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.binning.lists import PACKET, build_lists, order_lanes
+from eigengs_dr.raster.binning.lists import build_lists
 from eigengs_dr.raster.binning.tiles import ON_CPU, ON_GPU, TILE, Grid
 
 RADIUS = 3.0
 
 GRID = Grid(*SIZE)
 
-
-def upload(backend, mean, factor):
-    types = types_in(select(backend))
-    return upload_rows(types.Float, (*mean.T, *factor.T))
-
-
 EDGE = 1e-3
 """Relative distance to the cutoff within which rounding may decide."""
 
 
-def lists_of(backend, mean, factor, grid=GRID, pad=0.0):
-    return build_lists(upload(backend, mean, factor), RADIUS, grid, pad)
+def lists_of(backend, mean, factor, grid=GRID, pad=0.0, growth=1.0):
+    shape = upload_rows(types_in(select(backend)).Float, (*mean.T, *factor.T))
+    return build_lists(shape, RADIUS, grid, pad, growth)
 
 
 def membership(lists, count=COUNT):
@@ -89,6 +81,8 @@ def check_lists(backend, mean, factor, grid=GRID):
 
 
 GRANULARITY = {"llvm": ON_CPU, "cuda": ON_GPU}
+
+PIECES = ("splat", "begin", "end", "tile", "slot", "first", "number")
 
 
 @few
@@ -160,108 +154,21 @@ def test_too_many_entries_are_refused(backend):
         lists_of(backend, mean, factor, Grid(side, side))
 
 
-def pairs_by_splat(lists):
-    """The pairs of the pieces as a matrix (tiles, N), and the number of visits of every piece."""
-    pieces = lists.pieces
-    tile, splat, begin, end = (
-        getattr(pieces, k).numpy().astype(int) for k in ("tile", "splat", "begin", "end")
-    )
-    found = np.zeros((lists.grid.tiles, dr.width(pieces.first)), int)
-    for n, i, j in zip(splat, begin, end, strict=True):
-        np.add.at(found[:, n], tile[i:j], 1)
-    return found, end - begin
-
-
-def pairs_by_tile(lists, count):
-    found = np.zeros((lists.grid.tiles, count), int)
-    splat, order = lists.splat.numpy(), lists.order.numpy()
-    for t, i, j in zip(order, lists.begin.numpy(), lists.end.numpy(), strict=True):
-        np.add.at(found[t], splat[i:j], 1)
-    return found
-
-
-@pytest.mark.parametrize(
-    ("side", "count", "most"),
-    [(260, 512, "long_visits"), (260, 400, "visits"), (256, 600, "visits")],
-    ids=["long", "short", "small"],
-)
-def test_long_lists_have_longer_pieces(backend, side, count, most):
-    """Where enough pieces are left, and not in small images, which go in batches."""
-    shape = upload(backend, np.full((count, 2), side / 2), np.tile([1e-4, 0, 1e-4], (count, 1)))
-    found, visits = pairs_by_splat(build_lists(shape, RADIUS, Grid(side, side)))
-    assert (found == 1).all()
-    assert visits.max() == getattr(GRANULARITY[backend], most)
-
-
 @few
 @given(scene=scenes(), pad=st.sampled_from([0.0, 1.5]), growth=st.sampled_from([1.0, 1.3]))
 def test_pieces_are_the_transpose(backend, scene, pad, growth):
     """Every pair once in both lists, and no piece longer than the granularity."""
-    shape = upload(backend, scene.mean, scene.factor)
-    lists = build_lists(shape, RADIUS, GRID, pad, growth)
-    found, visits = pairs_by_splat(lists)
-    assert found.max(initial=0) <= 1
-    np.testing.assert_array_equal(found, pairs_by_tile(lists, len(scene.mean)))
-    assert visits.max(initial=0) <= GRANULARITY[backend].visits
-    slot, first, number = (
-        getattr(lists.pieces, k).numpy().astype(int) for k in ("slot", "first", "number")
-    )
+    lists = lists_of(backend, scene.mean, scene.factor, pad=pad, growth=growth)
+    pieces = {name: getattr(lists.pieces, name).numpy().astype(int) for name in PIECES}
+    found = np.zeros((COUNT, GRID.tiles), int)
+    for n, first, last in zip(pieces["splat"], pieces["begin"], pieces["end"], strict=True):
+        np.add.at(found[n], pieces["tile"][first:last], 1)
+    np.testing.assert_array_equal(found.reshape(COUNT, GRID.ny, GRID.nx), membership(lists))
+    assert (pieces["end"] - pieces["begin"]).max(initial=0) <= GRANULARITY[backend].visits
+    slot, number = pieces["slot"], pieces["number"]
     assert sorted(slot) == list(range(len(slot)))
-    np.testing.assert_array_equal(first, np.cumsum(number) - number)
+    np.testing.assert_array_equal(pieces["first"], np.cumsum(number) - number)
     owner = np.repeat(np.arange(len(number)), number)
     splat = np.empty(len(slot), int)
-    splat[slot] = lists.pieces.splat.numpy()
+    splat[slot] = pieces["splat"]
     np.testing.assert_array_equal(splat[: len(owner)], owner)
-
-
-def test_windows_keep_neighbours_together():
-    """Without empty lanes: by window, then by descending length, equal lengths as they were."""
-    window = np.repeat([0, 1, 2], 50)
-    length = np.random.default_rng(0).integers(1, 9, 150)
-    order = order_lanes(length, window)
-    np.testing.assert_array_equal(order, np.lexsort((np.arange(150), -length, window)))
-
-
-def plain_order(length, window):
-    """`order_lanes` by a sort of pairs, which takes any numbers."""
-    order = np.lexsort((np.arange(len(length)), -length, window))
-    dealt = len(order) // PACKET * PACKET
-    packets = order[:dealt].reshape(-1, PACKET)
-    full = length[packets[:, [0, -1]]].any(axis=1)
-    place = np.zeros(len(packets), int)
-    for kind in (full, ~full):
-        place[kind] = np.linspace(0, 65535, kind.sum()).astype(int)
-    packets = packets[np.lexsort((np.arange(len(packets)), place))]
-    return np.concatenate([packets.ravel(), order[dealt:]])
-
-
-@pytest.mark.parametrize("lanes", [1, 16, 100, 5000])
-@pytest.mark.parametrize("longest", [0, 1, 40, 100_000])
-def test_lanes_are_in_the_order_of_a_plain_sort(lanes, longest):
-    """Windows of one run, and windows of tiles, which return row after row."""
-    rng = np.random.default_rng(lanes + longest)
-    length = np.where(rng.uniform(size=lanes) < 0.6, rng.integers(0, longest + 1, lanes), 0)
-    lane = np.arange(lanes)
-    for window in (lane // 64, lane % 80 // 32 + 3 * (lane // 800)):
-        np.testing.assert_array_equal(order_lanes(length, window), plain_order(length, window))
-
-
-def test_the_order_of_lanes_takes_the_memory_of_the_lists():
-    """Not that of all windows times the longest list: one tile may hold most Gaussians."""
-    window = np.arange(64_000) // 32
-    length = np.ones(len(window), int)
-    length[5] = 20_000
-    tracemalloc.start()
-    order_lanes(length, window)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 100 * len(window)
-
-
-def test_empty_packets_are_dealt_out():
-    """Every quarter of the lanes has a quarter of the work."""
-    length = np.concatenate([np.full(64 * PACKET, 8), np.zeros(32 * PACKET, int)])
-    order = order_lanes(length, np.arange(len(length)) // 256)
-    assert sorted(order) == list(range(len(length)))
-    work = length[order].reshape(4, -1).sum(axis=1)
-    assert np.ptp(work) <= PACKET * 8
