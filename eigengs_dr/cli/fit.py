@@ -91,8 +91,8 @@ def fit(
     """Fit sums of Gaussians to images. Grey images become RGB; --space data keeps one channel.
 
     IMAGE may be a folder, or a pattern in quotes. For several images, -o and --preview name
-    folders, whose files are named after the images; manifest.jsonl has a row per image. If one
-    fails, the others are fitted, and the exit code is 2.
+    folders, whose files are named after the images; --report has a row per image. If one fails,
+    the others are fitted, and the exit code is 2.
 
     A single result is replaced. Of several images, those with results are skipped, so the same
     command continues a run; results of other options are an error. Files that are not sets of

@@ -55,7 +55,7 @@ def test_sets_in_a_folder(set_file, trained, tmp_path):
     assert_refused(empty, "fits: holds no files ending in .npz or .egs")
     for name in ("a", "b"):
         (fits / f"{name}.npz").write_bytes(set_file[1].read_bytes())
-    (fits / "manifest.jsonl").write_text("")
+    (fits / "notes.txt").write_text("")
     assert [facts["gaussians"] for facts in facts_of(fits)] == [40, 40]
     assert said("info", fits, "--preview", tmp_path / "seen").count(" image ") == 2
     said("render", fits, "-o", tmp_path / "drawn", "--size", 16)
@@ -96,7 +96,7 @@ def test_a_set_that_was_edited_claims_no_figures(set_file, tmp_path):
         {"figures": np.zeros(2)},
         {"figures": np.zeros(3, np.float32)},
         {"figures": np.array([1.0, 2.0, -3.0])},
-        {"figures": np.array([1.0, 2.0, np.nan])},
+        {"figures": np.array([1.0, 2.0, np.inf])},
         {"source": np.array("x" * 65)},
         {"source": np.zeros(3)},
     ],

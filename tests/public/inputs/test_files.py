@@ -43,14 +43,6 @@ def deep(request):
     return DEEP[request.param]
 
 
-def test_a_manifest_of_deep_json_is_refused(photos, tmp_path, deep):
-    (tmp_path / "manifest.jsonl").write_text(deep + "\n")
-    result = run("fit", photos, "-o", tmp_path, *QUICK)
-    assert_refused(result, tmp_path / "manifest.jsonl", "line 1 is not a row")
-    with pytest.raises(ValueError, match="line 1 is not a row"):
-        eg.fit_many(photos, tmp_path, gaussians=4, iterations=1)
-
-
 def test_a_checkpoint_of_deep_json_is_begun_anew_with_a_word(photos, tmp_path, deep):
     folder = tmp_path / "m.npz.checkpoint"
     folder.mkdir()
@@ -100,7 +92,7 @@ print(json.dumps([fill(Path({str(folder)!r}) / limit, int(limit)) for limit in {
 def test_a_full_disk_is_told_by_the_name_of_the_output(full, limit):
     folder, said = full[limit]
     written = ["set.egs", "packed.egs"] if limit == "300" else []
-    results = {"report.json": ["report.json.egs"], "sets": ["sets", "manifest.jsonl"]}
+    results = {"report.json": ["report.json.egs"], "sets": ["sets"]}
     for name, (error, left) in said.items():
         # A run by blocks keeps those that are done.
         names = [os.path.basename(path) for path in left if ".checkpoint" not in path]
@@ -148,19 +140,13 @@ def test_what_its_owner_made_read_only_is_refused_by_every_writer(tmp_path):
 def test_results_of_a_folder_that_are_read_only_stay(photos, tmp_path):
     few = {"gaussians": 4, "iterations": 1}
     eg.fit_many(photos, tmp_path, **few)
-    result, manifest = tmp_path / "p1.npz", tmp_path / "manifest.jsonl"
+    result = tmp_path / "p1.npz"
     result.chmod(0o444)
     assert [row.status for row in eg.fit_many(photos, tmp_path, **few)] == ["skipped"] * 3
     before = result.read_bytes()
     rows = eg.fit_many(photos, tmp_path, overwrite=True, **few)
     assert [row.status for row in rows] == ["done", "failed", "done"]
     assert f"{result}: is read-only" in rows[1].error and result.read_bytes() == before
-    manifest.chmod(0o444)
-    before = manifest.read_bytes()
-    with pytest.raises(OSError, match=rf"{manifest}: is read-only"):
-        eg.fit_many(photos, tmp_path, overwrite=True, **few)
-    assert_refused(run("fit", photos, "-o", tmp_path, "--overwrite", *QUICK), manifest)
-    assert manifest.read_bytes() == before
     assert not (tmp_path / ".lock").exists()
 
 
