@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import lazy_loader
 
 from .backend import messages
-from .backend.selection import select_libllvm
+from .backend.selection import import_drjit, select_libllvm
 from .gaussian import packed
 from .version import __version__ as __version__
 
@@ -55,7 +55,13 @@ packed.read_set, packed.read_head = _read_packed, _packed_head
 _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
+WITHOUT_DRJIT = {"load_image", "ms_ssim", "psnr", "sample", "save_image", "ssim"}
+WITHOUT_DRJIT |= {"BackendError", "ClusterError", "ImageError", "Interrupted"}
+
+
 def __getattr__(name: str) -> object:
     if name in __all__:
+        if name not in WITHOUT_DRJIT:
+            import_drjit()  # quietly, and with one line on what to install where that fails
         return _import_name(name)
     raise messages.no_attribute(__name__, name, __all__)

@@ -4,8 +4,6 @@ import gc
 import os
 import signal
 from functools import cache
-from importlib.util import find_spec
-from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -17,8 +15,7 @@ settings.load_profile("untimed")
 
 pytest.register_assert_rewrite("_helpers")
 
-from eigengs_dr.backend.arrays import _types  # noqa: E402
-from eigengs_dr.backend.selection import BackendError, select  # noqa: E402
+import eigengs_dr  # noqa: E402, F401
 
 # isort: split
 import drjit as dr  # noqa: E402  (after the package, which finds libLLVM)
@@ -30,23 +27,13 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 @cache
 def has_gpu():
     """Whether Dr.Jit finds a CUDA device."""
-    try:
-        select("cuda")
-    except BackendError:
-        return False
-    return True
+    return dr.has_backend(dr.JitBackend.CUDA)
 
 
 @pytest.fixture(params=["llvm", pytest.param("cuda", marks=pytest.mark.gpu)])
 def backend(request):
     """Name of a backend: a test that takes it runs once for each."""
     return request.param
-
-
-@pytest.fixture(params=[32, 64])
-def types(backend, request):
-    """Types of a backend in single and in double precision."""
-    return _types(select(backend).__name__, request.param)
 
 
 def pytest_collection_modifyitems(config, items):
@@ -80,11 +67,7 @@ def one_thread():
         yield
         return
     with threadpool_limits(1), pytest.MonkeyPatch.context() as patch:
-        if find_spec("mitsuba"):
-            from eigengs_dr.plugins import registration
-
-            two = SimpleNamespace(**vars(dr) | {"thread_count": lambda: 2})
-            patch.setattr(registration, "dr", two)
+        patch.setattr(dr, "thread_count", lambda: 2)
         yield
 
 

@@ -75,7 +75,7 @@ KINDS = {
     "PathLike": ("str __fspath__", "a path"),
     "Images": ("__fspath__ __iter__ __getitem__", "a path or several images"),
     "TrainingImages": ("__fspath__ __iter__ __getitem__", "a path or several images"),
-    "Sequence[TextureMap]": ("__iter__", "several of TextureMap"),
+    "Sequence[TextureMap]": ("__iter__", "the name, space and channels of each map"),
     "Mapping[str, Tensor]": ("keys", "a mapping of names to tensors"),
     "Mapping[str, object]": ("keys", "parameters, as of mitsuba.traverse"),
     "mi.SceneParameters": ("keys", "parameters, as of mitsuba.traverse"),

@@ -61,7 +61,7 @@ def select(backend: str | None = None) -> ModuleType:
     """
     if backend is not None and str(backend) not in BACKENDS:
         raise ValueError(f"backend {backend!r} is unknown; use {', '.join(map(repr, BACKENDS))}")
-    dr = _import_drjit()
+    dr = import_drjit()
     backend = backend or ("cuda" if _has(dr, "cuda") else "llvm")
     if backend != "llvm":
         if not _has(dr, backend):
@@ -120,7 +120,7 @@ def describe(backend: str | None = None) -> Record:
         As for `select`.
     """
     module = select(backend)
-    dr = _import_drjit()
+    dr = import_drjit()
     llvm = _has(dr, "llvm")
     return {
         "backend": name_of(module),
@@ -159,7 +159,7 @@ def version_of(package: str) -> str | None:
         return None
 
 
-def _import_drjit() -> ModuleType:
+def import_drjit() -> ModuleType:
     """Import Dr.Jit, with a clearer error than Dr.Jit's if libatomic is missing."""
     if "drjit" in sys.modules:
         return sys.modules["drjit"]

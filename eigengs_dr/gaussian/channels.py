@@ -71,15 +71,21 @@ def check_name(name: str) -> None:
 
 
 def check_maps(maps: Sequence[TextureMap], channels: int) -> tuple[TextureMap, ...]:
-    """Return maps whose spaces may still be names.
+    """Return maps that may still be plain tuples, and whose spaces may be names.
 
     Raises
     ------
+    TypeError
+        If a map is no tuple of a name, a space, a number of channels and optionally a weight.
     BadValue
         If maps are invalid, or their total number of channels differs.
     """
-    if not all(isinstance(m, TextureMap) for m in maps):
-        raise TypeError(f"maps are {shown(maps)}; give a sequence of TextureMap")
+    try:
+        maps = [TextureMap(*m) for m in maps]
+    except TypeError:
+        raise TypeError(
+            f"maps are {shown(maps)}; give the name, space and channels of each"
+        ) from None
     names = [m.name for m in maps]
     for m in maps:
         check_name(m.name)

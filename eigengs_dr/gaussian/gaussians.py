@@ -61,8 +61,9 @@ class Gaussians:
         ``exp(-cutoff^2 / 2)`` times the sum of the absolute colours of the Gaussians that end
         before it.
     maps : tuple of TextureMap
-        Groups of channels, if the set has several maps, as a material has; see
-        `eigengs_dr.gaussian.channels.TextureMap`. ``gaussians["albedo"]`` is then the set of one
+        Groups of channels, if the set has several maps, as a material has: each is a name, a
+        space, a number of channels and the weight of its errors, 1 by default, as in
+        ``("albedo", "linear", 3, 0.5)``. ``gaussians["albedo"]`` is then the set of one
         map, and `space` is "data", because each map has its own. Together, maps have at most 16
         channels.
 

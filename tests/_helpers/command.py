@@ -1,10 +1,13 @@
 """The command line, in this process, and what all of its commands keep to."""
 
+from importlib.metadata import entry_points
+
 import numpy as np
 from click.testing import CliRunner
 from PIL import Image
 
-from eigengs_dr.cli.main import main
+(program,) = entry_points(group="console_scripts", name="eigengs-dr")
+main = program.load()
 
 
 def run(*arguments):

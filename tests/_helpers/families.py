@@ -7,8 +7,6 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import eigengs_dr as eg
-from eigengs_dr.eigenbasis.basis import Eigenbasis
-from eigengs_dr.eigenbasis.eigengs import EigenGS
 
 
 def family(count=40, side=32, seed=0):
@@ -21,13 +19,13 @@ def family(count=40, side=32, seed=0):
 @cache
 def small_basis(space="ycbcr"):
     """Components of a family of 32x32 pixels: 12 of the first channel, 6 of the others."""
-    return Eigenbasis.from_images(family(), (32, 32), (12, 6, 6), space=space)
+    return eg.Eigenbasis.from_images(family(), (32, 32), (12, 6, 6), space=space)
 
 
 @cache
 def small_model(backend, split=False, space="ycbcr"):
     """A model of `small_basis` with 100 splats."""
-    return EigenGS.fit(small_basis(space), 100, frequency_aware=split, backend=backend)
+    return eg.EigenGS.fit(small_basis(space), 100, frequency_aware=split, backend=backend)
 
 
 SIDE, SPLATS = 32, 100

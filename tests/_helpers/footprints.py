@@ -4,9 +4,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from _helpers.arrays import upload_rows
 from _helpers.reference import render_exact
 from _helpers.sets import SIZE
-from eigengs_dr.backend.arrays import upload_rows
 
 CUTOFF = 5.0
 FINE = 3

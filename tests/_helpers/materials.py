@@ -2,23 +2,22 @@
 
 import numpy as np
 
-from eigengs_dr.gaussian.channels import TextureMap
-from eigengs_dr.gaussian.gaussians import Gaussians
+import eigengs_dr as eg
 
 MAPS = (
-    TextureMap("albedo", "linear", 3, 0.5),
-    TextureMap("roughness", "data", 1, 2.0),
-    TextureMap("normal", "normal", 3, 1.0),
+    ("albedo", "linear", 3, 0.5),
+    ("roughness", "data", 1, 2.0),
+    ("normal", "normal", 3, 1.0),
 )
 
 
 def material(count=24, size=(22, 17), maps=MAPS, backend=None, seed=0):
     """Round Gaussians with channels near the middle of their range."""
     random = np.random.default_rng(seed)
-    channels = sum(m.channels for m in maps)
+    channels = sum(m[2] for m in maps)
     factor = np.zeros((count, 3))
     factor[:, [0, 2]] = random.uniform(0.2, 0.5, (count, 2))
-    return Gaussians.from_arrays(
+    return eg.Gaussians.from_arrays(
         random.uniform(0, 1, (count, 2)) * size,
         factor,
         random.uniform(-0.1, 0.1, (count, channels)),

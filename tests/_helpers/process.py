@@ -8,15 +8,16 @@ from pathlib import Path
 import eigengs_dr
 
 SELECT = """
-import eigengs_dr
-from eigengs_dr.backend.selection import BackendError, select
+import eigengs_dr as eg
 try:
-    types = select("llvm")
-except BackendError as error:
+    eg.Gaussians.from_arrays(
+        [[1, 1]], [[1, 0, 1]], [[1]], size=(2, 2), space="data", backend="llvm"
+    )
+except eg.BackendError as error:
     print(error)
 else:
     import drjit as dr
-    print(dr.clip(types.Float(1, 2, 3), 0, 2))
+    print(dr.clip(dr.llvm.ad.Float(1, 2, 3), 0, 2))
 """
 
 

@@ -4,15 +4,15 @@ All numbers are rounded to float32, so that what is computed in float64 has the 
 
 from typing import NamedTuple
 
+import drjit as dr
 import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from _helpers.arrays import upload_rows
 from _helpers.reference import render_exact
-from eigengs_dr.backend.arrays import upload_rows
-from eigengs_dr.backend.selection import select
-from eigengs_dr.gaussian.gaussians import Gaussians
+from eigengs_dr import Gaussians
 
 SIZE = (22, 17)
 """Width and height: no multiples of a tile. The same for all tests, so that kernels are
@@ -43,8 +43,7 @@ class Scene(NamedTuple):
 
     def on(self, backend, bits=32, space="data"):
         """Upload to a backend, in single or double precision."""
-        module = select(backend)
-        suffix = "64" if bits == 64 else ""
+        module, suffix = getattr(dr, backend).ad, "64" if bits == 64 else ""
         Float = getattr(module, "Float" + suffix)
 
         def rows(kind, array):

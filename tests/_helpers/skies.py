@@ -7,9 +7,9 @@ import pytest
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
 
 import eigengs_dr as eg  # noqa: E402
+from _helpers.arrays import upload_rows  # noqa: E402
 from _helpers.poster import camera  # noqa: E402
 from _helpers.texture import backend  # noqa: E402
-from eigengs_dr.backend.arrays import upload_rows  # noqa: E402
 
 WIDTH, HEIGHT = 64, 32
 

@@ -7,8 +7,8 @@ import pytest
 from _helpers.sets import SIZE, random_scene
 
 mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
+from _helpers.arrays import upload_rows  # noqa: E402
 from _helpers.poster import camera  # noqa: E402
-from eigengs_dr.backend.arrays import upload_rows  # noqa: E402
 from eigengs_dr.plugins import texture_of  # noqa: E402
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from _helpers.kernels import jit, launches
-from _helpers.reference import render_plain
+from _oracles.reference import render_plain
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.backend.selection import select
 from eigengs_dr.gaussian.gaussians import Gaussians

@@ -94,7 +94,7 @@ def test_opacity_is_a_map_of_a_material(tmp_path):
 
 
 def test_textures_of_a_file_share_memory_until_one_changes(file):
-    parts = [map_texture(file, m.name, prefilter=0.01) for m in MAPS]
+    parts = [map_texture(file, m[0], prefilter=0.01) for m in MAPS]
     rows = [mi.traverse(part)["mean"].array.index for part in parts]
     assert len(set(rows)) == 1
     [held] = files._files.values()

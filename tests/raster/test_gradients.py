@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from _helpers.reference import render_plain
 from _helpers.sets import few, random_scene, scenes
+from _oracles.reference import render_plain
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.gaussian.file import CUTOFF
 from eigengs_dr.gaussian.gaussians import concatenate
