@@ -1,4 +1,4 @@
-"""Sampled emission of the texture, its mean and its maximum."""
+"""Emission of the texture: its mean, its maximum, what is sampled, and how it lights."""
 
 import drjit as dr
 import numpy as np
@@ -6,11 +6,11 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.chi_square import assert_density
+from _helpers.light import LUMINANCE, to_linear
 from _helpers.sets import SIZE
 from _helpers.texture import at, backend, gaussians, mi, small_scene, texel_centres, texture
 from _helpers.variants import in_variants, on_both
-from eigengs_dr.gaussian.gaussians import Gaussians
-from eigengs_dr.image.color import to_linear
+from eigengs_dr.plugins import texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -21,15 +21,14 @@ def lamps(deviation, count=40, side=256, space="linear"):
     mean = rng.uniform(8, side - 8, (count, 2)).astype(np.float32)
     factor = np.tile(np.float32([1 / deviation, 0, 1 / deviation]), (count, 1))
     color = np.repeat(rng.uniform(0.5, 0.9, (count, 1)), 3, axis=1).astype(np.float32)
-    g = Gaussians.from_arrays(
-        mean, factor, color, size=(side, side), space=space, backend=backend()
-    )
+    options = {"size": (side, side), "space": space, "backend": backend()}
+    g = eg.Gaussians.from_arrays(mean, factor, color, **options)
     mass = 2 * np.pi * deviation**2 * -np.expm1(-0.5 * g.cutoff**2)
     return g, color[:, 0].sum(dtype=np.float64) * mass / side**2
 
 
 class TestMean:
-    @pytest.mark.parametrize("deviation", [0.03, 0.1, 0.3, 0.7, 2.0])
+    @pytest.mark.parametrize("deviation", [0.03, 0.3, 2.0])
     def test_is_the_integral_however_small_the_gaussians_are(self, deviation):
         g, expected = lamps(deviation)
         assert np.array(texture(g).mean()).item() == pytest.approx(expected, rel=2e-3)
@@ -37,8 +36,7 @@ class TestMean:
     @pytest.mark.parametrize("scale", [0.37, 3.0])
     def test_over_what_to_uv_shows(self, scale):
         """Repeats count as often as they show; a part of the texture has its own mean."""
-        g = gaussians("linear")
-        tex = texture(g, to_uv=mi.ScalarTransform4f().scale(scale))
+        tex = texture(gaussians("linear"), to_uv=mi.ScalarTransform4f().scale(scale))
         line = np.float32((np.arange(300) + 0.5) / 300)
         u, v = np.meshgrid(line, line)
         seen = tex.eval_1(at(mi.Float(u.ravel()), mi.Float(v.ravel())))
@@ -47,7 +45,7 @@ class TestMean:
     def test_of_clamped_and_decoded_values(self):
         g = gaussians("ycbcr", quiet=False)
         dense = np.clip(eg.render(g, SIZE[0] * 10).numpy(), 0, 1)
-        light = to_linear(dense) @ np.float32([0.212671, 0.715160, 0.072169])
+        light = to_linear(dense) @ LUMINANCE
         tex = texture(g)
         assert np.array(tex.mean()).item() == pytest.approx(light.mean(), rel=0.01)
         assert tex.max() == pytest.approx(light.max(), abs=0.02)
@@ -60,6 +58,7 @@ class TestMean:
         lengths = np.linspace(mi.MI_CIE_MIN, mi.MI_CIE_MAX, 95)
         for first in range(0, 92, 4):
             si.wavelengths = type(si.wavelengths)(*lengths[first : first + 4].tolist())
+            dr.make_opaque(si.wavelengths)
             total += np.array(tex.eval(si), np.float64).mean() / 23
         assert np.array(tex.mean()).item() == pytest.approx(total, rel=0.01)
 
@@ -74,7 +73,7 @@ class TestMean:
 
 
 class TestSampling:
-    @pytest.mark.parametrize("deviation", [0.3, 1.2, 3.0])
+    @pytest.mark.parametrize("deviation", [0.3, 3.0])
     def test_small_lamps_are_found(self, deviation):
         """One sample estimates their light to 40 %; evenly spread samples to 1,000 % or more."""
         g, expected = lamps(deviation)
@@ -90,12 +89,11 @@ class TestSampling:
             np.array(tex.pdf_position(position)), np.array(density), rtol=1e-4
         )
 
-    @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
-    def test_chi_square(self, wrap):
+    def test_chi_square(self):
         from mitsuba.chi2 import PlanarDomain
 
         turn = mi.ScalarTransform4f().rotate([0, 0, 1], 20) @ mi.ScalarTransform4f().scale(1.3)
-        tex = texture(gaussians("linear", quiet=False), wrap_mode=wrap, to_uv=turn)
+        tex = texture(gaussians("linear", quiet=False), wrap_mode="mirror", to_uv=turn)
         square = PlanarDomain(mi.ScalarBoundingBox2f([0, 0], [1, 1]))
         assert_density(
             lambda sample: tex.sample_position(sample)[0], tex.pdf_position, square, 200_000, 16
@@ -112,11 +110,10 @@ class TestSampling:
         assert dark.any()
         assert density[dark].max() < 0.1 * density.max()
 
-    @pytest.mark.parametrize("value", [0, -1])
-    def test_a_black_picture_is_sampled_evenly(self, value):
+    def test_a_black_picture_is_sampled_evenly(self):
         g = gaussians("linear")
         g.color *= 0
-        g.background *= value
+        g.background *= 0
         density = np.array(texture(g, raw=True).pdf_position(mi.Point2f(0.3, 0.7)))
         assert density == pytest.approx(1)
 
@@ -137,9 +134,34 @@ class TestSampling:
                 np.testing.assert_allclose(np.array(found), np.array(expected), atol=1e-6)
 
 
+@pytest.mark.parametrize("space", ["linear", "log"])
+def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(space):
+    """Also above 1."""
+    g = gaussians(space, quiet=False)
+    data = np.clip(eg.render(g, SIZE[0] * 8).numpy(), 0, 1 if space == "linear" else None)
+    bitmap = {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "wrap_mode": "clamp"}
+    means = []
+    for radiance in (texture_of(g), bitmap):
+        scene = small_scene(None, emitter={"type": "area", "radiance": radiance})
+        means.append(np.array(mi.render(scene, spp=256, seed=1)).mean(axis=(0, 1)))
+    np.testing.assert_allclose(means[0], means[1], rtol=0.02)
+
+
+@in_variants([*on_both("rgb"), *on_both("spectral")])
+def test_particles_leave_it_as_paths_find_it(variant):
+    """Light traced from the emitter, which samples positions and wavelengths of the texture."""
+    emitter = {"type": "area", "radiance": texture_of(gaussians("linear", quiet=False))}
+    scene = small_scene(None, emitter=emitter)
+    means = [
+        np.array(mi.render(scene, integrator=mi.load_dict({"type": t, "max_depth": 3}), spp=64))
+        for t in ("path", "ptracer")
+    ]
+    np.testing.assert_allclose(*(m.mean(axis=(0, 1)) for m in means), rtol=0.05)
+
+
 def test_a_lamp_renders_inside_of_the_lock():
     """The survey is made in another thread, for which the thread that holds the lock waits."""
-    scene = small_scene(None, emitter={"type": "area", "radiance": texture(gaussians())})
+    scene = small_scene(None, emitter={"type": "area", "radiance": texture(gaussians("linear"))})
     with eg.exclusive():
         image = mi.render(scene, spp=1)
         dr.eval(image)

@@ -7,7 +7,6 @@ import pytest
 from _helpers.errors import refused
 from _helpers.texture import at, gaussians, in_front, mi, small_scene, texture
 from eigengs_dr.plugins import environment_of, follow, pixel_angle, texture_of
-from eigengs_dr.plugins.follow import follow_where_asked
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -33,9 +32,7 @@ def changed(scene, **values):
     return scene
 
 
-@pytest.mark.parametrize(
-    "change", [{}, {"film__size": [48, 48]}, {"x_fov": 15.0}, {"x_fov": 70.0, "film__size": [6, 6]}]
-)
+@pytest.mark.parametrize("change", [{}, {"x_fov": 70.0, "film__size": [6, 6]}])
 def test_a_change_of_the_camera_changes_the_prefilter(change):
     scene = scene_with(0.5)  # far too wide
     follow(scene)
@@ -102,15 +99,6 @@ def test_what_is_no_sensor_is_refused(sensor, error, message):
         follow(scene, sensor)
 
 
-def test_none_stands_for_the_default():
-    """It ends the process in Mitsuba."""
-    g = gaussians("linear")
-    for make in (texture_of, environment_of):
-        given = make(g, prefilter=None, cutoff=None)
-        assert "prefilter" not in given and given["cutoff"] == g.cutoff
-        mi.load_dict(given)
-
-
 def test_all_textures_of_the_scene():
     """Also those inside of others, and lamps."""
     inner = {"type": "checkerboard", "color0": texture_of(gaussians("linear"))}
@@ -126,19 +114,6 @@ def test_all_textures_of_the_scene():
     follow(scene, scene.sensors()[0])
     found = [np.array(value) for key, value in mi.traverse(scene) if key.endswith("prefilter")]
     assert len(found) == 2 and np.allclose(found, pixel_angle(scene.sensors()[0]))
-
-
-def test_where_asked_numbers_stay_and_others_follow():
-    scene = scene_with(True)
-    follow_where_asked(scene, 0)
-    angle = pixel_angle(scene.sensors()[0])
-    np.testing.assert_array_equal(picture(scene), picture(scene_with(angle)))
-    eight_times = scene_with(8 * angle)
-    with pytest.warns(UserWarning, match=r"prefilter is .* and a pixel of the camera .*; say true"):
-        follow_where_asked(eight_times, 0)
-    np.testing.assert_array_equal(picture(eight_times), picture(scene_with(8 * angle)))
-    for quiet in (angle, 0.0):
-        follow_where_asked(scene_with(quiet), 0)
 
 
 def test_a_sensor_without_a_field_of_view_is_refused():
