@@ -1,41 +1,35 @@
 """Light from Gaussians: the picture of an ``envmap``, sampling, derivatives, mistakes."""
 
 import gc
+import weakref
 
 import drjit as dr
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.arrays import upload_rows
 from _helpers.chi_square import assert_density
-from _helpers.errors import refused
+from _helpers.light import to_log
 from _helpers.poster import camera
 from _helpers.skies import HEIGHT, WIDTH, directions, lit, mi, seen, sky, uniform
 from _helpers.texture import backend
-from _helpers.variants import in_all, in_variants
-from eigengs_dr.backend.arrays import upload_rows
-from eigengs_dr.image.color import to_log
+from _helpers.variants import in_all, in_variants, on_both
 from eigengs_dr.plugins import (
     bake_environment,
     environment_of,
     follow,
     gaussians_of,
     pixel_angle,
-    resident_bytes,
 )
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
-TURNS = {
-    "as it is": [],
-    "about y": [([0, 1, 0], 70)],
-    "about all": [([0, 1, 0], 40), ([1, 0, 0], 100), ([0, 0, 1], -30)],
-}
 
-
-def turn(name):
+def turn():
+    """A rotation about all axes."""
     transform = mi.ScalarTransform4f()
-    for axis, angle in TURNS[name]:
+    for axis, angle in ([0, 1, 0], 40), ([1, 0, 0], 100), ([0, 0, 1], -30):
         transform = transform.rotate(axis, angle)
     return transform
 
@@ -46,9 +40,15 @@ def texels(width=WIDTH, height=HEIGHT):
     return directions((x.ravel() + 0.5) / width, y.ravel() / (height - 1))
 
 
+def one(mean, color, size, space="radiance", background=None):
+    """The environment of one Gaussian."""
+    return eg.Gaussians.from_arrays(
+        [mean], [[0.3, 0, 0.3]], [color], background, size=size, space=space, backend=backend()
+    )
+
+
 class TestPicture:
-    @pytest.mark.parametrize("space", ["radiance", "log", "linear"])
-    @pytest.mark.parametrize("channels", [1, 3])
+    @pytest.mark.parametrize(("space", "channels"), [("radiance", 3), ("log", 3), ("linear", 1)])
     def test_is_that_of_eg_render(self, space, channels):
         g = sky(space, channels)
         found = seen(mi.load_dict(environment_of(g)), texels())
@@ -61,52 +61,44 @@ class TestPicture:
         """Its rows go from pole to pole."""
         g = sky(size=(32, 16))
         d = np.random.default_rng(1).normal(size=(4096, 3)) * [1, 2, 1]  # many near the poles
-        d = np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
-        d = np.ascontiguousarray(d.T)
+        d = np.ascontiguousarray(np.float32(d / np.linalg.norm(d, axis=1, keepdims=True)).T)
         expected = seen(mi.load_dict(environment_of(g)), d)
         off = [
             np.sqrt(np.square(seen(mi.load_dict(baked), d) - expected).mean())
             for baked in (bake_environment(g, 32 * k) for k in (1, 2, 4, 8))
         ]
         assert off[1] < 0.4 * off[0] and off[2] < 0.6 * off[1] and off[3] < off[2]
-        for rows in (0, 1):
-            with pytest.raises(ValueError, match=f"{rows} rows; the set and the bitmap must"):
-                bake_environment(g, 32, rows)
+        with pytest.raises(ValueError, match="1 rows; the set and the bitmap must"):
+            bake_environment(g, 32, 1)
 
     @in_all
-    @pytest.mark.parametrize("name", ["as it is", "about all"])
-    def test_is_that_of_an_envmap(self, variant, name):
+    def test_is_that_of_an_envmap(self, variant):
         """At texels; spectra differ, and so do their pictures by a little."""
-        g, placed = sky(), {"to_world": turn(name), "scale": 1.5}
+        g, placed = sky(), {"to_world": turn(), "scale": 1.5}
         pictures = []
         for emitter in (environment_of(g, **placed), bake_environment(g, **placed)):
-            scene = lit(emitter, "direct", 32)
-            pictures.append(np.array(mi.render(scene, spp=512, seed=1)))
+            pictures.append(np.array(mi.render(lit(emitter, "direct", 32), spp=512, seed=1)))
         difference = pictures[0] - pictures[1]
         assert np.sqrt(np.square(difference).mean()) < 0.025 * pictures[1].mean()
         assert abs(difference.mean()) < 0.005 * pictures[1].mean()
 
-    @pytest.mark.parametrize("name", TURNS)
-    def test_by_path(self, name):
-        g, placed = sky(), {"to_world": turn(name)}
-        scenes = [lit(make(g, **placed)) for make in (environment_of, bake_environment)]
-        a, b = (np.array(mi.render(scene, spp=256)) for scene in scenes)
-        assert np.sqrt(np.square(a - b).mean()) < 0.03 * b.mean()
-        np.testing.assert_allclose(a.mean((0, 1)), b.mean((0, 1)), rtol=0.005)
+    @in_variants(["llvm_ad_spectral_polarized"])
+    def test_polarized(self, variant):
+        a, b = (
+            np.array(mi.render(lit(make(sky()), side=12), spp=64)).mean((0, 1))
+            for make in (environment_of, bake_environment)
+        )
+        np.testing.assert_allclose(a, b, rtol=0.02)
 
     def test_a_constant_light(self):
         """Energy: a white ball under light of 1 is 1, whatever is sampled."""
-        even = eg.Gaussians.from_arrays(
-            [[8, 4]], [[1, 0, 1]], [[0, 0, 0]], [1, 1, 1], size=(16, 8), space="radiance",
-            backend=backend(),
-        )  # fmt: skip
         white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
         scene = mi.load_dict(
             {
                 "type": "scene",
                 "integrator": {"type": "direct"},
                 "ball": {"type": "sphere", "bsdf": white},
-                "sky": environment_of(even),
+                "sky": environment_of(one([8, 4], [0, 0, 0], (16, 8), background=[1, 1, 1])),
                 "sensor": camera([0, 0, 5], 4, fov=10),
             }
         )
@@ -117,18 +109,18 @@ class TestPicture:
         g = sky()
         g.background *= -5
         emitter = mi.load_dict(environment_of(g))
-        found = seen(emitter, texels())
-        assert found.min() == 0
+        assert seen(emitter, texels()).min() == 0
         _, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1000), uniform(1000))
         assert np.array(weight).min() >= 0
 
+    def test_of_a_single_bright_channel(self):
+        g = one([8, 4], [0], (16, 8), "log", to_log(np.float32([30.0])))
+        np.testing.assert_allclose(seen(mi.load_dict(environment_of(g)), texels()), 30, rtol=1e-3)
+
     def test_occluders_are_in_front_of_it_however_large_they_are(self):
         """What hides the sky hides it, although emitters in Python do not know the scene."""
-        at = mi.ScalarTransform4f()
-        roof = {
-            "type": "rectangle",
-            "to_world": at.translate([0, 5e4, 0]).rotate([1, 0, 0], 90).scale(1e7),
-        }
+        to_world = mi.ScalarTransform4f().translate([0, 5e4, 0]).rotate([1, 0, 0], 90).scale(1e7)
+        roof = {"type": "rectangle", "to_world": to_world}
         scene = mi.load_dict({"type": "scene", "roof": roof, "sky": environment_of(sky())})
         si = dr.zeros(mi.SurfaceInteraction3f, 4096)
         si.n = si.sh_frame.n = mi.Normal3f(0, 1, 0)
@@ -148,10 +140,7 @@ class TestSeamAndPoles:
             np.testing.assert_allclose(left, right, rtol=0.01)
 
     def test_a_gaussian_ends_at_the_seam_as_in_its_picture(self):
-        half = eg.Gaussians.from_arrays(
-            [[0, 16]], [[0.3, 0, 0.3]], [[1]], size=(64, 32), space="radiance", backend=backend()
-        )
-        v = np.full(2, 15.5 / 31)
+        half, v = one([0, 16], [1, 1, 1], (64, 32)), np.full(2, 15.5 / 31)
         found = seen(mi.load_dict(environment_of(half)), directions(np.array([0.01, 0.99]), v))
         assert found[0, 0] > 0.9
         assert found[1, 0] == 0
@@ -160,33 +149,27 @@ class TestSeamAndPoles:
         near = seen(blurred, directions(np.array([0.001, 0.999]), v))
         np.testing.assert_allclose(near[0], near[1], rtol=0.05)
 
-    @pytest.mark.parametrize("prefilter", [0.0, 0.02])
-    def test_at_the_poles(self, prefilter):
-        emitter = mi.load_dict(environment_of(sky(), prefilter=prefilter))
+    def test_at_the_poles_and_where_there_is_no_direction(self):
+        emitter = mi.load_dict(environment_of(sky(), prefilter=0.02))
         d = np.float32([[0, 1, 0], [0, -1, 0], [1e-4, 1, 0], [0, -1, 1e-4]]).T
-        found = seen(emitter, d / np.linalg.norm(d, axis=0))
-        assert np.isfinite(found).all()
+        assert np.isfinite(seen(emitter, d / np.linalg.norm(d, axis=0))).all()
         ds = dr.zeros(mi.DirectionSample3f, 4)
         ds.d = mi.Vector3f(*upload_rows(mi.Float, d))
         density = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f, 4), ds))
         assert np.isfinite(density).all()
         assert density.min() > 0
-
-    def test_directions_that_are_not_finite(self):
-        emitter = mi.load_dict(environment_of(sky()))
         assert (seen(emitter, np.float32([[np.nan], [0], [1]])) == 0).all()
 
 
 class TestFootprint:
-    @pytest.mark.parametrize("prefilter", [0.1, 0.4])
-    def test_is_the_mean_over_a_gaussian_on_the_sphere(self, prefilter):
+    def test_is_the_mean_over_a_gaussian_on_the_sphere(self):
         """Away from the poles, where the plane of the picture bends."""
         g = sky(deviation=(2.0, 3.0))
-        sharp, blurred = (mi.load_dict(environment_of(g, prefilter=p)) for p in (0, prefilter))
+        sharp, blurred = (mi.load_dict(environment_of(g, prefilter=p)) for p in (0, 0.4))
         rng = np.random.default_rng(3)
         u, v = rng.uniform(0, 1, 8), rng.uniform(0.3, 0.7, 8)
         found = seen(blurred, directions(u, v))
-        sigma, count = 0.4 * prefilter, 20_000
+        sigma, count = 0.4 * 0.4, 20_000
         for k in range(8):
             east, south = sigma * rng.normal(size=(2, count))
             around = seen(
@@ -204,14 +187,8 @@ class TestFootprint:
         fixed = lit(environment_of(sky(), prefilter=angle), "direct")
         np.testing.assert_array_equal(followed, np.array(mi.render(fixed, spp=4, seed=1)))
 
-    def test_without_a_sensor(self):
-        emitter = mi.load_dict(environment_of(sky(), prefilter=True))
-        with refused(ValueError, "gaussian_environment: prefilter = true needs a sensor"):
-            seen(emitter, texels())
-
 
 SETS = {
-    "smooth": {},
     "sharp": {"deviation": (0.2, 0.5), "count": 10},
     "log": {"space": "log", "deviation": (0.5, 3.0)},
     "wide": {"size": (400, 60), "deviation": (1.0, 9.0)},
@@ -220,30 +197,11 @@ SETS = {
 
 class TestSampling:
     @pytest.mark.parametrize("name", SETS)
-    def test_the_density_is_one(self, name):
-        emitter, count = mi.load_dict(environment_of(sky(**SETS[name]))), 400_000
-        ds = dr.zeros(mi.DirectionSample3f, count)
-        ds.d = mi.warp.square_to_uniform_sphere(uniform(count))
-        density = np.array(emitter.pdf_direction(dr.zeros(mi.Interaction3f, count), ds), np.float64)
-        mean = 4 * np.pi * density.mean()
-        assert abs(mean - 1) < 5 * 4 * np.pi * density.std() / np.sqrt(count)
-
-    @pytest.mark.parametrize("name", SETS)
     def test_samples_have_their_density(self, name):
-        emitter = mi.load_dict(environment_of(sky(**SETS[name]), to_world=turn("about all")))
-        it = dr.zeros(mi.Interaction3f, 10_000)
-        ds, weight = emitter.sample_direction(it, uniform(10_000))
-        density, light = emitter.pdf_direction(it, ds), emitter.eval_direction(it, ds)
-        # Rounding moves few directions over the border of a leaf.
-        same = np.isclose(np.array(density), np.array(ds.pdf), rtol=1e-2)
-        assert same.mean() > 0.995
-        np.testing.assert_allclose(np.array(light / ds.pdf), np.array(weight), rtol=0.02, atol=1e-3)
-
-    @pytest.mark.parametrize("name", SETS)
-    def test_chi_square(self, name):
+        """By the chi-square test, by the weights, and the density is 1 over the sphere."""
         from mitsuba.chi2 import SphericalDomain
 
-        emitter = mi.load_dict(environment_of(sky(**SETS[name]), to_world=turn("about all")))
+        emitter = mi.load_dict(environment_of(sky(**SETS[name]), to_world=turn()))
 
         def sample(numbers):
             it = dr.zeros(mi.Interaction3f, dr.width(numbers))
@@ -255,13 +213,19 @@ class TestSampling:
             return emitter.pdf_direction(dr.zeros(mi.Interaction3f, dr.width(d)), ds)
 
         assert_density(sample, density, SphericalDomain(), 100_000, 32)
+        even = mi.warp.square_to_uniform_sphere(uniform(400_000))
+        whole = 4 * np.pi * np.array(density(even), np.float64)
+        assert abs(whole.mean() - 1) < 5 * whole.std() / np.sqrt(len(whole))
+        it = dr.zeros(mi.Interaction3f, 10_000)
+        ds, weight = emitter.sample_direction(it, uniform(10_000))
+        same = np.isclose(np.array(density(ds.d)), np.array(ds.pdf), rtol=1e-2)
+        assert same.mean() > 0.995
+        light = np.array(emitter.eval_direction(it, ds) / ds.pdf)
+        np.testing.assert_allclose(light, np.array(weight), rtol=0.02, atol=1e-3)
 
     def test_one_sample_finds_the_light(self):
         """Of a sun 1,000 times as bright as the sky; evenly spread samples have a noise of 20."""
-        sun = eg.Gaussians.from_arrays(
-            [[100, 60]], [[0.7, 0, 0.7]], [[1000]], [1], size=(512, 256), space="radiance",
-            backend=backend(),
-        )  # fmt: skip
+        sun = one([100, 60], [1000] * 3, (512, 256), background=[1] * 3)
         emitter = mi.load_dict(environment_of(sun))
         _, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 100_000), uniform(100_000))
         light = np.array(weight, np.float64)[0]
@@ -277,36 +241,25 @@ class TestSampling:
         assert np.isfinite(np.array(ds.pdf)).all()
         assert (np.array(weight) == 0).all()
 
-    @in_all
+    @in_variants([*on_both("rgb"), *on_both("spectral")])
     def test_rays_from_the_light(self, variant):
-        """Light traced from the sky is that traced from the camera."""
+        """Light traced from the sky is that traced from the camera, the background too.
+
+        A sensor sees nothing beyond its far clip plane.
+        """
         scene = lit(environment_of(sky()), side=12)
         scene.environment().set_scene(scene)
-        images = []
-        for kind, spp in (("ptracer", 1024), ("path", 256)):
-            depth = {"max_depth": 3, "hide_emitters": True}
-            integrator = mi.load_dict({"type": kind, **depth})
-            images.append(np.array(mi.render(scene, integrator=integrator, spp=spp)).mean())
-        assert images[0] == pytest.approx(images[1], rel=0.02)
+        for hidden in (True, False):
+            depth = {"max_depth": 3, "hide_emitters": hidden}
+            means = []
+            for kind, spp in (("ptracer", 1024), ("path", 256)):
+                integrator = mi.load_dict({"type": kind, **depth})
+                image = np.array(mi.render(scene, integrator=integrator, spp=spp))
+                means.append(image[..., :3].mean())
+            assert means[0] == pytest.approx(means[1], rel=0.02)
 
-    def test_rays_from_the_light_show_the_background(self):
-        """A sensor sees nothing beyond its far clip plane."""
-        scene = lit(environment_of(sky()), side=12)
-        scene.environment().set_scene(scene)
-        images = [
-            np.array(mi.render(scene, integrator=mi.load_dict({"type": kind}), spp=spp))[..., :3]
-            for kind, spp in (("ptracer", 1024), ("path", 256))
-        ]
-        assert images[0].mean() == pytest.approx(images[1].mean(), rel=0.02)
 
-    @in_variants(["llvm_ad_spectral_polarized"])
-    def test_polarized(self, variant):
-        g = sky()
-        a, b = (
-            np.array(mi.render(lit(make(g), side=12), spp=64)).mean((0, 1))
-            for make in (environment_of, bake_environment)
-        )
-        np.testing.assert_allclose(a, b, rtol=0.02)
+STEPS = {"mean": 2e-2, "factor": 1e-3, "scale": 1e-2}
 
 
 def of_sky(scene):
@@ -324,27 +277,20 @@ def direction_like(array):
     return np.random.default_rng(2).normal(size=np.shape(array)).astype(np.float32)
 
 
-STEPS = {"mean": 2e-2, "factor": 1e-3, "scale": 1e-2}
-
-
 class TestDerivatives:
-    @pytest.mark.parametrize("space", ["radiance", "log"])
-    @pytest.mark.parametrize("prefilter", [0.0, 0.2])
+    @pytest.mark.parametrize(("space", "prefilter"), [("radiance", 0.0), ("log", 0.2)])
     def test_are_finite_differences(self, space, prefilter):
-        g = sky(space, count=12, size=(32, 16))
-        emitter = environment_of(g, cutoff=6.0, prefilter=prefilter)
+        emitter = environment_of(sky(space, count=12), cutoff=6.0, prefilter=prefilter)
         scene = mi.load_dict({"type": "scene", "sky": emitter})
         parameters, environment = of_sky(scene), scene.environment()
         d = texels(32, 16)
-        weight = np.random.default_rng(1).normal(size=(d.shape[1], 3))
+        weight = np.random.default_rng(1).normal(size=(3, d.shape[1])).astype(np.float32)
+        weight = mi.Color3f(*upload_rows(mi.Float, weight))
 
         def loss():
             si = dr.zeros(mi.SurfaceInteraction3f, d.shape[1])
             si.wi = -mi.Vector3f(*upload_rows(mi.Float, d))
-            light = environment.eval(si)
-            return sum(
-                dr.sum(light[k] * mi.Float(weight[:, k].astype(np.float32))) for k in range(3)
-            )
+            return dr.sum(dr.dot(environment.eval(si), weight))
 
         for key, value in parameters:
             dr.enable_grad(value)
@@ -365,11 +311,10 @@ class TestDerivatives:
             expected = (values[0] - values[1]) / (2 * step)
             assert (gradient * along).sum() == pytest.approx(expected, rel=0.02, abs=0.05), key
 
-    @pytest.mark.parametrize("integrator", ["direct", "path", "prb"])
-    def test_through_integrators(self, integrator):
+    def test_through_an_integrator(self):
         """Linear in the colours: the derivative is the picture of other colours."""
-        g = sky(count=12, size=(32, 16))
-        scene = lit(environment_of(g), integrator, 12)
+        g = sky(count=12)
+        scene = lit(environment_of(g), "prb", 12)
         parameters, weight = of_sky(scene), upstream(scene)
         parameters.keep(r"sky\.color")
         dr.enable_grad(parameters["sky.color"])
@@ -387,17 +332,11 @@ class TestDerivatives:
         expected = (values[0] - values[1]) / 0.4
         assert (gradient * along).sum() == pytest.approx(expected, rel=0.05)
 
-    @pytest.mark.parametrize(
-        ("integrator", "name"),
-        [
-            *(("direct", name) for name in ("mean", "factor", "color", "background", "scale")),
-            *(("prb", name) for name in ("mean", "color")),
-        ],
-    )
-    def test_forward_mode_is_backward_mode(self, integrator, name):
+    @pytest.mark.parametrize("name", ["mean", "scale"])
+    def test_forward_mode_is_backward_mode(self, name):
         found = []
         for mode in ("forward", "backward"):
-            scene = lit(environment_of(sky(count=12, size=(32, 16))), integrator, 8)
+            scene = lit(environment_of(sky(count=12)), "direct", 12)
             parameters, along, key = of_sky(scene), mi.Float(0), f"sky.{name}"
             dr.enable_grad(along)
             kind = type(parameters[key])
@@ -436,14 +375,14 @@ class TestChanges:
     def test_rotation_and_scale(self):
         emitter = mi.load_dict(environment_of(sky()))
         parameters = mi.traverse(emitter)
-        parameters["to_world"] = mi.AffineTransform4f(turn("about all"))
+        parameters["to_world"] = mi.AffineTransform4f(turn())
         parameters["scale"] = mi.Float(2)
         parameters.update()
-        expected = mi.load_dict(environment_of(sky(), to_world=turn("about all"), scale=2.0))
+        expected = mi.load_dict(environment_of(sky(), to_world=turn(), scale=2.0))
         np.testing.assert_allclose(seen(emitter, texels()), seen(expected, texels()), rtol=1e-5)
 
     def test_in_a_frozen_rendering(self):
-        scene = lit(environment_of(sky()), "direct", 8)
+        scene = lit(environment_of(sky()), "direct", 12)
         parameters = mi.traverse(scene)
         frozen = dr.freeze(lambda scene: mi.render(scene, spp=4, seed=1))
         for step in range(4):
@@ -459,7 +398,7 @@ class TestChanges:
 
     @pytest.mark.parametrize("name", ["mean", "factor", "color", "background"])
     def test_broken_parameters_leave_finite_light(self, name):
-        emitter = mi.load_dict(environment_of(sky(count=8, size=(32, 16))))
+        emitter = mi.load_dict(environment_of(sky(count=12)))
         parameters = mi.traverse(emitter)
         start = np.array(parameters[name])
         for value in (np.nan, np.inf, -np.inf, 0.0, -5.0, 1e30):
@@ -474,56 +413,30 @@ class TestChanges:
             assert np.isfinite(np.array(ds.d)).all(), value
             assert found.min() >= 0, value
 
-
-class TestMemory:
-    @pytest.mark.texture_units
-    def test_is_below_that_of_an_envmap(self):
-        """A set of 16 bytes for each of its 2,600 texels would be no gain."""
-        g = sky(count=500, size=(512, 256), deviation=(3.0, 20.0))
-        sizes = [
-            resident_bytes(mi.load_dict(make(g))) for make in (environment_of, bake_environment)
-        ]
-        assert sizes[0] < 0.2 * sizes[1]
-
-    @pytest.mark.texture_units
-    def test_counts_the_table_of_an_envmap(self):
-        """16 bytes of a texel and 4 x 7/3 of the table."""
-        held = resident_bytes(mi.load_dict(bake_environment(sky(size=(400, 200)))))
-        assert held == pytest.approx(400 * 200 * (16 + 28 / 3), rel=0.02)
-
     def test_is_freed(self):
-        import weakref
-
         emitter = mi.load_dict(environment_of(sky()))
         seen(emitter, texels())
-        table = weakref.ref(emitter.table)
+        alive = weakref.ref(emitter)
         del emitter
         gc.collect()
-        assert table() is None
+        assert alive() is None
 
 
-class TestFile:
-    def test_is_read(self, tmp_path):
-        sky().save(tmp_path / "sky.npz")
-        scene = tmp_path / "scene.xml"
-        scene.write_text(
-            '<scene version="3.0.0"><emitter type="gaussian_environment">'
-            '<string name="filename" value="sky.npz"/><float name="scale" value="2"/>'
-            '<string name="memory" value="exact"/>'
-            '<transform name="to_world"><rotate y="1" angle="70"/></transform>'
-            "</emitter></scene>"
-        )
-        emitter = mi.load_file(str(scene)).environment()
-        expected = mi.load_dict(environment_of(sky(), scale=2.0, to_world=turn("about y")))
-        np.testing.assert_allclose(seen(emitter, texels()), seen(expected, texels()), rtol=1e-3)
-        assert 'name = "sky.npz"' in str(emitter)
-
-    def test_of_a_single_bright_channel(self):
-        g = eg.Gaussians.from_arrays(
-            [[8, 4]], [[0.3, 0, 0.3]], [[0]], to_log(np.float32([30.0])), size=(16, 8),
-            space="log", backend=backend(),
-        )  # fmt: skip
-        np.testing.assert_allclose(seen(mi.load_dict(environment_of(g)), texels()), 30, rtol=1e-3)
+def test_a_file_is_read(tmp_path):
+    sky().save(tmp_path / "sky.npz")
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><emitter type="gaussian_environment">'
+        '<string name="filename" value="sky.npz"/><float name="scale" value="2"/>'
+        '<string name="memory" value="exact"/>'
+        '<transform name="to_world"><rotate y="1" angle="70"/></transform>'
+        "</emitter></scene>"
+    )
+    emitter = mi.load_file(str(scene)).environment()
+    about_y = mi.ScalarTransform4f().rotate([0, 1, 0], 70)
+    expected = mi.load_dict(environment_of(sky(), scale=2.0, to_world=about_y))
+    np.testing.assert_allclose(seen(emitter, texels()), seen(expected, texels()), rtol=1e-3)
+    assert 'name = "sky.npz"' in str(emitter)
 
 
 class TestMistakes:
@@ -536,45 +449,39 @@ class TestMistakes:
             ({"wrap_mode": "clamp"}, "it has no property wrap_mode"),
             ({"space": "cmyk"}, "space 'cmyk'"),
             ({"cutoff": 99.0}, "cutoff is 99.0; it must be above 0"),
+            ({"to_world": "scaled"}, "to_world scales or shears directions"),
         ],
     )
     def test_of_properties(self, properties, message):
+        if "to_world" in properties:
+            properties = {"to_world": mi.ScalarTransform4f().scale(2)}
         with pytest.raises(RuntimeError) as caught:
             mi.load_dict({**environment_of(sky()), **properties})
         first_line = str(caught.value).splitlines()[0]
         assert "gaussian_environment: " in first_line
         assert message in first_line
 
-    @pytest.mark.parametrize(
-        ("g", "message"),
-        [
-            (lambda: sky("data"), "3 channels in the space 'data'; it needs one or three of light"),
-            (lambda: sky("data", channels=2), "2 channels in the space 'data'"),
-            (lambda: sky(channels=4), "4 channels; use a set of 1 to 3"),
-            (lambda: sky(size=(8, 1)), "8x1 pixels; it needs two along each side"),
-        ],
-    )
-    def test_of_sets(self, g, message):
-        with pytest.raises(RuntimeError, match=message):
-            mi.load_dict(environment_of(g()))
-
-    def test_no_source(self):
+    def test_of_sets(self):
+        for g, message in (
+            (sky("data"), "3 channels in the space 'data'; it needs one or three of light"),
+            (sky("data", channels=2), "2 channels in the space 'data'"),
+            (sky(channels=4), "4 channels; use a set of 1 to 3"),
+            (sky(size=(8, 1)), "8x1 pixels; it needs two along each side"),
+        ):
+            with pytest.raises(RuntimeError, match=message):
+                mi.load_dict(environment_of(g))
         with pytest.raises(RuntimeError, match="gaussian_environment: give one of filename"):
             mi.load_dict({"type": "gaussian_environment"})
 
-    def test_a_transform_that_scales(self):
-        scaled = mi.ScalarTransform4f().scale(2)
-        with pytest.raises(RuntimeError, match="to_world scales or shears directions"):
-            mi.load_dict(environment_of(sky(), to_world=scaled))
-
     def test_parameters_of_another_shape(self):
-        emitter = mi.load_dict(environment_of(sky()))
-        parameters = mi.traverse(emitter)
+        parameters = mi.traverse(mi.load_dict(environment_of(sky())))
         parameters["color"] = mi.TensorXf(np.zeros((3, 3), np.float32))
         with pytest.raises(Exception, match=r"color has shape \(3, 3\)"):
             parameters.update()
 
-    @in_variants(["scalar_rgb"])
-    def test_scalar_variants(self, variant):
-        with pytest.raises(RuntimeError, match="gaussian_environment does not support the variant"):
-            mi.load_dict({"type": "gaussian_environment", "filename": "x.npz"})
+    @pytest.mark.parametrize("value", [[float("nan")], [-1.0], [float("inf")], [1.0, 2.0], []])
+    def test_a_change_of_scale_is_checked_as_the_property_is(self, value):
+        parameters = mi.traverse(mi.load_dict(environment_of(sky())))
+        parameters["scale"] = mi.Float(value)
+        with pytest.raises(ValueError, match=r"gaussian_environment: scale (is|holds).*must"):
+            parameters.update()
