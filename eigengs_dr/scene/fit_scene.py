@@ -66,6 +66,9 @@ DETAIL = 64
 """Fewest seen texels per Gaussian in a fit. A target with four times as many is halved, again and
 again: 200 Gaussians show no more of an enlarged image, and a step takes the time of its texels."""
 
+EXACT = 99.0
+"""PSNR from which on sets are alike."""
+
 ROUNDING = 1e-3
 """By how much data may exceed 0 and 1."""
 
@@ -329,7 +332,8 @@ def fit_seen(
 
     def score(gaussians: Gaussians) -> list[Measured]:
         psnr = image.psnr(render(image.without_unseen(gaussians)).numpy())
-        return [Measured({"psnr": min(psnr), "psnr_of_cameras": psnr}, min(psnr) - goal.psnr)]
+        margin = min(*psnr, EXACT) - goal.psnr  # an even image may have no error
+        return [Measured({"psnr": min(psnr), "psnr_of_cameras": psnr}, margin)]
 
     for count in (-(-most // fewer) for fewer in FEWER):
         objective = _objective(target, weight, image.fine.seen, count, image.kind)
