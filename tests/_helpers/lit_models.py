@@ -66,7 +66,8 @@ class LitFormula:
         table = {"lights": np.float32(lights), "values": np.float32(values)}
         table |= {"kind": np.array(kind), "smoothing": np.array(smoothing)}
         given = self.planes.to_arrays() | {"size": np.array(SIZE)}
-        return changed(any_model(), **given, **table, brightest=np.array(brightest))
+        table |= {"brightest": np.array(float(brightest)), "psnr_held_out": np.array(40.0)}
+        return changed(any_model(), **given, **table)
 
     def codes(self, lights, uv):
         """Codes (n, 3) under lights (n, 3) of length 1 at places (n, 2) of the photo."""

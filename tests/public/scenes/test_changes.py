@@ -68,7 +68,9 @@ def test_colours_alone_keep_the_lists(of_file, tmp_path):
     """They launch far fewer programs than means."""
     gaussians("linear").save(tmp_path / "x.npz")
     file = {"type": "gaussian_texture", "filename": str(tmp_path / "x.npz")}
-    tex = mi.load_dict({**(file if of_file else texture_of(gaussians("linear"))), "prefilter": 0.02})
+    tex = mi.load_dict(
+        {**(file if of_file else texture_of(gaussians("linear"))), "prefilter": 0.02}
+    )
     parameters, counts = mi.traverse(tex), {}
     for names in (COLORS, COLORS, ("mean",)):  # a file makes its parameters in the first one
         with launches() as launched:

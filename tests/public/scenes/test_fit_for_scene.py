@@ -1,4 +1,4 @@
-"""No more Gaussians than cameras resolve: what they see, the search, and what a renderer then sees."""
+"""No more Gaussians than cameras resolve: what they see, the search, what a renderer then sees."""
 
 import signal
 from functools import cache

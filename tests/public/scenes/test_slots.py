@@ -82,7 +82,9 @@ def gallery(show=texture_of):
 def test_every_slot_shows_what_a_bitmap_of_the_same_picture_shows():
     """Slopes of a bitmap are those of its texels, random normals point behind a surface, and rays
     through glass end at edges."""
-    images = [np.array(mi.render(gallery(show), spp=64, seed=1)) for show in (texture_of, fine_bitmap)]
+    images = [
+        np.array(mi.render(gallery(show), spp=64, seed=1)) for show in (texture_of, fine_bitmap)
+    ]
     for k, name in enumerate(slots(texture_of)):
         row, column = TILE * (k // COLUMNS), TILE * (COLUMNS - 1 - k % COLUMNS)
         seen, expected = (i[row : row + TILE, column : column + TILE] for i in images)
@@ -224,7 +226,9 @@ def even(space, value, size=(32, 16)):
     )
 
 
-@pytest.mark.parametrize(("space", "value"), [("log", to_log(BRIGHT)), ("rgb", to_coded(BRIGHT / 10))])
+@pytest.mark.parametrize(
+    ("space", "value"), [("log", to_log(BRIGHT)), ("rgb", to_coded(BRIGHT / 10))]
+)
 def test_sky_of_a_set(space, value):
     light = BRIGHT / 10 if space == "rgb" else BRIGHT
     mi.load_dict({"type": "scene"})  # without OptiX this test ends here, before the bitmap

@@ -1,32 +1,23 @@
 """Photos under lights as a material: light from the right side, on every surface and way."""
 
+import drjit as dr
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.chi_square import assert_density
+from _helpers.light import to_coded
 from _helpers.lit_models import SIZE, LitFormula, to_light
+from _helpers.lit_spheres import directions, photos
 from _helpers.packed import few_groups
+from _helpers.texture import in_front, mi, picture, texel_centres
+from _helpers.variants import in_variants
+from eigengs_dr.plugins import material_of, resident_bytes
 
-mi = pytest.importorskip("mitsuba", reason="the plugins need mitsuba")
-dr = pytest.importorskip("drjit")
-
-from eigengs_dr.plugins import environment_of, material_of, resident_bytes  # noqa: E402
-
-pytestmark = pytest.mark.mitsuba
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
 TABLE = 4e-3
 """What the interpolation between directions of the table may cost, of values up to 0.3."""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def llvm():
-    """A variant with the plugins."""
-    before = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    eg.register_plugins()
-    yield
-    if before:
-        mi.set_variant(before)
 
 
 @pytest.fixture(scope="module")
@@ -122,11 +113,9 @@ TURNS = (([1, 2, 3], 200), ([0, 1, 0], 140), ([1, 0, 0], -90))
 
 
 @pytest.mark.parametrize("name", WALLS)
-@pytest.mark.parametrize("axis, degrees", TURNS)
-def test_light_comes_from_the_side_that_the_photo_has_on_a_wall(
-    formula, name, axis, degrees, tmp_path
-):
+def test_light_comes_from_the_side_that_the_photo_has_on_a_wall(formula, name, tmp_path):
     matrix, chart, options = WALLS[name]
+    axis, degrees = TURNS[len(name) % 3]
     wrap, chart = options.get("wrap", "repeat"), np.array(chart, float)
     matrix = turn(axis, degrees) @ matrix
     bsdf = material_of(formula.model(), wrap_mode=wrap, to_uv=to_uv(chart))
@@ -194,6 +183,50 @@ def test_an_update_of_to_uv_turns_the_light(saved):
     np.testing.assert_allclose(seen(changed), seen(loaded), atol=1e-6)
 
 
+# --- Samples ---
+
+
+def on_a_wall(count):
+    """Points of a wall, seen from the side, and numbers to sample with."""
+    r = np.random.default_rng(0)
+    si = in_front(dr.zeros(mi.SurfaceInteraction3f, count))
+    si.uv, si.wi = mi.Point2f(r.uniform(0, 1, (2, count))), mi.Vector3f(0, 0.6, 0.8)
+    return si, (mi.Float(r.uniform(0, 1, count)), mi.Point2f(r.uniform(0, 1, (2, count))))
+
+
+def test_samples_have_their_density(saved):
+    from mitsuba.chi2 import SphericalDomain
+
+    bsdf = mi.load_dict({"type": "gaussian_relightable", "model": saved})
+
+    def interaction(count):
+        si = in_front(dr.zeros(mi.SurfaceInteraction3f, count))
+        si.uv, si.wi = mi.Point2f(0.4, 0.6), mi.Vector3f(0, 0.6, 0.8)
+        return si
+
+    def sample(numbers):
+        first = mi.Float(dr.arange(mi.UInt32, dr.width(numbers)) % 1000) / 1000
+        bs, _ = bsdf.sample(mi.BSDFContext(), interaction(dr.width(numbers)), first, numbers)
+        return bs.wo
+
+    def density(wo):
+        return bsdf.pdf(mi.BSDFContext(), interaction(dr.width(wo)), wo)
+
+    assert_density(sample, density, SphericalDomain(), 100_000, 32)
+
+
+def test_samples_weigh_the_value(saved):
+    bsdf, ctx = mi.load_dict({"type": "gaussian_relightable", "model": saved}), mi.BSDFContext()
+    si, numbers = on_a_wall(1000)
+    bs, weight = bsdf.sample(ctx, si, *numbers)
+    value, density = bsdf.eval(ctx, si, bs.wo), bsdf.pdf(ctx, si, bs.wo)
+    np.testing.assert_allclose(np.array(density), np.array(bs.pdf), rtol=1e-4)
+    np.testing.assert_allclose(np.array(weight * density), np.array(value), atol=1e-5)
+    behind = mi.Vector3f(bs.wo.x, bs.wo.y, -bs.wo.z)
+    assert not np.array(bsdf.eval(ctx, si, behind)).any()
+    assert not np.array(bsdf.pdf(ctx, si, behind)).any()
+
+
 # --- Paths from the light ---
 
 
@@ -234,11 +267,8 @@ def test_integrators_from_the_light_and_from_the_camera_agree(saved):
 def test_in_light_tracing_the_value_is_that_for_the_light_times_the_ratio_of_cosines(saved):
     bsdf, count = mi.load_dict({"type": "gaussian_relightable", "model": saved}), 200
     radiance, importance = (mi.BSDFContext(mode) for mode in mi.TransportMode.__members__.values())
-    r = np.random.default_rng(0)
-    si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
-    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    si.uv = mi.Point2f(r.uniform(0, 1, (2, count)))
+    si, numbers = on_a_wall(count)
+    si.n = mi.Normal3f(0, 0, 1)
     one, other = (
         mi.Vector3f(np.float32(over(np.tile([0, 0, 1.0], (count, 1)), k)).T) for k in (1, 2)
     )
@@ -246,7 +276,6 @@ def test_in_light_tracing_the_value_is_that_for_the_light_times_the_ratio_of_cos
     si.wi, swapped.wi = one, other
     expected = bsdf.eval(radiance, swapped, one) * (other.z / one.z)
     np.testing.assert_allclose(bsdf.eval(importance, si, other), expected, rtol=1e-4)
-    numbers = mi.Float(r.uniform(0, 1, count)), mi.Point2f(r.uniform(0, 1, (2, count)))
     bs, weight = bsdf.sample(importance, si, *numbers)
     density = bsdf.pdf(importance, si, bs.wo)
     np.testing.assert_allclose(bs.pdf, density, rtol=1e-4)
@@ -290,22 +319,6 @@ def test_an_environment_of_a_model_of_bright_photos_is_not_clamped():
     expected = 2 * to_light(formula.codes(lights, middle)).mean(axis=0)  # 2 pi / pi
     np.testing.assert_allclose(shown[1][6, 8], expected, rtol=0.05)
     assert shown[0].mean() < 0.8 * shown[1].mean()
-
-
-@few_groups()
-def test_a_fit_knows_how_bright_its_photos_are(tmp_path):
-    formula = LitFormula()
-    lights = np.random.default_rng(0).normal(size=(12, 3))
-    lights[:, 2] = 0.5 + abs(lights[:, 2])
-    model = formula.model()
-    photos = np.stack([eg.render(model.relight(light)).numpy() for light in lights])
-    for factor in (1, 1.4 / photos.max()):
-        options = {"gaussians": 30, "planes": 2, "iterations": 2, "progress": False}
-        fitted = eg.Relightable.fit(factor * photos, lights, encoding="srgb", **options)
-        assert fitted.brightest == pytest.approx(max(1, factor * photos.max()), rel=1e-5)
-        for name in ("m.npz", "m.egs"):
-            fitted.save(tmp_path / name) if name == "m.npz" else eg.pack(fitted, tmp_path / name)
-            assert eg.Relightable.load(tmp_path / name).brightest == pytest.approx(fitted.brightest)
 
 
 def test_an_environment_lights_a_model_as_an_envmap_does(formula):
@@ -389,17 +402,13 @@ def test_pictures_and_bitmaps_are_environments_of_their_own_encoding(formula):
         np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
-@pytest.mark.parametrize("value", [[float("nan")], [-1.0], [float("inf")], [1.0, 2.0], []])
-@pytest.mark.parametrize("kind", ["material", "environment"])
-def test_a_change_of_scale_is_checked_as_the_property_is(formula, kind, value):
-    options = {"size": (16, 8), "space": "log"}
-    sky = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1, 0.5, 0.2]], [0.4] * 3, **options)
-    plugin = material_of(formula.model()) if kind == "material" else environment_of(sky)
-    parameters = mi.traverse(mi.load_dict(plugin))
+@pytest.mark.parametrize("value", [[float("nan")], [-1.0], [1.0, 2.0], []])
+def test_a_change_of_scale_is_checked_as_the_property_is(formula, value):
+    parameters = mi.traverse(mi.load_dict(material_of(formula.model())))
     parameters["scale"] = mi.Float(3)
     parameters.update()
     parameters["scale"] = mi.Float(value)
-    with pytest.raises(ValueError, match=rf"{plugin['type']}: scale (is|holds).*must") as caught:
+    with pytest.raises(ValueError, match=r"table: scale (is|holds).*must") as caught:
         parameters.update()
     assert "\n" not in str(caught.value)
 
@@ -415,7 +424,7 @@ def test_a_prefilter_of_several_numbers_is_refused(formula, value):
 def test_messages_name_the_material(formula, saved):
     flat = mi.ScalarTransform4f().scale([0, 1, 1])
     wrong = [{"wrap_mode": "x"}, {"to_uv": flat}, {"to_uv": 3.0}, {"prefilter": -1.0}, {"a": 1}]
-    wrong += [{"memory": "no"}, {"scale": -1.0}]
+    wrong += [{"memory": "no"}, {"scale": -1.0}, {"light": [0, 0, 1.0]}]
     for properties in wrong:
         for bsdf in (
             {"type": "gaussian_relightable", "model": saved},
@@ -466,3 +475,171 @@ def test_a_material_counts_its_table(formula):
     numbers = 32 * 32 * 9  # three colours of two planes and what is added
     counted = resident_bytes(bsdf) - resident_bytes(bsdf.planes)
     assert 4 * numbers <= counted < 8 * numbers  # rows of 9 take 16 in Dr.Jit
+
+
+# --- Derivatives, polarization, maps of memory ---
+
+
+def test_planes_are_differentiable(saved):
+    scene = wall_in_light({"type": "gaussian_relightable", "model": saved}, "prb")
+    parameters, key = mi.traverse(scene), "wall.bsdf.planes.background"
+    start = mi.TensorXf(parameters[key])
+
+    def rendered(change):
+        parameters[key] = start + change
+        parameters.update()
+        return dr.mean(mi.render(scene, parameters, spp=16, seed=3), axis=None)
+
+    change, step = dr.zeros(mi.TensorXf, start.shape), 1e-2
+    dr.enable_grad(change)
+    dr.backward(rendered(change))
+    found = dr.grad(change).numpy().ravel()
+    for k in range(len(found)):
+        axis = mi.TensorXf(np.float32(np.arange(len(found)) == k) * step)
+        ends = [float(rendered(sign * axis).array[0]) for sign in (1, -1)]
+        assert found[k] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.03, abs=1e-4)
+
+
+@in_variants(["llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"])
+def test_a_material_depolarizes(saved, variant):
+    """Beside the light, all parameters of Stokes are 0."""
+    stokes = mi.load_dict({"type": "stokes", "inner": {"type": "direct"}})
+    scene = wall_in_light({"type": "gaussian_relightable", "model": saved}, "direct")
+    seen = mi.render(scene, integrator=stokes, spp=16, seed=1).numpy()
+    shown, total, others = np.split(seen, [-12, -9], axis=2)  # three channels per parameter
+    assert shown.mean() > 0.01 and not others.any()
+    np.testing.assert_allclose(total, np.broadcast_to(shown, total.shape), rtol=1e-3, atol=1e-4)
+
+
+def test_a_file_loses_little(formula, saved):
+    """Rows of 8 words instead of 12 numbers, and no parameters: 9 numbers."""
+    file = {"type": "gaussian_relightable", "model": saved}
+    coded, exact = (mi.load_dict({**file, "memory": name}) for name in ("normal", "exact"))
+    held = resident_bytes(exact) - resident_bytes(coded)
+    number = len(formula.planes)
+    assert held >= 32 * number
+    si = in_front(texel_centres(SIZE))
+    towards = mi.Vector3f(0.3, -0.2, 0.9)
+    values = [picture(one.eval(mi.BSDFContext(), si, towards), SIZE) for one in (coded, exact)]
+    np.testing.assert_allclose(*values, atol=0.01)
+    assert np.abs(values[0]).max() > 0.1
+
+
+# --- A texture that shows one light ---
+
+
+NAME = "wall.bsdf.reflectance.light"
+LIGHT = [0.3, -0.4, 0.8]
+
+
+def wall_in_light(bsdf, integrator, side=12):
+    """A wall that fills the picture of a camera in front of it, under a lamp far away."""
+    film = {"type": "hdrfilm", "width": side, "height": side, "pixel_format": "rgb"}
+    view = mi.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0])
+    film["rfilter"] = {"type": "box"}
+    light = {"type": "directional", "direction": [-0.3, -0.4, -0.8], "irradiance": np.pi}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator},
+            "lamp": light,
+            "wall": {"type": "rectangle", "bsdf": bsdf},
+            "camera": {"type": "orthographic", "to_world": view, "film": film},
+        }
+    )
+
+
+def test_a_wall_under_a_lamp_looks_like_a_photo(formula, saved):
+    scene = wall_in_light({"type": "gaussian_relightable", "model": saved}, "direct", 24)
+    shown = mi.render(scene, spp=64).numpy()[::-1]  # row 0 lies at v = 0, the bottom of the wall
+    photo = eg.render(formula.model().relight(LIGHT), width=24, height=24).numpy().clip(0, 1)
+    assert eg.psnr(to_coded(shown.clip(0, 1)), photo) > 30
+
+
+class TestTexture:
+    def test_shows_the_model_under_its_light(self, formula, saved):
+        texture = mi.load_dict({"type": "gaussian_texture", "model": saved, "light": LIGHT})
+        parameters = mi.traverse(texture)
+        assert [key for key, _ in parameters] == ["light", "to_uv", "prefilter"]
+        for light in (LIGHT, [-3.0, 2.0, 9.0]):
+            parameters["light"] = mi.Vector3f(*light)
+            parameters.update()
+            found = picture(texture.eval_3(texel_centres(SIZE)), SIZE)
+            expected = eg.picture_of(formula.model().relight(light)).clip(0, 1)
+            np.testing.assert_allclose(found, to_light(expected), atol=1e-3)
+
+    @few_groups()
+    def test_packed_models_are_read(self, formula, saved, tmp_path):
+        eg.pack(formula.model(), tmp_path / "m.egs", max_psnr_drop=0.1)
+        packed = mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "m.egs")})
+        whole = mi.load_dict({"type": "gaussian_texture", "model": saved})
+        found, expected = (picture(t.eval_3(texel_centres(SIZE)), SIZE) for t in (packed, whole))
+        np.testing.assert_allclose(found, expected, atol=0.05)
+
+    @pytest.mark.parametrize("integrator", ["direct", "prb"])
+    def test_the_derivative_is_that_of_finite_differences(self, saved, integrator):
+        texture = {"type": "gaussian_texture", "model": saved, "light": LIGHT}
+        scene = wall_in_light({"type": "diffuse", "reflectance": texture}, integrator)
+        parameters = mi.traverse(scene)
+
+        def rendered(light):
+            parameters[NAME] = light
+            parameters.update()
+            return dr.sum(dr.square(mi.render(scene, parameters, seed=3, spp=16)), axis=None)
+
+        light = mi.Vector3f(*LIGHT)
+        dr.enable_grad(light)
+        dr.backward(rendered(light))
+        step, found = 2e-2, np.array(dr.grad(light)).ravel()
+        ends = [
+            [
+                float(rendered(mi.Vector3f(*(np.array(LIGHT) + s * axis).tolist())).array[0])
+                for s in (step, -step)
+            ]
+            for axis in np.eye(3)
+        ]
+        expected = np.array([up - down for up, down in ends]) / (2 * step)
+        np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.01 * abs(expected).max())
+
+    def test_an_optimiser_finds_the_light_of_a_photo(self, saved):
+        texture = {"type": "gaussian_texture", "model": saved, "light": LIGHT}
+        scene = wall_in_light({"type": "diffuse", "reflectance": texture}, "direct")
+        parameters = mi.traverse(scene)
+        photo = mi.TensorXf(mi.render(scene, seed=3, spp=64))
+        optimiser = mi.ad.Adam(lr=0.05)
+        optimiser["light"] = mi.Vector3f(0, 0, 1)
+        for step in range(60):
+            parameters[NAME] = optimiser["light"]
+            parameters.update()
+            shown = mi.render(scene, parameters, seed=mi.UInt32(step), spp=16)
+            dr.backward(dr.mean(dr.square(shown - photo), axis=None))
+            optimiser.step()
+        found, true = np.array(optimiser["light"]).ravel(), np.array(LIGHT)
+        cosine = found @ true / np.linalg.norm(found) / np.linalg.norm(true)
+        assert np.degrees(np.arccos(min(cosine, 1))) < 2
+
+    def test_a_light_that_an_optimiser_spoilt_is_that_of_the_camera(self, saved):
+        texture = mi.load_dict({"type": "gaussian_texture", "model": saved, "memory": "exact"})
+        expected = picture(texture.eval_3(texel_centres(SIZE)), SIZE)
+        parameters = mi.traverse(texture)
+        for light in ([np.nan, 0, 1], [0, 0, 0]):
+            parameters["light"] = mi.Vector3f(*light)
+            parameters.update()
+            found = picture(texture.eval_3(texel_centres(SIZE)), SIZE)
+            np.testing.assert_array_equal(found, expected)
+
+    def test_lights_that_are_refused(self, saved):
+        for light, says in (([0, 0, -1.0], "below the horizon"), ([0, 0, 0.0], "no direction")):
+            with pytest.raises(RuntimeError, match=says):
+                mi.load_dict({"type": "gaussian_texture", "model": saved, "light": light})
+
+
+def test_one_plane_is_a_plane():
+    """As two are, which of another texture would be those of normals, and get a third."""
+    lights = directions(8)
+    model = eg.Relightable.fit(photos(lights), lights, gaussians=8, planes=1, iterations=0)
+    texture = mi.load_dict(material_of(model))
+    si = in_front(texel_centres((24, 24)))
+    found = picture(texture.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1)), (24, 24))
+    expected = eg.picture_of(model.relight([0, 0, 1])).clip(0, 1)
+    np.testing.assert_allclose(found, to_light(expected) / np.pi, atol=5e-3)
