@@ -10,6 +10,7 @@ from _helpers.light import to_coded
 from _helpers.lit_models import SIZE, LitFormula, to_light
 from _helpers.lit_spheres import directions, photos
 from _helpers.packed import few_groups
+from _helpers.poster import camera
 from _helpers.texture import in_front, mi, picture, texel_centres
 from _helpers.variants import in_variants
 from eigengs_dr.plugins import material_of, resident_bytes
@@ -65,8 +66,8 @@ def quad(folder, matrix, flipped=False, normals=False):
 
 
 def values(shape, points, normals, lamps):
-    """What a shape reflects (n, 3) at points that are seen along their normals, and the hit."""
-    scene = mi.load_dict({"type": "scene", "shape": shape})
+    """What a shape, or a scene, reflects (n, 3) at points that are seen along their normals."""
+    scene = mi.load_dict({"type": "scene", "shape": shape}) if isinstance(shape, dict) else shape
     origin, towards = (np.float32(a).T for a in (points + 0.5 * normals, -normals))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(towards)))
     assert np.array(si.is_valid()).all()
@@ -163,16 +164,9 @@ def test_light_comes_from_the_side_that_the_photo_has_on_a_sphere(formula, flip)
 
 
 def test_an_update_of_to_uv_turns_the_light(saved):
-    lamps = over(np.tile([0, 0, 1.0], (50, 1)))
     points = np.c_[np.random.default_rng(5).uniform(-0.9, 0.9, (50, 2)), np.zeros(50)]
+    normals = np.tile([0, 0, 1.0], (50, 1))
     bsdf = {"type": "gaussian_relightable", "model": saved}
-
-    def seen(scene):
-        origin = mi.Point3f(np.float32(points + np.array([0, 0, 1])).T)
-        si = scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(0, 0, -1)))
-        light = si.to_local(mi.Vector3f(np.float32(lamps).T))
-        return np.array(si.bsdf().eval(mi.BSDFContext(), si, light))
-
     loaded, changed = (
         mi.load_dict({"type": "scene", "wall": {"type": "rectangle", "bsdf": bsdf | more}})
         for more in ({"to_uv": to_uv(UPRIGHT)}, {})
@@ -180,7 +174,8 @@ def test_an_update_of_to_uv_turns_the_light(saved):
     parameters = mi.traverse(changed)
     parameters["wall.bsdf.planes.to_uv"] = to_uv(UPRIGHT)
     parameters.update()
-    np.testing.assert_allclose(seen(changed), seen(loaded), atol=1e-6)
+    found, expected = (values(s, points, normals, over(normals)) for s in (changed, loaded))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 # --- Samples ---
@@ -230,20 +225,16 @@ def test_samples_weigh_the_value(saved):
 # --- Paths from the light ---
 
 
-def plate(bsdf, integrator="path", side=12):
-    """A wall under a lamp and a slanted camera, and what else lights it."""
+def plate(bsdf):
+    """Two walls under a lamp, and a slanted camera."""
     look = mi.ScalarTransform4f().look_at
-    film = {"type": "hdrfilm", "width": side, "height": side, "pixel_format": "rgb"}
-    film["rfilter"] = {"type": "box"}
     lamp = look([-1, 2, 2], [0, 0, 0], [0, 0, 1]) @ mi.ScalarTransform4f().scale(0.5)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 5.0}}
     beside = look([0, -1, 1], [0, 0, 1], [1, 0, 0])
-    view = look([2, 0.8, 1.0], [0, 0, 0], [0, 0, 1])
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": integrator},
-            "camera": {"type": "perspective", "fov": 30, "to_world": view, "film": film},
+            "camera": camera([2, 0.8, 1.0], 12, fov=30, up=[0, 0, 1]),
             "wall": {"type": "rectangle", "bsdf": bsdf},
             "side": {"type": "rectangle", "bsdf": bsdf, "to_world": beside},
             "lamp": {"type": "rectangle", "to_world": lamp, "emitter": light},
@@ -262,28 +253,6 @@ def test_integrators_from_the_light_and_from_the_camera_agree(saved):
     for name, spp in (("ptracer", 16384), ("volpath", 1024), ("prb", 1024)):
         assert mean(name, spp) == pytest.approx(expected, rel=0.02), name
     assert mean("direct", 1024) == pytest.approx(mean("path", 1024, max_depth=2), rel=0.02)
-
-
-def test_in_light_tracing_the_value_is_that_for_the_light_times_the_ratio_of_cosines(saved):
-    bsdf, count = mi.load_dict({"type": "gaussian_relightable", "model": saved}), 200
-    radiance, importance = (mi.BSDFContext(mode) for mode in mi.TransportMode.__members__.values())
-    si, numbers = on_a_wall(count)
-    si.n = mi.Normal3f(0, 0, 1)
-    one, other = (
-        mi.Vector3f(np.float32(over(np.tile([0, 0, 1.0], (count, 1)), k)).T) for k in (1, 2)
-    )
-    swapped = mi.SurfaceInteraction3f(si)
-    si.wi, swapped.wi = one, other
-    expected = bsdf.eval(radiance, swapped, one) * (other.z / one.z)
-    np.testing.assert_allclose(bsdf.eval(importance, si, other), expected, rtol=1e-4)
-    bs, weight = bsdf.sample(importance, si, *numbers)
-    density = bsdf.pdf(importance, si, bs.wo)
-    np.testing.assert_allclose(bs.pdf, density, rtol=1e-4)
-    np.testing.assert_allclose(
-        np.array(weight * density), np.array(bsdf.eval(importance, si, bs.wo)), rtol=1e-3, atol=1e-6
-    )
-    si.wi = mi.Vector3f(one.x, one.y, -one.z)  # one side only
-    assert not np.array(bsdf.eval(importance, si, other)).any()
 
 
 # --- Light above white ---
@@ -326,21 +295,8 @@ def test_an_environment_lights_a_model_as_an_envmap_does(formula):
     y, x = np.mgrid[:16, :32]
     sky = np.exp(-y / 2) + 0.2 * np.exp(-((x - 11) ** 2 + (y - 9) ** 2) / 8)
     sky = np.float32(sky[..., None] * [2, 1, 0.5])
-    view = mi.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"}
-    film["rfilter"] = {"type": "box"}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct"},
-            "camera": {"type": "orthographic", "to_world": view, "film": film},
-            "wall": {
-                "type": "rectangle",
-                "bsdf": material_of(formula.model(), to_uv=to_uv(UPRIGHT)),
-            },
-            "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
-        }
-    )
+    bsdf = material_of(formula.model(), to_uv=to_uv(UPRIGHT))
+    scene = wall_in_light(bsdf, "direct", 16, {"type": "envmap", "bitmap": mi.Bitmap(sky)})
     seen = mi.render(scene, spp=1024).numpy()
     found = eg.render(formula.model().relight(sky), width=16, height=16).numpy()
     np.testing.assert_allclose(found.mean((0, 1)), seen.mean((0, 1)), rtol=0.02)
@@ -353,28 +309,21 @@ def test_an_environment_lights_a_model_as_an_envmap_does(formula):
     "light, error, says",
     [
         ("lights", ValueError, "one direction.*environment"),
-        ("row", ValueError, "one direction"),
         ([[0, 0, 1.0]], ValueError, "one direction"),
         (np.ones((8, 16)), ValueError, r"image \(h, w, 3\)"),
         ([0, 1], ValueError, "shape"),
         (None, TypeError, "type NoneType"),
-        ([None] * 3, TypeError, "type list"),
-        (iter([0, 0, 1]), TypeError, "iterator"),
         (["0", "0", "1"], TypeError, "type list"),
-        ([1j, 0, 1], TypeError, "type list"),
         (b"sky.exr", TypeError, "type bytes"),
         ([[0, 0], [1]], TypeError, "type list"),
         (-np.ones((8, 16, 3)), ValueError, "light is -1 somewhere"),
         (np.full((8, 16, 3), np.nan), ValueError, "not finite"),
-        (np.full((8, 16, 3), np.inf), ValueError, "not finite"),
     ],
 )
 def test_what_is_neither_a_direction_nor_an_environment_is_refused(formula, light, error, says):
     model = formula.model()
-    names = {"lights": model.lights, "row": model.lights[:1]}
-    light = names.get(light, light) if isinstance(light, str) else light
     with pytest.raises(error, match=says) as caught:
-        model.relight(light)
+        model.relight(model.lights if isinstance(light, str) else light)
     assert "\n" not in str(caught.value)
 
 
@@ -402,23 +351,25 @@ def test_pictures_and_bitmaps_are_environments_of_their_own_encoding(formula):
         np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
-@pytest.mark.parametrize("value", [[float("nan")], [-1.0], [1.0, 2.0], []])
-def test_a_change_of_scale_is_checked_as_the_property_is(formula, value):
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("scale", [float("nan")]),
+        ("scale", [-1.0]),
+        ("scale", []),
+        ("planes.prefilter", [0.1, 0.2]),
+        ("planes.prefilter", []),
+    ],
+)
+def test_changes_are_checked_as_properties_are(formula, key, value):
     parameters = mi.traverse(mi.load_dict(material_of(formula.model())))
     parameters["scale"] = mi.Float(3)
     parameters.update()
-    parameters["scale"] = mi.Float(value)
-    with pytest.raises(ValueError, match=r"table: scale (is|holds).*must") as caught:
+    parameters[key] = mi.Float(value)
+    name = key.split(".")[-1]
+    with pytest.raises(ValueError, match=f"gaussian_relightable: {name} (is|holds)") as caught:
         parameters.update()
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("value", [[0.1, 0.2], []])
-def test_a_prefilter_of_several_numbers_is_refused(formula, value):
-    parameters = mi.traverse(mi.load_dict(material_of(formula.model())))
-    parameters["planes.prefilter"] = mi.Float(value)
-    with pytest.raises(ValueError, match="gaussian_relightable: prefilter holds"):
-        parameters.update()
 
 
 def test_messages_name_the_material(formula, saved):
@@ -532,17 +483,17 @@ NAME = "wall.bsdf.reflectance.light"
 LIGHT = [0.3, -0.4, 0.8]
 
 
-def wall_in_light(bsdf, integrator, side=12):
-    """A wall that fills the picture of a camera in front of it, under a lamp far away."""
+def wall_in_light(bsdf, integrator, side=12, light=None):
+    """A wall that fills the picture of a camera in front of it, by default under a lamp."""
     film = {"type": "hdrfilm", "width": side, "height": side, "pixel_format": "rgb"}
     view = mi.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0])
     film["rfilter"] = {"type": "box"}
-    light = {"type": "directional", "direction": [-0.3, -0.4, -0.8], "irradiance": np.pi}
+    lamp = {"type": "directional", "direction": [-0.3, -0.4, -0.8], "irradiance": np.pi}
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": integrator},
-            "lamp": light,
+            "lamp": light or lamp,
             "wall": {"type": "rectangle", "bsdf": bsdf},
             "camera": {"type": "orthographic", "to_world": view, "film": film},
         }
@@ -600,23 +551,6 @@ class TestTexture:
         ]
         expected = np.array([up - down for up, down in ends]) / (2 * step)
         np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.01 * abs(expected).max())
-
-    def test_an_optimiser_finds_the_light_of_a_photo(self, saved):
-        texture = {"type": "gaussian_texture", "model": saved, "light": LIGHT}
-        scene = wall_in_light({"type": "diffuse", "reflectance": texture}, "direct")
-        parameters = mi.traverse(scene)
-        photo = mi.TensorXf(mi.render(scene, seed=3, spp=64))
-        optimiser = mi.ad.Adam(lr=0.05)
-        optimiser["light"] = mi.Vector3f(0, 0, 1)
-        for step in range(60):
-            parameters[NAME] = optimiser["light"]
-            parameters.update()
-            shown = mi.render(scene, parameters, seed=mi.UInt32(step), spp=16)
-            dr.backward(dr.mean(dr.square(shown - photo), axis=None))
-            optimiser.step()
-        found, true = np.array(optimiser["light"]).ravel(), np.array(LIGHT)
-        cosine = found @ true / np.linalg.norm(found) / np.linalg.norm(true)
-        assert np.degrees(np.arccos(min(cosine, 1))) < 2
 
     def test_a_light_that_an_optimiser_spoilt_is_that_of_the_camera(self, saved):
         texture = mi.load_dict({"type": "gaussian_texture", "model": saved, "memory": "exact"})

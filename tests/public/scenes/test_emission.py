@@ -62,15 +62,6 @@ class TestMean:
             total += np.array(tex.eval(si), np.float64).mean() / 23
         assert np.array(tex.mean()).item() == pytest.approx(total, rel=0.01)
 
-    def test_follows_the_parameters(self):
-        tex = texture(gaussians("linear"))
-        before = np.array(tex.mean()).item(), tex.max()
-        parameters = mi.traverse(tex)
-        parameters["background"] = parameters["background"] + 0.1
-        parameters.update()
-        after = np.array(tex.mean()).item(), tex.max()
-        np.testing.assert_allclose(np.subtract(after, before), 0.1, rtol=0.01)
-
 
 class TestSampling:
     @pytest.mark.parametrize("deviation", [0.3, 3.0])
@@ -126,8 +117,10 @@ class TestSampling:
         sample = mi.Point2f(*(mi.Float(rng.random(50, np.float32)) for _ in "uv"))
         frozen = dr.freeze(lambda tex, sample: tex.sample_position(sample))
         for _ in range(3):
+            before = np.array(tex.mean()).item()
             parameters["color"] *= 0.5
             parameters.update()
+            assert abs(np.array(tex.mean()).item() - before) > 1e-4
             for found, expected in zip(
                 frozen(tex, sample), tex.sample_position(sample), strict=True
             ):

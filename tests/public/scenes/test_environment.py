@@ -18,9 +18,7 @@ from _helpers.variants import in_all, in_variants, on_both
 from eigengs_dr.plugins import (
     bake_environment,
     environment_of,
-    follow,
     gaussians_of,
-    pixel_angle,
 )
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -178,15 +176,6 @@ class TestFootprint:
             )
             np.testing.assert_allclose(found[k], around.mean(axis=0), rtol=0.03)
 
-    def test_follows_a_sensor(self):
-        scene = lit(environment_of(sky(), prefilter=True), "direct")
-        follow(scene)
-        parameters, angle = mi.traverse(scene), pixel_angle(scene.sensors()[0])
-        assert np.array(parameters["sky.prefilter"]) == pytest.approx(angle)
-        followed = np.array(mi.render(scene, spp=4, seed=1))
-        fixed = lit(environment_of(sky(), prefilter=angle), "direct")
-        np.testing.assert_array_equal(followed, np.array(mi.render(fixed, spp=4, seed=1)))
-
 
 SETS = {
     "sharp": {"deviation": (0.2, 0.5), "count": 10},
@@ -311,32 +300,13 @@ class TestDerivatives:
             expected = (values[0] - values[1]) / (2 * step)
             assert (gradient * along).sum() == pytest.approx(expected, rel=0.02, abs=0.05), key
 
-    def test_through_an_integrator(self):
-        """Linear in the colours: the derivative is the picture of other colours."""
-        g = sky(count=12)
-        scene = lit(environment_of(g), "prb", 12)
-        parameters, weight = of_sky(scene), upstream(scene)
-        parameters.keep(r"sky\.color")
-        dr.enable_grad(parameters["sky.color"])
-        parameters.update()
-        scene.integrator().render_backward(scene, parameters, weight, seed=3, spp=512)
-        gradient = np.array(dr.grad(parameters["sky.color"]))
-        along = np.abs(direction_like(gradient))
-        values = []
-        for sign in (1, -1):
-            parameters["sky.color"] = mi.TensorXf(g.color.numpy().T + sign * 0.2 * along)
-            parameters.update()
-            with dr.suspend_grad():
-                image = np.array(mi.render(scene, spp=512, seed=4), np.float64)
-            values.append((image * np.array(weight)).sum())
-        expected = (values[0] - values[1]) / 0.4
-        assert (gradient * along).sum() == pytest.approx(expected, rel=0.05)
-
-    @pytest.mark.parametrize("name", ["mean", "scale"])
-    def test_forward_mode_is_backward_mode(self, name):
+    @pytest.mark.parametrize(
+        ("integrator", "name"), [("direct", "mean"), ("direct", "scale"), ("prb", "color")]
+    )
+    def test_forward_mode_is_backward_mode(self, integrator, name):
         found = []
         for mode in ("forward", "backward"):
-            scene = lit(environment_of(sky(count=12)), "direct", 12)
+            scene = lit(environment_of(sky(count=12)), integrator, 12)
             parameters, along, key = of_sky(scene), mi.Float(0), f"sky.{name}"
             dr.enable_grad(along)
             kind = type(parameters[key])
@@ -447,8 +417,6 @@ class TestMistakes:
             ({"scale": "bright"}, "scale is 'bright'; it must be a number"),
             ({"prefilter": 2.0}, "prefilter is 2.0; it is the angle of a pixel"),
             ({"wrap_mode": "clamp"}, "it has no property wrap_mode"),
-            ({"space": "cmyk"}, "space 'cmyk'"),
-            ({"cutoff": 99.0}, "cutoff is 99.0; it must be above 0"),
             ({"to_world": "scaled"}, "to_world scales or shears directions"),
         ],
     )

@@ -159,9 +159,9 @@ def seen_from(distance):
 
 
 class TestFit:
-    @pytest.mark.parametrize("distance", [1.0, 2.7])
+    @pytest.mark.parametrize("distance", [1.0, 2.7, 7.0])
     def test_a_renderer_sees_what_was_asked_for(self, distance):
-        # The poster fills the picture, or nearly: what is around it is the same for both.
+        # What is around the poster is the same for both; far away, texels are merged.
         found = seen_from(distance)
         assert min(found.psnr) >= BOUND
         assert seen_by_a_renderer(found, [0, 0, distance], photo()) > BOUND - 1
@@ -177,20 +177,6 @@ class TestFit:
     def test_far_away_fewer_are_enough(self):
         counts = [len(seen_from(distance).gaussians) for distance in (2.7, 7.0, 20.0)]
         assert counts[0] > 2 * counts[1] > 4 * counts[2]
-
-    @pytest.mark.slow
-    def test_texels_beyond_what_cameras_resolve_change_nothing(self):
-        more = np.kron(photo(), np.ones((4, 4, 1), np.float32))
-        cameras = [camera([0, 0, distance]) for distance in np.linspace(6, 7.5, 4)]
-        few, many = ([fitted(c, image=x) for c in cameras] for x in (photo(), more))
-        assert {(found.gaussians.width, found.gaussians.height) for found in many} == {(192, 192)}
-        # With few Gaussians a fit is a matter of rounding, so of several the mean counts.
-        first, other = ([found.tried[0] for found in fits] for fits in (few, many))
-        assert [count for count, _ in first] == [count for count, _ in other]
-        assert np.mean(other, axis=0)[1] == pytest.approx(np.mean(first, axis=0)[1], abs=0.1)
-        # The searches part then: with a Gaussian more or less, a fit differs by half a decibel.
-        counts = [sum(len(found.gaussians) for found in fits) for fits in (few, many)]
-        assert counts[1] == pytest.approx(counts[0], rel=0.15)
 
     def test_none_is_spent_on_what_is_hidden(self):
         whole = seen_from(7.0)

@@ -100,20 +100,21 @@ def test_what_is_no_sensor_is_refused(sensor, error, message):
 
 
 def test_all_textures_of_the_scene():
-    """Also those inside of others, and lamps."""
+    """Also those inside of others, lamps, and the sky."""
     inner = {"type": "checkerboard", "color0": texture_of(gaussians("linear"))}
     lamp = {"type": "area", "radiance": {"type": "d65", "of": texture_of(gaussians("linear"))}}
     scene = mi.load_dict(
         {
             "type": "scene",
             "sensor": {"type": "perspective"},
+            "sky": environment_of(gaussians("linear")),
             "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": inner}},
             "lamp": {"type": "rectangle", "emitter": lamp},
         }
     )
     follow(scene, scene.sensors()[0])
     found = [np.array(value) for key, value in mi.traverse(scene) if key.endswith("prefilter")]
-    assert len(found) == 2 and np.allclose(found, pixel_angle(scene.sensors()[0]))
+    assert len(found) == 3 and np.allclose(found, pixel_angle(scene.sensors()[0]))
 
 
 def test_a_sensor_without_a_field_of_view_is_refused():

@@ -143,23 +143,6 @@ def test_forward_mode_of_a_prefilter_says_that_there_is_none():
     assert told.startswith("no forward mode of Gaussians with a prefilter")
 
 
-def test_projective_integrators():
-    """Their pictures, and the derivatives that the plain ones have too: those of colours."""
-    seen, slopes = [], []
-    for name in ("prb_projective", "prb"):
-        scene = small_scene(wall(gaussians("linear")), "direct", spp=256)
-        parameters, key = mi.traverse(scene), f"{TEXTURE}.color"
-        dr.enable_grad(parameters[key])
-        parameters.update()
-        image = mi.render(scene, parameters, integrator=mi.load_dict({"type": name}), seed=1)
-        dr.backward(dr.mean(dr.square(image), axis=None))
-        seen.append(np.array(image))
-        slopes.append(np.array(dr.grad(parameters[key])))
-    assert np.abs(slopes[1]).max() > 1e-4
-    for found, expected in (seen, slopes):  # but for noise
-        assert np.linalg.norm(found - expected) < 0.1 * np.linalg.norm(expected)
-
-
 def test_derivatives_that_nobody_walks_keep_nothing_alive():
     """Operations that hold their texture would be left when the process ends, and end it badly."""
     tex = texture(gaussians(), prefilter=0.05)

@@ -199,17 +199,3 @@ def test_a_branch_that_ended_lends_nothing():
     once = np.array(tex.eval(si))
     expected = 2 * once + 2 * once * (np.array(si.uv.x) > 0.4)
     np.testing.assert_allclose(np.array(total), expected, atol=1e-6)
-
-
-def test_other_points_and_textures_are_other_lookups():
-    one, two = texture(gaussians()), texture(gaussians(seed=1))
-    si, other = (at(mi.Float([u, 0.5]), mi.Float([0.3, 0.6])) for u in (0.2, 0.7))
-
-    def body(i, total):
-        parts = [t.eval(s) for t in (one, two) for s in (si, other) for _ in range(3)]
-        return i + 1, total + sum(parts)
-
-    start = (mi.UInt32(0), mi.Color3f(0) + dr.zeros(mi.Float, 2))
-    total = dr.while_loop(start, lambda i, total: i < 1, body, mode="symbolic")[1]
-    expected = 3 * sum(np.array(t.eval(s)) for t in (one, two) for s in (si, other))
-    np.testing.assert_allclose(np.array(total), expected, atol=1e-5)

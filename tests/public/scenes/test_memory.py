@@ -105,18 +105,6 @@ class TestLoss:
         slopes = [np.array(t.eval_1_grad(in_front(texel_centres()))) for t in (tex, exact)]
         np.testing.assert_allclose(*slopes, atol=0.02 * np.abs(slopes[1]).max())
 
-    def test_maps_of_a_file_lose_little(self, tmp_path):
-        material(size=SIZE, backend=backend()).save(tmp_path / "m.npz")
-        file = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz"), "prefilter": 0.05}
-        for name in ("albedo", "roughness", "normal"):
-            tex, exact = (
-                mi.load_dict({**file, "map": name, "memory": memory})
-                for memory in ("normal", "exact")
-            )
-            values = [np.array(t.eval(in_front(texel_centres()))) for t in (tex, exact)]
-            np.testing.assert_allclose(*values, atol=5 * LOSS)
-            assert resident_bytes(tex) < resident_bytes(exact)
-
     def test_what_words_do_not_hold_stays_floats(self, tmp_path):
         arrays = gaussians().to_arrays()
         arrays["factor"][0] = 1e-12, 0, 1
@@ -181,11 +169,16 @@ class TestParameters:
         for name, values in g.to_arrays().items():
             np.testing.assert_allclose(found[name], values, rtol=4e-3, atol=2e-3, err_msg=name)
 
-    def test_maps_without_their_file_show_what_rows_hold(self, tmp_path):
+    def test_maps_lose_little_and_without_their_file_show_what_rows_hold(self, tmp_path):
         whole = material(size=SIZE, backend=backend())
         whole.save(tmp_path / "m.npz")
-        file = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz")}
+        file = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz"), "prefilter": 0.05}
         textures = {m.name: mi.load_dict({**file, "map": m.name}) for m in whole.maps}
+        for name, tex in textures.items():
+            exact = mi.load_dict({**file, "map": name, "memory": "exact"})
+            values = [np.array(t.eval(in_front(texel_centres()))) for t in (tex, exact)]
+            np.testing.assert_allclose(*values, atol=5 * LOSS)
+            assert resident_bytes(tex) < resident_bytes(exact)
         (tmp_path / "m.npz").write_bytes(b"another one")
         for name, tex in textures.items():
             found = gaussians_of(mi.traverse(tex), "", like=whole[name]).to_arrays()
@@ -212,9 +205,15 @@ class TestParameters:
             assert largest > 1e-3
             np.testing.assert_allclose(ours, expected, rtol=1e-3, atol=1e-4 * largest)
 
-    def test_frozen_renderings_follow_a_texture_that_becomes_one_of_floats(self, tmp_path):
+    @pytest.mark.parametrize("asks", [False, True])
+    def test_frozen_renderings_follow_a_texture_that_becomes_one_of_floats(self, tmp_path, asks):
+        """Also where the frozen function is the first to ask."""
         scene = small_scene({"type": "diffuse", "reflectance": in_a_file(tmp_path)}, "direct")
-        frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=4, seed=seed))
+
+        def render(scene, seed):
+            return mi.render(scene, mi.traverse(scene) if asks else None, spp=4, seed=seed)
+
+        frozen = dr.freeze(render)
         for step in range(4):
             if step > 1:
                 parameters = mi.traverse(scene)
@@ -224,14 +223,3 @@ class TestParameters:
             shown = np.array(frozen(scene, mi.UInt32(step)))
             expected = np.array(mi.render(scene, spp=4, seed=step))
             np.testing.assert_allclose(shown, expected, atol=1e-6)
-
-    def test_a_frozen_function_may_be_the_first_to_ask(self, tmp_path):
-        scene = small_scene({"type": "diffuse", "reflectance": in_a_file(tmp_path)}, "direct")
-
-        def render(scene, seed):
-            return mi.render(scene, mi.traverse(scene), spp=4, seed=seed)
-
-        frozen = dr.freeze(render)
-        shown = [np.array(frozen(scene, mi.UInt32(step))) for step in range(3)]
-        for step, image in enumerate(shown):
-            np.testing.assert_allclose(image, np.array(render(scene, step)), atol=1e-6)

@@ -12,6 +12,7 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.light import to_coded, to_linear
+from _helpers.poster import camera
 from _helpers.process import python_path, run_python
 from _helpers.variants import in_variants
 from eigengs_dr.plugins import photo_loss
@@ -31,12 +32,7 @@ NAME, LIGHT = "wall.bsdf.reflectance", "sky.radiance.value"
 
 def wall(texture, light=1.0, normals=None, sky=None):
     """A diffuse wall under the same light from all sides: it looks like its texture."""
-    at, cameras = mi.ScalarTransform4f(), {}
-    film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "pixel_format": "rgb"}
-    film["rfilter"] = {"type": "box"}
-    for number, x in enumerate((-1, 0, 1)):
-        view = at.look_at([x, 0, 2.6], [0, 0, 0], [0, 1, 0])
-        cameras[f"camera{number}"] = {"type": "perspective", "film": film, "to_world": view}
+    cameras = {f"camera{k}": camera([k - 1, 0, 2.6], SIDE, fov=39) for k in range(3)}
     paint = texture
     if not isinstance(texture, dict):
         data = mi.TensorXf(np.ascontiguousarray(texture, np.float32))
@@ -125,17 +121,13 @@ class TestFits:
 
     def test_an_environment_map_is_recovered(self):
         """The light of a matt ball: the mean over half of the directions is all that it shows."""
-        from _helpers.poster import camera
-
         y, x = np.mgrid[:16, :32]
         up = np.clip(np.cos(np.pi * y / 15), 0, 1)[..., None]
         light = 0.2 + up * [0.5, 0.8, 1.5] + 3.0 * ((abs(x - 9) < 3) & (abs(y - 5) < 2))[..., None]
 
         def lit(pixels):
-            cameras = {
-                f"camera{k}": camera([4 * np.sin(k), 1, 4 * np.cos(k)], SIDE, fov=35, spp=16)
-                for k in (0, 2, 4)
-            }
+            places = [(4 * np.sin(k), 1, 4 * np.cos(k)) for k in (0, 2, 4)]
+            cameras = {f"camera{k}": camera(p, SIDE, fov=35) for k, p in enumerate(places)}
             sky = {"type": "envmap", "bitmap": mi.Bitmap(np.float32(pixels))}
             path = {"type": "prb", "max_depth": 2}
             scene = {"type": "scene", "integrator": path, "ball": {"type": "sphere"}, "sky": sky}
@@ -293,7 +285,6 @@ class TestInputs:
             (NAME, [*photos[:2], GREY], r"photo 2 has shape \(32, 32, 3\), but its film has 24x24"),
             (NAME, [*photos[:2], blind], "photo_loss: photo 2: .*finite"),
             (NAME, [photos[0], [[0.5], [0.5, 1]], photos[0]], "photo_loss: photo 1: "),
-            (NAME, [photos[0], object(), photos[0]], "photo_loss: photo 1: "),
             (NAME, ["no.png", *photos[1:]], r"photo_loss: photo 0 \(no.png\): "),
         ):
             with pytest.raises(ValueError, match=message):
@@ -303,13 +294,11 @@ class TestInputs:
             (ValueError, {"sensors": [0, 1]}, "3 photos, but 2 sensors"),
             (ValueError, {"sensors": [0, 1, 3]}, "there is no sensor 3; the scene has 3"),
             (ValueError, {"spp": 0}, "spp is 0"),
-            (ValueError, {"seed": -1}, "seed is -1"),
             (ValueError, {"bounds": (0, np.inf)}, "bounds are"),
             (ValueError, {"encoding": "sRGB"}, "encoding 'sRGB' is unknown"),
             (ValueError, {"parameters": light}, "did you mean 'sky.radiance.value'"),
             (TypeError, {"integrator": "path"}, "integrator is 'path'; give a loaded one"),
             (TypeError, {"sensors": 5}, "sensors is 5; give a list"),
-            (TypeError, {"spp": 2.0}, "spp is 2.0; it must be a whole number"),
             (TypeError, {"sensors": [0, 1, 2.0]}, "2.0 is no sensor"),
             (TypeError, {"parameters": {}.items()}, "give an optimiser"),
         ):

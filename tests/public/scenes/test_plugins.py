@@ -1,8 +1,7 @@
-"""Where plugins are found, what the manual says of them, and mistakes: one line says what to do."""
+"""Where plugins are found, threads that load them, and mistakes: one line says what to do."""
 
 import importlib
 import re
-import runpy
 import threading
 import weakref
 from pathlib import Path
@@ -11,11 +10,8 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.families import small_model
-from _helpers.lit_spheres import directions, photos
-from _helpers.materials import material
 from _helpers.process import run_python
-from _helpers.texture import at, backend, gaussians, mi, texture
+from _helpers.texture import at, gaussians, mi, texture
 from _helpers.variants import in_variants, on_both
 from eigengs_dr.plugins import environment_of, follow, gaussians_of, keep_in_bounds, texture_of
 
@@ -146,34 +142,6 @@ def test_a_collector_that_works_stays_out_of_lookups():
     with pytest.raises(ValueError, match="three channels"):
         texture(gaussians("data", channels=1)).eval_3(at(0.5, 0.5))
     assert works and not any(works) and gc.isenabled()
-
-
-def test_the_manual_lists_what_the_class_takes_and_nothing_else(tmp_path):
-    """A property that no texture asks for is an error of Mitsuba."""
-    made = runpy.run_path(str(ROOT / "tools" / "manual" / "pages.py"))
-    lines = made["plugin_parameters"]("gaussian_texture").splitlines()
-    rows = [line.strip("| ").split(" | ") for line in lines[2:]]
-    assert all(row[1] and row[2] for row in rows)
-    described = {name.strip("` ") for row in rows for name in row[0].split(",")}
-    material(backend=backend()).save(tmp_path / "maps.npz")
-    small_model(backend()).save(tmp_path / "model.npz")
-    known = directions(8)
-    lit = eg.Relightable.fit(photos(known), known, gaussians=8, iterations=0, backend=backend())
-    lit.save(tmp_path / "lights.npz")
-    model = {"model": str(tmp_path / "model.npz")}
-    loaded = mi.load_dict({"type": "gaussian_texture", **model})
-    taken = set()
-    for source in (
-        texture_of(gaussians()),
-        {"filename": str(tmp_path / "maps.npz"), "map": "albedo", "first": 3},
-        model | {"coefficients": mi.traverse(loaded)["coefficients"]},
-        {"model": str(tmp_path / "lights.npz"), "light": [0.3, 0.2, 0.9]},
-    ):
-        common = {"wrap_mode": "mirror", "raw": True, "prefilter": 0.0, "cutoff": 3.0}
-        common |= {"memory": "small", "to_uv": mi.ScalarTransform4f()}
-        mi.load_dict({"type": "gaussian_texture"} | source | common)
-        taken |= set(source) | set(common)
-    assert described == taken - {"type"}
 
 
 class TestMistakes:

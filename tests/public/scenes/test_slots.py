@@ -200,22 +200,6 @@ def test_first_so_many_of_a_file(tmp_path):
         mi.load_dict({**plain, "first": COUNT + 1})
 
 
-def test_many_load_at_once(tmp_path):
-    """Mitsuba makes the plugins of a scene in threads."""
-    sets = [gaussians(seed=seed) for seed in range(8)]
-    scene = {"type": "scene"}
-    for i, g in enumerate(sets):
-        g.save(tmp_path / f"{i}.npz")
-        file = {"type": "gaussian_texture", "filename": str(tmp_path / f"{i}.npz")}
-        tex = file if i % 2 else texture_of(g, prefilter=0.01)
-        scene[f"b{i}"] = {"type": "roughplastic", "diffuse_reflectance": tex}
-    shapes = {f"s{i}": {"type": "sphere", "bsdf": {"type": "ref", "id": f"b{i}"}} for i in range(8)}
-    parameters = mi.traverse(mi.load_dict({**scene, **shapes}, optimize=False))
-    for i, g in enumerate(sets):
-        found = np.array(parameters[f"b{i}.diffuse_reflectance.color"])
-        np.testing.assert_allclose(found, g.to_arrays()["color"], atol=1e-6)
-
-
 BRIGHT = np.array([7.0, 5.0, 3.0])
 
 
