@@ -39,7 +39,6 @@ from .raster.render import picture_of as picture_of
 from .raster.render import render as render
 from .raster.render import tile_lists as tile_lists
 from .relight.model import Relightable as Relightable
-from .scene.convert import convert_scene as convert_scene
 from .scene.fit_scene import fit_for_scene as fit_for_scene
 from .version import __version__ as __version__
 from .viewer.view import view as view
@@ -64,7 +63,6 @@ __all__ = [
     "Method",
     "Relightable",
     "concatenate",
-    "convert_scene",
     "exclusive",
     "fit",
     "fit_for_scene",

@@ -25,7 +25,7 @@ def name_outputs(
     Parameters
     ----------
     inputs : sequence of Path or str
-        The input files, or their URLs.
+        The input files.
     output : Path or None
         The output file or folder. Several inputs need a folder, which is created if it is missing.
         Files in a folder are named after the inputs. None is the current folder.
@@ -88,7 +88,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
     outputs : iterable of Path or None
         The files to write; None is skipped.
     inputs : iterable of Path or str
-        The files to read, or their URLs.
+        The files to read.
 
     Raises
     ------

@@ -76,7 +76,7 @@ def fit_many(
         raise `KeyboardInterrupt` to end the run.
     client : distributed.Client, optional
         Fit on the workers of this Dask cluster; None is this process. Workers read the files and
-        write the results, so they need the same file system, or URLs. On llvm the results are
+        write the results, so they need the same file system. On llvm the results are
         bit-identical for any number of workers.
     options : Any
         Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, target_psnr,

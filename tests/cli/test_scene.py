@@ -1,7 +1,5 @@
-"""The commands `scene` and `convert`."""
+"""The command `scene`."""
 
-import json
-import re
 import subprocess
 import sys
 
@@ -12,8 +10,6 @@ from _helpers.command import assert_refused, run, said
 from _helpers.scene_sets import save_halves
 
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
-
-from _helpers.bitmap_scenes import save_images, sky  # noqa: E402
 
 pytestmark = pytest.mark.mitsuba
 
@@ -267,35 +263,3 @@ def test_without_mitsuba(scene, tmp_path):
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 2 and len(result.stderr.splitlines()) == 1
     assert "pip install 'mitsuba>=3.9,<3.10'" in result.stderr
-
-
-def test_convert(tmp_path, monkeypatch):
-    monkeypatch.setattr("eigengs_dr.scene.convert.NEGLIGIBLE", 0)  # the photo is small
-    scene = sky(save_images(tmp_path))
-    lamp = '<emitter type="constant"/>'
-    scene.write_text(re.sub('<emitter type="envmap">.*?</emitter>', lamp, scene.read_text()))
-    settings = ("--psnr", 34, "--iterations", 5, "-D", "spp=2", *LLVM, "--report", tmp_path / "r")
-    told = said("convert", scene, "-o", tmp_path / "new", "--replace-all", *settings)
-    for words in ("32x32", "(the same set)", "memory: ", "left alone: leaf.png", "camera 1: "):
-        assert words in told
-    report = json.loads((tmp_path / "r").read_text())
-    [texture] = report["textures"]
-    assert report["bytes"] == texture["gaussian_bytes"] > report["bytes_before"] == 2 * 32 * 32 * 4
-    assert report["better"] == [] and len(report["left"]) == 4
-    assert (tmp_path / "new" / "scene.xml").exists()
-    told = said("convert", scene, "-o", tmp_path / "other", *settings)
-    assert "kept, the bitmap is better: photo.png (diffuse.reflectance)" in told
-    [better] = json.loads((tmp_path / "r").read_text())["better"]
-    assert better["gaussian_bytes"] == texture["gaussian_bytes"] and better["file"] == ""
-    assert_refused(run("convert", scene, "-o", tmp_path / "new"), "exists and is not empty")
-
-
-def test_mistakes_of_convert(scene, tmp_path):
-    bad = scene(text="<scene version='3.0.0'><shape></scene>")
-    for arguments, words in (
-        ([bad, "-o", tmp_path / "new"], "scene.xml: "),
-        ([tmp_path / "none.xml", "-o", tmp_path / "new"], "does not exist"),
-        ([bad, "-o", tmp_path / "a" / "b"], "cannot create a file"),
-    ):
-        assert_refused(run("convert", *arguments), words)
-        assert list(tmp_path.iterdir()) == [bad]

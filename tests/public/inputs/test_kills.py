@@ -23,8 +23,6 @@ def inputs(tmp_path_factory):
 
 @pytest.mark.parametrize("name", kill_commands.COMMANDS)
 def test_kills(inputs, tmp_path, name, monkeypatch):
-    if name == "convert":
-        pytest.importorskip("mitsuba")
     monkeypatch.setenv("PYTHONPATH", python_path())
     words, leaves = kill_commands.COMMANDS[name]
     whole = shutil.copytree(inputs, tmp_path / "whole")

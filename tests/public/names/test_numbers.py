@@ -11,7 +11,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.families import family
 
-NEED_MITSUBA = ("convert_scene", "fit_for_scene", "register_plugins")
+NEED_MITSUBA = ("fit_for_scene", "register_plugins")
 
 
 def functions():
