@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
+from threadpoolctl import threadpool_limits
 
 from ..backend.executor import completed
 from ..backend.messages import warn
@@ -182,6 +183,8 @@ def product(a: Singles, b: Singles) -> Doubles:
     return result
 
 
+# With two threads, matrices of 150 to 1,200 rows take 3 to 50 times the CPU time.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def largest_eigenpairs(gram: Doubles, limit: int, floor: float) -> tuple[Doubles, Doubles]:
     """Return the largest eigenvalues of a Gram matrix, and the weights of its rows.
 

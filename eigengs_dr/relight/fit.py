@@ -22,6 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
+from threadpoolctl import threadpool_limits
 
 from ..backend.messages import warn
 from ..backend.types import ArrayLike, Doubles, Singles
@@ -235,7 +237,7 @@ def find_planes(photos: Photos, planes: int | None = None) -> Planes:
     rows -= mean.astype(np.float32)[:, None]
     gram = product(rows, rows) / rows.shape[1]
     limit = planes or min(MAX_PLANES, most_planes(len(lights)))
-    errors = {choice: left_out(gram, mean, lights, *choice, limit) for choice in TABLES}
+    errors = left_out(gram, mean, lights, limit)
     psnrs = {
         choice: np.array([_mean_psnr(column + ROUNDING) for column in of_choice.T])
         for choice, of_choice in errors.items()
@@ -271,9 +273,10 @@ def folds(lights: Doubles) -> list[NDArray[np.bool_]]:
     return [np.arange(len(lights)) % count == fold for fold in range(count)]
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # more wait for each other, see `incremental`
 def left_out(
-    gram: Doubles, mean: Doubles, lights: Doubles, kind: str, smoothing: float, limit: int
-) -> Doubles:
+    gram: Doubles, mean: Doubles, lights: Doubles, limit: int
+) -> dict[tuple[str, float], Doubles]:
     """Return errors (n, limit) of left-out photos with 1, 2, ..., `limit` planes of the others.
 
     With the covariance C of the rows, the eigenpairs (V, L) of the rest R, and interpolated factors
@@ -286,25 +289,31 @@ def left_out(
         Covariance of the rows over the pixels.
     mean : ndarray of float64, shape (3 n,)
     lights : ndarray of float64, shape (n, 3)
-    kind, smoothing
-        See `LightTable`.
     limit : int
         At most `most_planes`.
+
+    Returns
+    -------
+    dict
+        For each of `TABLES`.
     """
-    all_errors = np.empty((len(lights), limit))
+    all_errors = {choice: np.empty((len(lights), limit)) for choice in TABLES}
     for out in folds(lights):
         left, rest = np.repeat(out, 3), np.repeat(~out, 3)
-        values, vectors = np.linalg.eigh(gram[np.ix_(rest, rest)])
-        values, vectors = values[::-1][:limit], vectors[:, ::-1][:, :limit]
+        span = (rest.sum() - limit, rest.sum() - 1)
+        values, vectors = eigh(gram[np.ix_(rest, rest)], subset_by_index=span)
+        values, vectors = values[::-1], vectors[:, ::-1]
         columns = np.concatenate([vectors, mean[rest, None]], axis=1)
+        products = gram[np.ix_(left, rest)] @ vectors
         known = lights[~out]
-        solved = solve_table(kind, smoothing, known, columns.reshape(len(known), -1))
-        factors = (functions_at(kind, known, lights[out]) @ solved).reshape(left.sum(), -1)
-        weights = factors[:, :-1]
-        change = values * weights**2 - 2 * weights * (gram[np.ix_(left, rest)] @ vectors)
-        errors = np.diag(gram)[left] + (mean[left] - factors[:, -1]) ** 2
-        errors = errors[:, None] + np.cumsum(change, axis=1)
-        all_errors[out] = np.maximum(errors.reshape(-1, 3, limit).mean(axis=1), 0)
+        for (kind, smoothing), errors in all_errors.items():
+            solved = solve_table(kind, smoothing, known, columns.reshape(len(known), -1))
+            factors = (functions_at(kind, known, lights[out]) @ solved).reshape(left.sum(), -1)
+            weights = factors[:, :-1]
+            change = values * weights**2 - 2 * weights * products
+            fixed = np.diag(gram)[left] + (mean[left] - factors[:, -1]) ** 2
+            by_count = fixed[:, None] + np.cumsum(change, axis=1)
+            errors[out] = np.maximum(by_count.reshape(-1, 3, limit).mean(axis=1), 0)
     return all_errors
 
 

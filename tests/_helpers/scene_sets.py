@@ -1,7 +1,5 @@
 """Sets for the scenes."""
 
-from dataclasses import replace
-
 import eigengs_dr as eg
 
 
@@ -16,12 +14,12 @@ def save_halves(folder):
         save(name, red, blue, "rgb" if name == "poster" else "linear")
     save("roughness", [0.2], [0.6], "data")
     maps = [("albedo", "linear", 3), ("roughness", "data", 1), ("normal", "normal", 3)]
-    both = halves([*red, 0.2, 0.5, 0.5, 1], [*blue, 0.6, 0.6, 0.4, 0.9], "data")
-    replace(both, maps=tuple(maps)).save(folder / "tiles.npz")
+    both = halves([*red, 0.2, 0.5, 0.5, 1], [*blue, 0.6, 0.6, 0.4, 0.9], "data", maps)
+    both.save(folder / "tiles.npz")
     return folder
 
 
-def halves(above, below, space):
+def halves(above, below, space, maps=()):
     """Two splats so wide that each is one colour all over its half."""
     return eg.Gaussians.from_arrays(
         [[8, 4], [8, 12]],
@@ -30,5 +28,6 @@ def halves(above, below, space):
         [0.0] * len(above),
         size=(16, 16),
         space=space,
+        maps=maps,
         backend="llvm",
     )
