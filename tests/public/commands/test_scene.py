@@ -173,7 +173,8 @@ def test_a_texture_follows_each_camera(scene, tmp_path):
     np.testing.assert_allclose(pictures[0], pictures[2], rtol=1e-5)
     np.testing.assert_allclose(pictures[1], pictures[3], rtol=1e-5)
     assert pictures[0].shape != pictures[1].shape
-    result = run("scene", path, "-o", tmp_path / "x.png", "-D", "angle=0.5", *LLVM)
+    usual = ("--integrator", "direct", "-D", "angle=0.5", *LLVM)
+    result = run("scene", path, "-o", tmp_path / "x.png", *usual)
     assert result.exit_code == 0 and "say true, and the texture follows" in result.stderr
 
 
