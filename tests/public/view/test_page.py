@@ -9,7 +9,6 @@ import eigengs_dr as eg
 from _helpers.families import SIDE, family, small_model
 from _helpers.lit_spheres import directions, photos
 from _helpers.sets import random_scene
-from eigengs_dr.viewer.view import Page
 
 SIZE = (120, 90)
 
@@ -110,7 +109,7 @@ def test_16_bit_sums_are_close(actual):
         };
     </script>"""
     page = eg.view(gaussians)
-    tab = actual(Page(page.html.replace("<script>", without + "<script>", 1)))
+    tab = actual(replace(page, html=page.html.replace("<script>", without + "<script>", 1)))
     assert tab.run("viewer.renderer.format === viewer.renderer.gl.RGBA16F")
     assert differ(tab.image(), codes(gaussians)) < 0.2
 
@@ -328,10 +327,14 @@ def lit():
 
 
 @pytest.mark.parametrize("kind", ["thin_plate", "hsh"])
-def test_the_light_follows_the_pointer(actual, lit, kind):
+def test_a_page_relights_by_each_table(actual, lit, kind):
     model = replace(lit, table=replace(lit.table, kind=kind))
-    tab = actual(eg.view(model))
-    assert differ(tab.image(), codes(model.relight((0, 0, 1)))) < 0.1
+    tab = actual(eg.view(model, light=(0.6, 0, 0.8)))
+    assert differ(tab.image(), codes(model.relight((0.6, 0, 0.8)))) < 0.1
+
+
+def test_the_light_follows_the_pointer(actual, lit):
+    model, tab = lit, actual(eg.view(lit))
     left, top, width, height = tab.run("viewer.camera.frame")
     tab.page.mouse.move(left + 0.75 * width, top + 0.25 * height)
     light = tab.run("lights.direction")
