@@ -2,21 +2,10 @@
 
 import re
 import runpy
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-FOLDER = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(FOLDER.glob("*.md")), *sorted(FOLDER.glob("*/*.md"))]
-
-
-def test_getting_started_lists_all_extras():
-    text = (FOLDER / "getting-started.md").read_text()
-    said = set(re.findall(r"^\| `(\w+)` \|", text, re.M))
-    extras = (ROOT / "pyproject.toml").read_text()
-    extras = extras.split("[project.optional-dependencies]")[1].split("\n[")[0]
-    assert set(re.findall(r"^(\w+) = \[", extras, re.M)) == said
+from _helpers.pages import FOLDER, PAGES, ROOT
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +15,6 @@ def check():
 
 def test_names_are_where_the_manual_says(check):
     assert check["missing"]() == []
-    assert check["exists"]("eigengs_dr.fitting.placement.redistribution.target_density")
-    assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.Canvas")
-    assert not check["exists"]("eigengs_dr.fitting.placement.adaptive.nothing")
 
 
 def test_the_folders_are_those_of_the_layers():
@@ -44,11 +30,8 @@ def test_figures_of_the_manual_can_be_traced(check):
     ("text", "traced"),
     [
         ("it takes 3.5 s", False),
-        ("it gains 0.1 to\n0.2 dB", False),
         ("| a | b |\n|---|---:|\n| x | 2 |", False),
-        ("it takes `3.5 s`, and is 5.3 times closer", False),
         ("it is 5.3 times closer", False),
-        ("it takes 3.5 s. That is of commit 0a1b2c3.", False),
         ("it takes 3.5 s (2 photos,\ncommit 0a1b2c3). It is set.", True),
         ("it takes <!-- figure: kernels.fast -->3.5 ms<!-- end -->, and $6$ dB", True),
         ("it takes 4 GB <!-- setting --> of memory", True),
@@ -123,13 +106,6 @@ def test_the_reference_is_what_the_code_says():
     pytest.importorskip("eigengs_bench", reason="pip install ./benchmarks")
     pages = runpy.run_path(str(ROOT / "tools" / "manual" / "pages.py"))
     assert pages["outdated"]() == {}
-
-
-def test_readme_fits_a_screen():
-    lines = (ROOT / "README.md").read_text().splitlines()
-    first = [line for line in lines if line.startswith("!")]
-    assert len(lines) <= 100 and "kodak-speed.svg" in first[1]
-    assert (FOLDER / "images/teaser.jpg").stat().st_size < 150_000
 
 
 def test_no_page_needs_a_build_to_be_read():
