@@ -10,7 +10,7 @@ import pytest
 
 import eigengs_dr as eg
 
-FOLDER = Path(__file__).parent.parent / "examples"
+FOLDER = Path(__file__).parents[2] / "examples"
 
 NUMBER = r"(-?\d+(?:\.\d+)?(?:e[+-]\d+)?|nan|inf)"
 
@@ -94,6 +94,7 @@ def test_numpy_and_torch(run, tmp_path):
     check_pictures(tmp_path, "rocket", "rocket_mirrored", "rocket_torch")
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_texture(run, tmp_path):
     pytest.importorskip("mitsuba")

@@ -6,7 +6,7 @@ import pytest
 
 from _helpers.process import python_path, run_python
 
-SECONDS = float(os.environ.get("SOAK_SECONDS", "60"))
+SECONDS = float(os.environ.get("SOAK_SECONDS", "30"))
 
 MIXED = """
 import os, sys, threading, time

@@ -82,9 +82,7 @@ def test_closed_standard_error(photo, tmp_path):
 # --- Ctrl-C and SIGTERM: one line and exit code 130, and nothing half-written stays ---
 
 
-@pytest.mark.parametrize(
-    ("module", "sent"), [("click", signal.SIGINT), ("numpy", signal.SIGTERM)]
-)
+@pytest.mark.parametrize(("module", "sent"), [("click", signal.SIGINT), ("numpy", signal.SIGTERM)])
 def test_in_an_import(tmp_path, module, sent):
     """NumPy would blame its installation for an interrupt."""
     code = f"import os, time\nos.kill(os.getpid(), {int(sent)})\ntime.sleep(60)"
