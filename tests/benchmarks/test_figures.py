@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from _helpers.benchmarks import lines_of, moment, row
-from eigengs_bench import inverse, kodak, pareto, pictures, rate, relight, stability, tables
-from eigengs_bench.names import PRESETS
+from eigengs_bench import inverse, kodak, pareto, rate, relight, stability, tables
 from eigengs_bench.sky import psnr_without_noise
 
 
@@ -68,15 +67,6 @@ def test_fits_of_one_machine_stand_beside_published_ones():
     assert labels[0] == "eigengs_dr, 1,000 steps, by Gaussians"
     assert any("NVIDIA V100 (arXiv 2403.08551)" in label for label in labels)
     assert "kodak-speed" not in kodak.summarize([row(job | {"timed": False}, **figures)]).charts
-
-
-def test_curves_are_those_of_the_longest_fits():
-    fits = []
-    for preset, count in zip((*PRESETS, PRESETS[0]), (3, 3, 3, 2), strict=True):
-        job = {"set": "samples", "preset": preset, "iterations": count}
-        fits.append(row(job, marks=[*range(count)], psnr_ycbcr=[20.0] * count))
-    lines = pictures.summarize(fits).charts["curves"].axes[0].lines
-    assert [len(line.get_xdata()) for line in lines] == [3, 3, 3]
 
 
 def test_the_matrix_of_ends():
@@ -164,16 +154,6 @@ def test_gain_at_equal_seconds():
     assert inverse.gain({"pyramid": pyramid, "fit": fits}) == pytest.approx([1, -4, 6])
     both = {"pyramid": pyramid, "texels": texels, "fit": fits}
     assert inverse.gain(both) == pytest.approx([1, -4, 1])
-
-
-@pytest.mark.parametrize("tuned", [False, True])
-@pytest.mark.parametrize("kind", ["JPEG", "AVIF"])
-def test_coded_planes_are_near_the_planes(kind, tuned):
-    y, x = np.mgrid[:32, :32] / 32
-    planes = np.stack([np.sin(3 * x + k) / (k + 1) for k in range(6)], 2).astype(np.float32)
-    size, found = relight.coded(planes + y[..., None], kind, tuned, 95)
-    assert size > 200
-    assert np.abs(found - planes - y[..., None]).max() < 0.05
 
 
 def test_bytes_at_a_psnr():

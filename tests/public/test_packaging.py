@@ -82,27 +82,6 @@ def test_archives_hold_all_files(published, wheel):
         assert f"eigengs_dr/{name}" in names
 
 
-SCENE = """
-import eigengs_dr as eg
-import mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-from eigengs_dr.plugins import texture_of
-eg.register_plugins()
-bsdf = {"type": "diffuse", "reflectance": texture_of(eg.Gaussians.load("fit.npz"))}
-scene = mi.load_dict({
-    "type": "scene",
-    "integrator": {"type": "direct"},
-    "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(
-        [0, 0, 4], [0, 0, 0], [0, 1, 0]), "film": {"type": "hdrfilm", "width": 16, "height": 16}},
-    "light": {"type": "constant"},
-    "card": {"type": "rectangle", "bsdf": bsdf},
-})
-picture = mi.render(scene, spp=4).numpy()
-print(eg.__file__)
-print(0.05 < picture.mean() < 0.95, picture.std() > 0.01)
-"""
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_an_installed_wheel_works_outside_of_the_checkout(wheel, tmp_path):
@@ -117,13 +96,14 @@ def test_an_installed_wheel_works_outside_of_the_checkout(wheel, tmp_path):
     programs = tmp_path / "empty" / ("Scripts" if os.name == "nt" else "bin")
     python, command = programs / "python", programs / "eigengs-dr"
     run(python, "-m", "pip", "install", f"{wheel}[plugins]")
-    assert "llvm     works" in run(command, "doctor")
+    doctor = run(command, "doctor")  # it fits, and renders a scene with a texture
+    assert "llvm     works" in doctor and "programs of a first fit are compiled" in doctor
     run(python, "-c", "import eigengs_dr as eg; eg.save_image('a.png', eg.sample('coffee')[:96])")
     run(command, "fit", "a.png", "-o", "fit.npz", "--gaussians", 100, "--iterations", 20)
     run(command, "fit", "a.png", "-o", "n.npz", "--basis", "natural", "--iterations", 0)
     run(command, "view", "fit.npz", "-o", "page.html")
-    where, checks = run(python, "-c", SCENE).splitlines()
-    assert Path(where).is_relative_to(tmp_path / "empty") and checks == "True True"
+    where = run(python, "-c", "import eigengs_dr.plugins as p; print(p.__file__)")
+    assert Path(where).is_relative_to(tmp_path / "empty")
     bench = subprocess.run([command, "bench"], capture_output=True, text=True, check=False)
     assert bench.returncode == 2 and bench.stderr.count("\n") == 1
     assert "pip install ./benchmarks" in bench.stderr

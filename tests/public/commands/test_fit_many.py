@@ -59,14 +59,6 @@ def test_images_in_subfolders(photos, tmp_path):
     assert result.stderr == "" and (tmp_path / "fits" / "02.npz").exists()
 
 
-def test_a_folder_of_one_image(photo, tmp_path):
-    folder, report = tmp_path / "photos", tmp_path / "r.json"
-    folder.mkdir()
-    shutil.copy(photo, folder / "a.png")
-    succeeded(run("fit", folder, "-o", tmp_path / "fits", "--report", report, *QUICK))
-    assert list(results(tmp_path / "fits")) == ["a.npz"] and len(rows(report)) == 1
-
-
 def test_the_same_command_continues(photos, tmp_path):
     fits, report = tmp_path / "fits", tmp_path / "r.json"
     command = ["fit", photos, "-o", fits, "--report", report, *QUICK]

@@ -203,13 +203,6 @@ def test_a_list_in_the_folder_counts_as_given(coin, given):
     assert result.stderr == ("" if given else note)
 
 
-def test_hidden_lists_do_not_count_and_capitals_do(coin):
-    shutil.copy(coin / "dirs.lp", coin / "._dirs.lp")
-    (coin / "dirs.lp").rename(coin / "DIRS.LP")
-    note = succeeded(run("train", "coin", "-o", "m.npz", *FEW)).stderr
-    assert "coin/DIRS.LP names the lights" in note and note.count("\n") == 1
-
-
 @pytest.mark.parametrize(
     "options",
     [

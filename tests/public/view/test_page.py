@@ -369,25 +369,21 @@ def test_the_light_follows_a_finger(show, lit):
 
 
 def test_buttons_turn_the_light_and_leave_it_there(actual, lit):
-    tab = actual(eg.view(lit))
-    tab.page.focus("#presets button:nth-child(2)")
-    tab.page.keyboard.press("Enter")
-    light = tab.run("lights.direction")
-    assert light[1] > 0.9 and light[2] == pytest.approx(lit.lights[:, 2].min())
-    assert differ(tab.image(), codes(lit.relight(light))) < 0.1
-    left, top, width, height = tab.run("viewer.camera.frame")
-    tab.page.mouse.move(left + 0.75 * width, top + 0.25 * height)
-    assert tab.run("lights.direction") == light
-
-
-def test_a_photo_starts_under_its_light(actual, lit):
+    """A photo starts under its light, to which the first button turns back."""
     light = lit.lights[7].tolist()
     tab = actual(eg.view(lit, photos(lit.lights[7:8])[0], light=light))
     left, top, width, height = tab.run("viewer.camera.frame")
-    tab.page.mouse.move(left + 0.75 * width, top + 0.25 * height)
-    assert np.allclose(tab.run("lights.direction"), light)
+    place = left + 0.75 * width, top + 0.25 * height
+    tab.page.mouse.move(*place)
+    np.testing.assert_allclose(tab.run("lights.direction"), light)
     tab.page.click("#presets button:nth-child(4)")
     assert tab.run("lights.direction") == [0, 0, 1]
+    tab.page.focus("#presets button:nth-child(2)")
+    tab.page.keyboard.press("Enter")
+    above = tab.run("lights.direction")
+    assert above[1] > 0.9 and above[2] == pytest.approx(lit.lights[:, 2].min())
+    tab.page.mouse.move(*place)
+    assert tab.run("lights.direction") == above
     tab.page.click("#presets button:nth-child(1)")
-    assert np.allclose(tab.run("lights.direction"), light)
+    np.testing.assert_allclose(tab.run("lights.direction"), light)
     assert differ(tab.image(), codes(lit.relight(light))) < 0.1
