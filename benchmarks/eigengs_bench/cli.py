@@ -12,7 +12,6 @@ from eigengs_bench.names import (
     KODAK_COUNTS,
     PAPER_SETS,
     PARTS,
-    PICTURES,
     PRESETS,
     SAMPLES,
     SETS,
@@ -146,16 +145,10 @@ def tables() -> None:
 
 @question("pictures")
 @data_argument
-@several("--picture", "pictures", PICTURES, "What to draw, by default all")
-@number("--images", "Images per set, for curves.", 8, 1)
+@number("--images", "Number of images from each set.", 8, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def pictures() -> None:
-    """Draw PSNR over steps, and where Gaussians show as tiles.
-
-    \b
-    curves  PSNR every 50 iterations
-    tiles   a slow gradient by every method, and its errors
-    """
+    """Draw PSNR over steps of every method, as the paper does."""
 
 
 @question("pareto", (SAMPLES,))

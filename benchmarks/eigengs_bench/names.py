@@ -26,7 +26,6 @@ NATURAL, SAMPLES = "natural256", "samples"
 
 PRESETS = ("default", "gaussianimage", "eigengs")
 TABLES = ("main", "ablation", "cross")
-PICTURES = ("curves", "tiles")
 PARTS = ("pixels", "splats", "small")
 SUBJECTS_OF_SAMPLES = ("poster", "ball", "material")
 SUBJECTS_OF_DATA = ("painting", "wall")

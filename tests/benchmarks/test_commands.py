@@ -72,11 +72,9 @@ def test_tables(data, tmp_path, backend):  # noqa: F811
 @slow
 def test_pictures(data, tmp_path):  # noqa: F811
     out = tmp_path / "out"
-    wanted = ("--picture", "curves", "--picture", "tiles")
-    rows, text = answered(out, "pictures", data, "--images", 1, "--iterations", 3, *wanted)
-    assert (out / "curves.svg").exists() and "The middle of a slow gradient" in text
-    assert {row["job"]["set"] for row in rows if "psnr_ycbcr" in row} == {"cats256", "natural256"}
-    assert eg.load_image(out / "tiles.png").std() > 0.01
+    rows, text = answered(out, "pictures", data, "--images", 1, "--iterations", 3)
+    assert (out / "curves.svg").exists() and "gaussianimage" in text
+    assert {row["job"]["set"] for row in rows} == {"cats256", "natural256"}
 
 
 @slow
@@ -184,7 +182,7 @@ def test_texture(monkeypatch, tmp_path):
     # Texels of a colour take four bytes, those of a map one.
     assert photo["bitmap_bytes"] == pytest.approx(4 * photo["side"] ** 2, rel=0.1)
     assert material["bitmap_bytes"] == pytest.approx(material["side"] ** 2, rel=0.1)
-    assert ball["bytes_filtered_20"] > ball["bytes_20"] > 0
+    assert ball["bytes_20"] > 0 and ball["held_20"] > 0
     assert ball["ratio_20"] > 0 and ball["ratio_step"] > 0 and ball["ratio_step_filtered"] > 0
     assert "memory, sharp text" in text and "coffee" in text
     for light in lights:
@@ -237,7 +235,7 @@ def test_relight(lit, tmp_path, monkeypatch):
     pytest.importorskip("mitsuba")
     eg.register_plugins()  # before the first row, which names the threads of Dr.Jit
     few = {"PLANES": (6,), "QUALITIES": (30, 90), "PIXELS": (16,), "BUDGETS": (0.5,)}
-    smaller(monkeypatch, relight, FOUND=1, STEPS=2, **few)
+    smaller(monkeypatch, relight, **few)
     shutil.rmtree(lit / "b")
     rows, text = answered(tmp_path / "out", "relight", lit, "--iterations", 5)
     assert {row["job"]["set"] for row in rows} == {"a"}
