@@ -1,19 +1,14 @@
-"""Rows of benchmarks, and of which code they are; programs in turns, images, models."""
+"""Rows of benchmarks, of which code they are, and the images that are measured."""
 
-import os
 import subprocess
-import sys
-from functools import partial
 
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
 from _helpers.benchmarks import RUN, data, row, task_in  # noqa: F401  data is a fixture
-from _helpers.command import main
-from _helpers.families import family
-from eigengs_bench import clock, images, report, rows
-from eigengs_bench.names import PRESETS, SETS, ImageSet
+from eigengs_bench import images, report, rows
+from eigengs_bench.names import SETS, ImageSet
 
 OTHER = {**RUN, "commit": "b" * 40}
 DIRTY = {**RUN, "clean": False}
@@ -110,35 +105,6 @@ def test_the_commit_is_that_of_the_package(tmp_path):
     assert rows.code_state(package) == {"commit": state["commit"], "clean": False}
 
 
-def test_memory_is_that_of_a_process_alone():
-    assert 0.02 < rows.alone("it", rows.peak_gib)() < rows.peak_gib() + 1
-    with pytest.raises(ValueError, match="it: its process was killed"):
-        rows.alone("it", sys.modules["os"]._exit, 9)()
-
-
-# --- Programs in turns, sets of images and their models ---
-
-
-def test_methods_have_the_names_of_the_command_line():
-    [preset] = [option for option in main.commands["fit"].params if option.name == "preset"]
-    assert tuple(clock.METHODS) == PRESETS == tuple(preset.type.choices)
-
-
-def test_programs_take_turns():
-    order, seen = [], []
-    programs = {name: partial(order.append, name) for name in "ab"}
-    ms = clock.interleaved(programs, 1, 2, lambda *step: seen.append(step))
-    assert "".join(order) == "ababab" and seen == [(1, 3), (2, 3), (3, 3)]
-    assert set(ms) == {"a", "b"} and all(value >= 0 for value in ms.values())
-
-
-def test_programs_apart_have_a_process_each():
-    makers = {"a": partial(partial, os.getpid)}
-    ms = clock.interleaved_apart(makers, 0, 1)
-    assert ms.keys() == {"a"} and ms["a"] >= 0
-    assert clock.KEPT == []  # the programs are in other processes
-
-
 def test_images_are_the_first_ones_at_the_size_of_their_set(tmp_path, monkeypatch):
     monkeypatch.setitem(SETS, "kodak", ImageSet("photos", 30, 20, 50))
     (tmp_path / "photos").mkdir()
@@ -150,16 +116,3 @@ def test_images_are_the_first_ones_at_the_size_of_their_set(tmp_path, monkeypatc
     assert [name for name, _ in images.images_of(task, "samples", 1)] == ["chelsea"]
     with pytest.raises(eg.ImageError, match="cars256"):
         images.images_of(task, "cars256")
-
-
-def test_models_are_trained_once_on_the_training_images(tmp_path, backend, data):  # noqa: F811
-    arguments = (task_in(tmp_path, backend, data), "cats256", "natural256", 4, "rgb")
-    model = images.model_for(*arguments, True)
-    assert model.components == (4, 4, 4)
-    assert len(model.gaussians) == 60 and model.low == 6 and model.gaussians.space == "rgb"
-    expected = family(16, seed=1)[2:].mean(axis=(0, 1, 2))
-    assert np.allclose(model.mean_image.mean(axis=(1, 2)), expected, atol=5e-3)
-    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "models").iterdir()}
-    images.model_for(*arguments, True)
-    images.model_for(*arguments)  # another model of the same basis
-    assert files.items() <= {p: p.stat().st_mtime_ns for p in files}.items() and len(files) == 2

@@ -192,6 +192,25 @@ def test_fit_from_a_set(fitted, photo, tmp_path):
     assert_refused(run(*command, "--basis", "natural"), "--start and --basis")
 
 
+def test_outlines_of_a_preview(tmp_path, monkeypatch):
+    """They are one standard deviation away, over a lighter picture; huge ones are not drawn."""
+    monkeypatch.chdir(tmp_path)
+    eg.save_image("grey.png", np.full((20, 30, 3), 0.5))
+    factor = np.array([[0.3, -0.2], [0, 0.5]])
+    shapes = [[*factor[0], factor[1, 1]], [1e-6, 0, 1e-6]]
+    start = eg.Gaussians.from_arrays([[15, 10], [1e6, 5]], shapes, np.ones((2, 3)), size=(30, 20))
+    start.save("start.npz")
+    outputs = ["-o", "x.npz", "--preview", "p.png", "--iterations", 0]
+    said("fit", "grey.png", *outputs, "--start", "start.npz", "--keep")
+    _, fit, outlines = np.split(eg.load_image("p.png"), 3, axis=1)
+    assert fit[0, 0, 0] == pytest.approx(0.5, abs=0.01)
+    assert outlines[0, 0, 0] == pytest.approx(0.6 + 0.4 * 0.5, abs=0.01)
+    y, x = np.nonzero(outlines[..., 0] < 0.35)
+    away = np.stack([x + 0.5, y + 0.5], axis=1) / (len(fit) / 20) - [15, 10]
+    assert len(x) > 100
+    np.testing.assert_allclose(np.linalg.norm(away @ factor.T, axis=1), 1, atol=0.06)
+
+
 def test_levels(photo, tmp_path):
     fitted, small, report = (tmp_path / f"a.{end}" for end in ("npz", "egs", "json"))
     base = ["fit", photo, "-o", fitted, "--quiet", "--iterations", 5]

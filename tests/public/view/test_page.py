@@ -114,19 +114,6 @@ def test_16_bit_sums_are_close(actual):
     assert differ(tab.image(), codes(gaussians)) < 0.2
 
 
-def test_draws_again_after_the_context_is_lost(actual):
-    gaussians = make_set()
-    tab = actual(eg.view(gaussians))
-    tab.page.evaluate("""() => new Promise((done) => {
-        viewer.canvas.addEventListener("webglcontextrestored", () => setTimeout(done, 50));
-        const loss = viewer.renderer.gl.getExtension("WEBGL_lose_context");
-        loss.loseContext();
-        setTimeout(() => loss.restoreContext(), 50);
-    })""")
-    tab.run("0")
-    assert differ(tab.image(), codes(gaussians)) < 0.05
-
-
 # --- Mouse, touch and keyboard ---
 
 
