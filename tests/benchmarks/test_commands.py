@@ -15,7 +15,6 @@ from _helpers.benchmarks import (  # noqa: F401  data is a fixture
 from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
 from eigengs_bench import cases, inverse, kernels, poster, rate, relight, scaling, sky, texture
-from eigengs_bench.clock import METHODS
 from eigengs_bench.images import images_of
 from eigengs_bench.names import SETS, ImageSet
 from eigengs_bench.report import Section
@@ -61,12 +60,9 @@ def test_tables(data, tmp_path, backend):  # noqa: F811
     assert set(ends) == {"default", "gaussianimage", "eigengs"}
     for words in ("eigengs, own basis", "eigengs, universal basis", "psnr_ycbcr / psnr_rgb in dB"):
         assert words in text
-    # The same figures as those of a fit.
     image = images_of(task_in(tmp_path, data=data, images=1), "cats256")[0][1]
-    for preset in ("default", "gaussianimage"):
-        [found] = [row for row in rows if row["job"].get("preset") == preset]
-        expected = eg.fit(image, 60, 12, method=METHODS[preset], backend=backend)
-        assert found["moments"][-1]["psnr_rgb"] == pytest.approx(expected.trace[-1]["psnr_rgb"])
+    expected = eg.fit(image, 60, 12, backend=backend).psnr_rgb
+    assert ends["default"]["psnr_rgb"] == pytest.approx(expected)
 
 
 @slow
@@ -161,8 +157,7 @@ def test_kernels(monkeypatch, backend, tmp_path):
     smaller(monkeypatch, kernels, SIDE=64, COUNT=300, ROUNDS=2, PEAK_LANES=1 << 10)
     told = said("bench", "kernels", "--backend", backend, "-o", tmp_path)
     [found] = read(tmp_path / FILE)
-    for name in ("step_ms", "forward_ms", "forward_peak_fraction", "step_peak_fraction"):
-        assert found[name] > 0 and name in told
+    assert found["step_ms"] > 0 < found["forward_peak_fraction"] and "forward_ms" in told
 
 
 @slow
@@ -183,13 +178,11 @@ def test_texture(monkeypatch, tmp_path):
     assert photo["bitmap_bytes"] == pytest.approx(4 * photo["side"] ** 2, rel=0.1)
     assert material["bitmap_bytes"] == pytest.approx(material["side"] ** 2, rel=0.1)
     assert ball["bytes_20"] > 0 and ball["held_20"] > 0
-    assert ball["ratio_20"] > 0 and ball["ratio_step"] > 0 and ball["ratio_step_filtered"] > 0
+    assert ball["ratio_20"] > 0 and ball["ratio_step_filtered"] > 0
     assert "memory, sharp text" in text and "coffee" in text
     for light in lights:
         assert light["mean"] < 0.2 and light["variance"] > 0 and light["ratio"] > 0
-        assert 15 < light["lookups"] < 60 and light["images"] > 20
-        assert light["bitmap_bytes"] > 0 and light["bytes"] > 0
-        assert light["job"]["light"] in text
+        assert 15 < light["lookups"] < 60 and light["images"] > 20 and light["bytes"] > 0
 
 
 @slow

@@ -7,23 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from _helpers.benchmarks import lines_of, moment, row
-from eigengs_bench import inverse, kodak, pareto, rate, relight, stability, tables
+from eigengs_bench import inverse, kodak, pareto, rate, stability, tables
 from eigengs_bench.sky import psnr_without_noise
-
-
-def test_means_of_tables_count_failures():
-    job = {"set": "faces256", "iterations": 1000, "gaussians": 60}
-    usual = {"source": "", "components": 0, "space": "ycbcr", "split": "auto"}
-    made = [
-        row(
-            {**job, **usual, "image": str(k), "preset": preset},
-            moments=[moment(0, 30.0 + 2 * k), moment(1000, value)],
-        )
-        for preset in ("default", "gaussianimage")
-        for k, value in enumerate((34.0, 36.0, None, 42.0))
-    ]
-    first, *_ = tables.summarize(made).tables
-    assert lines_of(first)[0] == ("faces256", "default", "33.0", "37.3 (1 failed)", "1.00")
 
 
 def test_few_columns_have_what_the_paper_prints_beside_ours():
@@ -154,10 +139,3 @@ def test_gain_at_equal_seconds():
     assert inverse.gain({"pyramid": pyramid, "fit": fits}) == pytest.approx([1, -4, 6])
     both = {"pyramid": pyramid, "texels": texels, "fit": fits}
     assert inverse.gain(both) == pytest.approx([1, -4, 1])
-
-
-def test_bytes_at_a_psnr():
-    points = pd.DataFrame({"bytes_per_pixel": [1.0, 4.0, 2.0], "psnr_rgb": [30.0, 34.0, 29.0]})
-    assert relight.at_level(points, 32.0) == (pytest.approx(2.0), 0.0)
-    assert relight.at_level(points, 40.0) == (4.0, -6.0)
-    assert relight.at_level(points, 28.0) == (1.0, 2.0)

@@ -1,6 +1,5 @@
 """The examples run, write pictures, and reach what they print."""
 
-import math
 import re
 import runpy
 import sys
@@ -12,7 +11,7 @@ import eigengs_dr as eg
 
 FOLDER = Path(__file__).parents[2] / "examples"
 
-NUMBER = r"(-?\d+(?:\.\d+)?(?:e[+-]\d+)?|nan|inf)"
+NUMBER = r"(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)"
 
 
 @pytest.fixture
@@ -40,9 +39,7 @@ def numbers(text, pattern):
     escaped = re.escape(pattern).replace("NUM", NUMBER)
     found = re.findall(escaped, text)
     assert len(found) == 1, f"{pattern!r} is in the output {len(found)} times:\n{text}"
-    values = [float(x) for x in (found[0] if isinstance(found[0], tuple) else found)]
-    assert all(map(math.isfinite, values))
-    return values
+    return [float(x) for x in (found[0] if isinstance(found[0], tuple) else found)]
 
 
 def check_pictures(folder, *names):

@@ -165,20 +165,3 @@ def test_data_of_16_bits(tmp_path):
     succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.png", "--bits", 16))
     found = np.rint(eg.load_image(tmp_path / "y.png", keep_grey=True) * 65535)[..., 0]
     assert np.abs(found - heights).mean() < 60  # a step of 8 bits is 257
-
-
-def test_data_beyond_1_have_one_psnr(tmp_path):
-    """The trace, the report, rows of many images and a goal measure in one unit."""
-    folder, reports = tmp_path / "photos", []
-    folder.mkdir()
-    eg.save_image(folder / "a.pfm", 2 * smooth_pixels(32, 32).astype(np.float32)[..., 0] - 250)
-    for image, output in ((folder / "a.pfm", "one.npz"), (folder, "many")):
-        outputs = ["-o", tmp_path / output, "--report", tmp_path / "r.json"]
-        succeeded(run("fit", image, "--space", "data", *outputs, *FEW))
-        reports.append(json.loads((tmp_path / "r.json").read_text()))
-    one, several = reports
-    assert one["psnr_ycbcr"] == one["trace"][-1]["psnr_ycbcr"] > 25
-    assert several["images"][0]["psnr_ycbcr"] == one["psnr_ycbcr"]
-    goal = ["--target-psnr", 30, "--iterations", 60, "--space", "data", "-o", tmp_path / "few.npz"]
-    told = said("fit", folder / "a.pfm", *goal)
-    assert float(told.split("psnr_data ")[1].split(" dB")[0]) >= 30
