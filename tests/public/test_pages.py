@@ -15,7 +15,6 @@ import pytest
 import eigengs_dr as eg
 from _helpers.command import said
 from _helpers.pages import FOLDER, PAGES, ROOT, blocks_of, name_of
-from _helpers.photos import coffee
 
 RUN = [
     ROOT / "README.md",
@@ -89,7 +88,7 @@ def test_a_page_runs_from_its_first_block_to_its_last(page, tmp_path, monkeypatc
     What needs PyTorch runs only where it is installed.
     """
     monkeypatch.chdir(tmp_path)
-    eg.save_image("photo.jpg", coffee(64))
+    eg.save_image("photo.jpg", eg.sample("coffee")[100:164, 200:296])
     space = {"__name__": "__main__"}
     with warnings.catch_warnings():
         if page.stem in ("README", "getting-started"):

@@ -15,6 +15,7 @@ from PIL import Image
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said, smooth_pixels
 from _helpers.lit_models import LitFormula
+from _helpers.materials import material
 
 
 def facts_of(*arguments):
@@ -49,6 +50,7 @@ def test_info_of_a_fit(result, set_file):
     assert "gaussians   64" in text and "photo.png" in text and "bpp" in text
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_info_of_textures(set_file):
     """At least the arrays of the file; with a prefilter more."""
@@ -108,8 +110,7 @@ def fits(result, tmp_path_factory):
     result.save(folder / "a.npz")
     eg.pack(result.gaussians, folder / "b.egs", smooth_pixels(32, 32), 3)
     LitFormula().model().save(folder / "c.npz")
-    maps = {"albedo": smooth_pixels(32, 32), "roughness": smooth_pixels(32, 32, 1)}
-    eg.fit(maps, gaussians=64, iterations=1).save(folder / "d.npz")
+    material().save(folder / "d.npz")
     (folder / "notes.txt").write_text("no set")
     return folder
 

@@ -148,6 +148,7 @@ def test_several_images_go_on(tmp_path):
     assert len(json.loads(report.read_text())["images"]) == len(list(fits.glob("*.npz"))) == 1
 
 
+@pytest.mark.slow
 def test_blocks_go_on(tmp_path):
     photo, report = tmp_path / "photo.png", tmp_path / "r.json"
     eg.save_image(photo, smooth_pixels(64, 64))
@@ -160,6 +161,7 @@ def test_blocks_go_on(tmp_path):
     assert json.loads(report.read_text())["blocks_resumed"] > 0 and not checkpoint.exists()
 
 
+@pytest.mark.slow
 def test_a_training_goes_on(tmp_path):
     photos, output = random_fields(tmp_path / "photos", 12), tmp_path / "m.npz"
     command = ["train", photos, "-o", output, *SMALL, "--report", tmp_path / "m.json"]

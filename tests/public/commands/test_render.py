@@ -75,7 +75,6 @@ def test_smaller_pictures_are_averages(fitted, tmp_path, options):
     [
         ("linear", 3, ("RGB", "RGB")),
         ("linear", 1, ("L", "RGB")),
-        ("data", 3, ("RGB", "RGB")),
         ("data", 1, ("L", "L")),
     ],
 )

@@ -156,6 +156,7 @@ WALL = """<shape type="rectangle">
 SPHERE = '<shape type="sphere"><point name="center" x="0" y="0" z="4"/></shape>'
 
 
+@pytest.mark.slow
 @pytest.mark.exr
 def test_a_texture_follows_each_camera(scene, tmp_path):
     """And a prefilter that is a number for another film does not blur in silence."""

@@ -365,7 +365,7 @@ def test_buttons_turn_the_light_and_leave_it_there(actual, lit):
     np.testing.assert_allclose(tab.run("lights.direction"), light)
     tab.page.click("#presets button:nth-child(4)")
     assert tab.run("lights.direction") == [0, 0, 1]
-    tab.page.focus("#presets button:nth-child(2)")
+    tab.page.focus("#presets button:nth-child(3)")
     tab.page.keyboard.press("Enter")
     above = tab.run("lights.direction")
     assert above[1] > 0.9 and above[2] == pytest.approx(lit.lights[:, 2].min())
