@@ -67,6 +67,7 @@ def test_film(run, tmp_path):
     check_pictures(tmp_path, "still", "an_object_moves", "pan", "cuts")
 
 
+@pytest.mark.slow
 def test_render_and_differentiate(run, tmp_path):
     out = run("render_and_differentiate.py")
     reverse, forward = numbers(out, "by NUM a pixel (reverse), NUM (forward)")

@@ -310,7 +310,7 @@ def test_a_photo_moves_along_the_components(actual):
 def lit():
     """A model of a bump under lights."""
     lights = directions(20)
-    return eg.Relightable.fit(photos(lights), lights, gaussians=80, planes=5, iterations=20)
+    return eg.Relightable.fit(photos(lights), lights, gaussians=80, planes=3, iterations=20)
 
 
 @pytest.mark.parametrize("kind", ["thin_plate", "hsh"])
