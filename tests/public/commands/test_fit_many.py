@@ -149,3 +149,10 @@ def test_processes_of_this_machine(photos, tmp_path):
     assert far.keys() == here.keys()
     for name, expected in here.items():
         check_equal(far[name], expected.to_arrays())
+
+
+def test_a_scheduler_that_does_not_answer(photos, tmp_path):
+    dask = pytest.importorskip("dask")
+    with dask.config.set({"distributed.comm.timeouts.connect": "0.3s"}):
+        result = run("fit", photos, "-o", tmp_path / "x", "--cluster", "tcp://127.0.0.1:1")
+    assert_refused(result, "tcp://127.0.0.1:1", "start")
