@@ -94,7 +94,7 @@ layers: $(READY)
 	$(BIN)/lint-imports
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -q -m slow
+	$(BIN)/python -m pytest -q -m slow $(ON_ALL_CORES)
 
 # CUDASIM_APPROX: the simulated driver rounds approximate instructions as coarsely as a GPU may.
 # It compiles every program with gcc at its first use, within the time of the test.
