@@ -137,7 +137,6 @@ def tables() -> None:
     \b
     main      gaussianimage, default, and eigengs with its own and with the universal basis
     ablation  eigengs in YCbCr or RGB, with and without the frequency-aware split
-    cross     eigengs with the basis of other images
 
     FOLDER/models keeps trained bases and models: about a gigabyte per set.
     """

@@ -25,7 +25,7 @@ PAPER_SETS = ("faces256", "cats256", "cars256", "natural256", "cats512")
 NATURAL, SAMPLES = "natural256", "samples"
 
 PRESETS = ("default", "gaussianimage", "eigengs")
-TABLES = ("main", "ablation", "cross")
+TABLES = ("main", "ablation")
 PARTS = ("pixels", "splats", "small")
 SUBJECTS_OF_SAMPLES = ("poster", "ball", "material")
 SUBJECTS_OF_DATA = ("painting", "wall")
