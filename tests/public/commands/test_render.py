@@ -8,21 +8,17 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, previewed, run, said, smooth_pixels, succeeded
-from _helpers.packed import few_groups
-from eigengs_dr.gaussian.file import read_set
-from eigengs_dr.image.color import to_coded
-from eigengs_dr.image.io import load_image, save_image
 
-FEW = ["--gaussians", 200, "--iterations", 30, "--quiet"]
+FEW = ["--gaussians", 200, "--iterations", 20, "--quiet"]
 
 
 @pytest.mark.parametrize(
     ("options", "size"),
     [
-        ([], (32, 24)),
-        (["--scale", "2"], (64, 48)),
+        ([], (32, 32)),
+        (["--scale", "2"], (64, 64)),
         (["--size", "10x7"], (10, 7)),
-        (["--size", "16"], (16, 12)),
+        (["--size", "16"], (16, 16)),
         (["--size", "30", "--region", "4,4,20,10"], (30, 15)),
     ],
 )
@@ -51,7 +47,7 @@ def test_bad_sizes(fitted, tmp_path, options):
 
 
 @pytest.mark.parametrize("scale", [1, 2])
-@pytest.mark.parametrize("region", [(3, 5, 14, 10), (31, 23, 1, 1)])
+@pytest.mark.parametrize("region", [(3, 5, 14, 10), (31, 31, 1, 1)])
 @pytest.mark.parametrize("suffix", ["png", "tif"])
 def test_region_is_the_crop_of_the_whole(fitted, tmp_path, scale, region, suffix):
     part, whole = tmp_path / f"y.{suffix}", tmp_path / "whole.png"
@@ -64,10 +60,10 @@ def test_region_is_the_crop_of_the_whole(fitted, tmp_path, scale, region, suffix
     assert np.abs(found - np.asarray(Image.open(whole).crop(box)).astype(int)).max() <= 1
 
 
-@pytest.mark.parametrize("options", [["--size", "8"], ["--scale", "0.25"], ["--size", "32x6"]])
+@pytest.mark.parametrize("options", [["--size", "8"], ["--scale", "0.25"], ["--size", "32x8"]])
 def test_smaller_pictures_are_averages(fitted, tmp_path, options):
     succeeded(run("render", fitted[0] / "fit.npz", "-o", tmp_path / "y.png", *options))
-    found = load_image(tmp_path / "y.png")
+    found = eg.load_image(tmp_path / "y.png")
     gaussians = eg.Gaussians.load(fitted[0] / "fit.npz")
     for filter in (True, False):
         expected = eg.render(gaussians, *found.shape[1::-1], filter=filter).numpy().clip(0, 1)
@@ -79,7 +75,6 @@ def test_smaller_pictures_are_averages(fitted, tmp_path, options):
     [
         ("linear", 3, ("RGB", "RGB")),
         ("linear", 1, ("L", "RGB")),
-        ("data", 3, ("RGB", "RGB")),
         ("data", 1, ("L", "L")),
     ],
 )
@@ -114,22 +109,22 @@ def test_spaces_of_textures(tmp_path, space, channels, modes):
 def sky(tmp_path_factory):
     """A folder with an EXR file of light up to 50, and its fit."""
     folder = tmp_path_factory.mktemp("sky")
-    light = smooth_pixels(32, 24).astype(np.float32) / 100
+    light = smooth_pixels(32, 32).astype(np.float32) / 100
     light[5:9, 7:11] = 50
-    save_image(folder / "sky.exr", light)
+    eg.save_image(folder / "sky.exr", light)
     command = ["fit", folder / "sky.exr", "-o", folder / "sky.npz", "--space", "log", *FEW]
     succeeded(run(*command, "--report", folder / "r.json", "--preview", folder / "p.png"))
     return folder, light
 
 
-@few_groups()
 def test_fit_of_light(sky, tmp_path):
     folder, _ = sky
     figures = json.loads((folder / "r.json").read_text())
     assert figures["psnr_ycbcr"] > 25 and figures["encoding"] is None
-    assert load_image(folder / "p.png").shape[1] > 32
-    assert read_set(folder / "sky.npz").space == "log"
+    assert eg.load_image(folder / "p.png").shape[1] > 32
+    assert eg.Gaussians.load(folder / "sky.npz").space == "log"
     command = ["pack", folder / "sky.npz", "-o", tmp_path / "y.egs", "--image", folder / "sky.exr"]
+    command += ["--max-psnr-drop", 3]
     assert "psnr in log" in said(*command)
 
 
@@ -137,48 +132,35 @@ def test_fit_of_light(sky, tmp_path):
 def test_light_is_written(sky, tmp_path, name, bits):
     folder, light = sky
     succeeded(run("render", folder / "sky.npz", "-o", tmp_path / name, "--bits", bits))
-    found = load_image(tmp_path / name)
+    found = eg.load_image(tmp_path / name)
     assert found.shape == light.shape
     assert found.max() == pytest.approx(50, rel=0.2)
     assert np.median(found) == pytest.approx(np.median(light), rel=0.05)
 
 
-def test_codes_become_light_in_exr_and_an_encoding_can_be_said(tmp_path):
-    save_image(tmp_path / "a.png", smooth_pixels(32, 24))
-    command = ["fit", tmp_path / "a.png", "-o", tmp_path / "a.npz", "--overwrite", *FEW]
-    succeeded(run(*command))
+def test_codes_become_light_in_exr(fitted, tmp_path):
     for name in ("y.png", "y.exr"):
-        succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / name))
-    codes = to_coded(load_image(tmp_path / "y.exr"))
-    np.testing.assert_allclose(load_image(tmp_path / "y.png"), np.clip(codes, 0, 1), atol=0.003)
-    succeeded(run(*command, "--space", "linear", "--encoding", "linear"))
+        succeeded(run("render", fitted[0] / "fit.npz", "-o", tmp_path / name))
+    light = eg.load_image(tmp_path / "y.exr").clip(0.0031308, 1)
+    codes = 1.055 * light ** (1 / 2.4) - 0.055
+    shown = eg.load_image(tmp_path / "y.png")
+    np.testing.assert_allclose(shown.clip(0.04045), codes.clip(0.04045), atol=0.003)
+
+
+def test_an_encoding_can_be_said(photo, tmp_path):
+    """Codes that count as linear light are that of the rendering."""
+    command = ["fit", photo, "-o", tmp_path / "a.npz", *FEW, "--space", "linear"]
+    succeeded(run(*command, "--encoding", "linear"))
     succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.exr"))
-    means = [float(load_image(tmp_path / name).mean()) for name in ("a.png", "y.exr")]
+    means = [float(eg.load_image(path).mean()) for path in (photo, tmp_path / "y.exr")]
     assert means[0] == pytest.approx(means[1], rel=0.02)
 
 
 def test_data_of_16_bits(tmp_path):
-    y, x = np.mgrid[:24, :32]
+    y, x = np.mgrid[:32, :32]
     heights = (30_000 + 200 * x + 90 * y).astype(np.uint16)
-    save_image(tmp_path / "a.png", heights, bits=16)
+    eg.save_image(tmp_path / "a.png", heights, bits=16)
     succeeded(run("fit", tmp_path / "a.png", "-o", tmp_path / "a.npz", "--space", "data", *FEW))
     succeeded(run("render", tmp_path / "a.npz", "-o", tmp_path / "y.png", "--bits", 16))
-    found = np.rint(load_image(tmp_path / "y.png", keep_grey=True) * 65535)[..., 0]
+    found = np.rint(eg.load_image(tmp_path / "y.png", keep_grey=True) * 65535)[..., 0]
     assert np.abs(found - heights).mean() < 60  # a step of 8 bits is 257
-
-
-def test_data_beyond_1_have_one_psnr(tmp_path):
-    """The trace, the report, rows of many images and a goal measure in one unit."""
-    folder, reports = tmp_path / "photos", []
-    folder.mkdir()
-    save_image(folder / "a.pfm", 2 * smooth_pixels(64, 64).astype(np.float32)[..., 0] - 250)
-    for image, output in ((folder / "a.pfm", "one.npz"), (folder, "many")):
-        outputs = ["-o", tmp_path / output, "--report", tmp_path / "r.json"]
-        succeeded(run("fit", image, "--space", "data", *outputs, *FEW))
-        reports.append(json.loads((tmp_path / "r.json").read_text()))
-    one, several = reports
-    assert one["psnr_ycbcr"] == one["trace"][-1]["psnr_ycbcr"] > 25
-    assert several["images"][0]["psnr_ycbcr"] == one["psnr_ycbcr"]
-    goal = ["--target-psnr", 30, "--iterations", 60, "--space", "data", "-o", tmp_path / "few.npz"]
-    told = said("fit", folder / "a.pfm", *goal)
-    assert float(told.split("psnr_data ")[1].split(" dB")[0]) >= 30

@@ -1,6 +1,5 @@
 """The examples run, write pictures, and reach what they print."""
 
-import math
 import re
 import runpy
 import sys
@@ -10,9 +9,9 @@ import pytest
 
 import eigengs_dr as eg
 
-FOLDER = Path(__file__).parent.parent / "examples"
+FOLDER = Path(__file__).parents[2] / "examples"
 
-NUMBER = r"(-?\d+(?:\.\d+)?(?:e[+-]\d+)?|nan|inf)"
+NUMBER = r"(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)"
 
 
 @pytest.fixture
@@ -40,9 +39,7 @@ def numbers(text, pattern):
     escaped = re.escape(pattern).replace("NUM", NUMBER)
     found = re.findall(escaped, text)
     assert len(found) == 1, f"{pattern!r} is in the output {len(found)} times:\n{text}"
-    values = [float(x) for x in (found[0] if isinstance(found[0], tuple) else found)]
-    assert all(map(math.isfinite, values))
-    return values
+    return [float(x) for x in (found[0] if isinstance(found[0], tuple) else found)]
 
 
 def check_pictures(folder, *names):
@@ -70,6 +67,7 @@ def test_film(run, tmp_path):
     check_pictures(tmp_path, "still", "an_object_moves", "pan", "cuts")
 
 
+@pytest.mark.slow
 def test_render_and_differentiate(run, tmp_path):
     out = run("render_and_differentiate.py")
     reverse, forward = numbers(out, "by NUM a pixel (reverse), NUM (forward)")
@@ -94,6 +92,7 @@ def test_numpy_and_torch(run, tmp_path):
     check_pictures(tmp_path, "rocket", "rocket_mirrored", "rocket_torch")
 
 
+@pytest.mark.slow
 @pytest.mark.mitsuba
 def test_texture(run, tmp_path):
     pytest.importorskip("mitsuba")

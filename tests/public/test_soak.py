@@ -6,7 +6,7 @@ import pytest
 
 from _helpers.process import python_path, run_python
 
-SECONDS = float(os.environ.get("SOAK_SECONDS", "60"))
+SECONDS = float(os.environ.get("SOAK_SECONDS", "30"))
 
 MIXED = """
 import os, sys, threading, time
@@ -18,8 +18,8 @@ mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()
 from eigengs_dr.plugins import environment_of, photo_loss, texture_of
 
-works = "fit", "render", "scene", "recover", "drop"
-end, counts = time.monotonic() + {seconds}, dict.fromkeys(works, 0)
+end = time.monotonic() + {seconds}
+counts = dict.fromkeys(("fit", "render", "scene", "recover", "drop"), 0)
 image = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
 first = eg.fit(image, 60, iterations=3, space="linear", progress=False)
 expected = first.image.tobytes()
@@ -28,25 +28,23 @@ light = eg.Gaussians.from_arrays(
     [[8, 4]], [[0.3, 0, 0.3]], [[0.5] * 3], [1.0] * 3, size=(16, 8), space="radiance"
 )
 GREY = np.full((8, 8, 3), 0.5)
+CONSTANT = {{"type": "constant"}}
+FILM = {{"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb"}}
 
 
-def wall(texture, sky, integrator):
+def wall(texture, sky=CONSTANT, integrator="direct"):
     # Load a wall that a camera sees.
     view = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
-    film = {{"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb"}}
-    return mi.load_dict({{
-        "type": "scene",
-        "integrator": {{"type": integrator}},
-        "sensor": {{"type": "perspective", "film": film, "to_world": view}},
-        "sky": sky,
-        "wall": {{"type": "rectangle", "bsdf": {{"type": "diffuse", "reflectance": texture}}}},
-    }})
+    bsdf = {{"type": "diffuse", "reflectance": texture}}
+    scene = {{"type": "scene", "integrator": {{"type": integrator}}, "sky": sky}}
+    scene["sensor"] = {{"type": "perspective", "film": FILM, "to_world": view}}
+    return mi.load_dict(scene | {{"wall": {{"type": "rectangle", "bsdf": bsdf}}}})
 
 
 def grey_wall(number):
     # A wall with a bitmap; every other one under a sky of Gaussians.
     bitmap = {{"type": "bitmap", "data": mi.TensorXf(GREY), "raw": True}}
-    sky = environment_of(light) if number % 2 else {{"type": "constant"}}
+    sky = environment_of(light) if number % 2 else CONSTANT
     return wall(bitmap, sky, ("direct", "prb", "path")[number % 3])
 
 
@@ -63,10 +61,9 @@ def render():
 
 def scene():
     with eg.exclusive():
-        shown = wall(texture_of(results[-1].gaussians), {{"type": "constant"}}, "direct")
+        shown = wall(texture_of(results[-1].gaussians))
         assert np.isfinite(mi.render(shown, spp=2).numpy()).all()
-        other = grey_wall(counts["scene"])
-    loaded.extend([shown, other])
+        loaded.extend([shown, grey_wall(counts["scene"])])
 
 
 def recover():
