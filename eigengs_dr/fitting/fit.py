@@ -84,7 +84,7 @@ class Fit:
     loss : float
         The loss of the set, from the same row; NaN without a loss.
     source : str
-        Name of the image, if it was a file or a URL.
+        Name of the image, if it was a file.
     maps : dict of str to dict
         For maps, psnr_ycbcr and psnr_rgb of each, from the same row.
     """
@@ -154,7 +154,7 @@ def fit(
 
     Parameters
     ----------
-    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL; or a mapping
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like; or a mapping
         A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`. A
         mapping holds the images of maps by name, with at most 16 channels together; a `Map` says
         the space, the weight and the goal of one. Data whose three channels are equal count as one

@@ -56,10 +56,9 @@ def fit_many(
     Parameters
     ----------
     images : path-like or iterable
-        A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of one of them; or an iterable of
-        files, URLs and arrays (H, W, 3), (H, W, 1) or (H, W). The name of an image is the stem of
-        its file; arrays are named by their index, such as "000012". URLs need fsspec, from the
-        extra ``cluster``.
+        A folder, a glob such as ``"photos/**/*.jpg"``, or an iterable of files and arrays
+        (H, W, 3), (H, W, 1) or (H, W). The name of an image is the stem of its file; arrays are
+        named by their index, such as "000012".
     output : path-like, optional
         Folder of the results, ``NAME.npz`` for each image; it is created if it is missing. Each
         file is written atomically. ``manifest.jsonl`` has a row for each image. By default the

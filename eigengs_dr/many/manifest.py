@@ -32,9 +32,10 @@ from ..fitting.start import set_in
 from ..gaussian.file import read_figures, read_head
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import list_images
-from ..image.remote import is_url, stem_of
+from ..image.pixels import URL_NOTE
 from ..storage.atomic import (
     atomic_write,
+    is_url,
     lock_folder,
     refuse_link,
     remove_stale,
@@ -54,8 +55,8 @@ class ImageRow:
     status : str
         "done", "skipped" because the output exists, or "failed". In the progress of
         `eigengs_dr.fit_large` the stage: "survey", "place", "density", "fit" or "measure".
-    input : Path, str or None
-        The image file or its URL, if there is one.
+    input : Path or None
+        The image file, if there is one.
     output : Path or None
         The file of the result, if there is one.
     width, height, gaussians : int or None
@@ -81,7 +82,7 @@ class ImageRow:
 
     name: str
     status: str
-    input: Path | str | None = None
+    input: Path | None = None
     output: Path | None = None
     width: int | None = None
     height: int | None = None
@@ -101,7 +102,7 @@ RowProgress = Callable[[int, int | None, ImageRow], None]
 
 
 Images = str | os.PathLike[str] | Iterable[str | os.PathLike[str] | ArrayLike]
-"""A folder, a glob, a URL of one of them, or an iterable of image files, URLs and arrays."""
+"""A folder, a glob, or an iterable of image files and arrays."""
 
 
 class RunImage(NamedTuple):
@@ -113,8 +114,8 @@ class RunImage(NamedTuple):
         Index in the run, from 0.
     name : str
         Stem of the file, or the index of the array with six digits.
-    image : Path, str or array_like
-        A file, a URL, or the pixels.
+    image : Path or array_like
+        A file, or the pixels.
     output : Path or None
         The file of the result; None keeps the result in memory.
     error : str
@@ -128,9 +129,9 @@ class RunImage(NamedTuple):
     error: str = ""
 
     @property
-    def path(self) -> Path | str | None:
-        """The file or the URL of the image; None for an array."""
-        return self.image if isinstance(self.image, (Path, str)) else None
+    def path(self) -> Path | None:
+        """The file of the image; None for an array."""
+        return self.image if isinstance(self.image, Path) else None
 
     def row(self, status: str, **figures: Any) -> ImageRow:
         """Return a row for the image."""
@@ -145,8 +146,8 @@ def list_sources(
     Parameters
     ----------
     images : path-like or iterable
-        A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of a folder, a glob or a file; or
-        an iterable of files, URLs and arrays, see `eigengs_dr.image.io.check_image`.
+        A folder, a glob such as ``"photos/**/*.jpg"``, or an iterable of files and arrays, see
+        `eigengs_dr.image.io.check_image`.
     recursive : bool, optional
         Whether to take images in the subfolders of a folder too.
     folder : path-like, optional
@@ -186,9 +187,9 @@ def _name_each(images: Iterable, folder: str | os.PathLike[str] | None) -> Itera
     taken: Record = {}
     for place, image in enumerate(images):
         is_file = isinstance(image, (str, os.PathLike))
-        item = Path(image) if is_file and not is_url(image) else image
-        name = stem_of(item) if is_file else f"{place:06d}"
-        error = ""
+        item = Path(image) if is_file else image
+        name = item.stem if is_file else f"{place:06d}"
+        error = f"{image}: {URL_NOTE}" if is_url(image) else ""
         if name in taken:
             error = f"{item if is_file else name}: {taken[name]} has this name too; rename one"
         taken.setdefault(name, item if is_file else f"image {place}")

@@ -369,9 +369,6 @@ MAX_CHUNK_IMAGES = 256
 SETUP_STEPS = 10
 """Number of descent steps that take as long as the work before the first step."""
 
-URL_PIXELS = 1 << 16
-"""Assumed number of pixels of an image at a URL, whose size is unknown."""
-
 WORK_PER_BYTE = 8
 """Minimum work per byte of an array: the scheduler keeps a copy of at most 16 MB until the chunk is
 done."""
@@ -486,7 +483,5 @@ def _work_of(source: RunImage, steps: int) -> int:
     if source.path is None:
         pixels = math.prod(source.image.shape[:2])
         return max(pixels * steps, WORK_PER_BYTE * source.image.nbytes)
-    if isinstance(source.path, str):
-        return URL_PIXELS * steps
     # Errors of a file are left to the worker.
     return source.path.stat().st_size * steps if source.path.is_file() else 0
