@@ -33,13 +33,12 @@ from .image.pixels import ImageError as ImageError
 from .many.fit_large import LargeFit as LargeFit
 from .many.fit_large import fit_large as fit_large
 from .many.fit_many import fit_many as fit_many
-from .many.manifest import ImageRow as ImageRow
+from .many.images import ImageRow as ImageRow
 from .plugins import register_plugins as register_plugins
 from .raster.render import picture_of as picture_of
 from .raster.render import render as render
 from .raster.render import tile_lists as tile_lists
 from .relight.model import Relightable as Relightable
-from .scene.convert import convert_scene as convert_scene
 from .scene.fit_scene import fit_for_scene as fit_for_scene
 from .version import __version__ as __version__
 from .viewer.view import view as view
@@ -64,7 +63,6 @@ __all__ = [
     "Method",
     "Relightable",
     "concatenate",
-    "convert_scene",
     "exclusive",
     "fit",
     "fit_for_scene",

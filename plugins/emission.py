@@ -1,4 +1,4 @@
-"""The brightness of the texture over uv, which gives its mean, its maximum and its emission.
+"""The brightness of Gaussians over uv, which gives the mean, the maximum and the emission.
 
 A survey evaluates the displayed brightness at the centres of cells, the midpoint rule. By Poisson's
 summation formula, the rule with the spacing h gives the integral of a Gaussian with the standard
@@ -65,14 +65,11 @@ class Spacing(NamedTuple):
         Smallest and largest spacing, in texels.
     resolved : float
         Standard deviation of the smallest Gaussian, in spacings, between these two.
-    multiple : int
-        Number that divides the columns and rows of points.
     """
 
     finest: float = FINEST
     coarsest: float = COARSEST
     resolved: float = RESOLVED
-    multiple: int = 1
 
 
 def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
@@ -112,12 +109,6 @@ def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
     return survey
 
 
-def light_at(texture: Texture, uv: mi.Point2f) -> Float:
-    """Return the displayed brightness at points of uv, without gradients and footprints."""
-    with dr.suspend_grad():
-        return _light_at(texture, uv, texture.table.lists.cells, texture.table.packed)
-
-
 def _light_at(texture: Texture, uv: mi.Point2f, cells: CellLists, packed: Packed) -> Float:
     """Return the brightness of a texture with these Gaussians."""
     (x, _), (y, _), _ = texture.point(uv)
@@ -141,12 +132,10 @@ def _smallest_deviation(shape: list, color: list) -> float:
 
 def _grid(texture: Texture, smallest: float, spacing: Spacing) -> tuple[int, int, float]:
     """Return the number of columns and rows of points, and their spacing in texels."""
-    spans, multiple = np.minimum(texture.spans(), 1e9), spacing.multiple
+    spans = np.minimum(texture.spans(), 1e9)
     counts = spans / min(max(smallest / spacing.resolved, spacing.finest), spacing.coarsest)
     counts *= min(1.0, math.sqrt(MOST / counts.prod()))
-    columns, rows = (
-        multiple * math.ceil(max(FEWEST, n) / multiple) for n in np.minimum(counts, MOST / FEWEST)
-    )
+    columns, rows = (math.ceil(max(FEWEST, n)) for n in np.minimum(counts, MOST / FEWEST))
     return columns, rows, float((spans / (columns, rows)).max())
 
 
@@ -233,9 +222,11 @@ def _neighbours(u: Float, count: int) -> tuple[tuple, Float]:
     return tuple(around), position - below
 
 
-def emission_of(survey: Survey) -> Emission:
-    """Return the distribution of emission for a survey of the brightness."""
+def emission_of(survey: Survey, over_sphere: bool = False) -> Emission:
+    """Return the distribution of emission for a survey, of a square or of a sphere."""
     density = np.maximum(survey.brightness.numpy()[..., 0], 0)
+    if over_sphere:
+        density *= np.sin((np.arange(len(density)) + 0.5) * (np.pi / len(density)))[:, None]
     floor = DARKEST * density.mean() or 1.0
     density = np.maximum(density, floor)
     relative = density / density.mean(dtype=np.float64).astype(np.float32)

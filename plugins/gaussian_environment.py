@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from eigengs_dr.backend.arrays import rcp, upload
+from eigengs_dr.backend.arrays import rcp
 from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.raster.lookup.points import axes_of, fold
@@ -22,8 +22,7 @@ from eigengs_dr.raster.lookup.points import axes_of, fold
 from . import properties
 from .color import luminance, unpolarized, upsample
 from .cone import PIXEL, no_metric
-from .emission import Spacing, light_at, make_survey
-from .importance import SIDE, importance_of
+from .emission import Spacing, emission_of, make_survey
 from .memory import resident_bytes
 from .sums import plugin_of_sums
 
@@ -119,13 +118,8 @@ def gaussian_environment() -> type:
             if not keys or set(keys) - self.others:
                 # Logarithms are sharper than the Gaussians that sum to them.
                 largest = math.inf if self.space.affine else 1.0
-                survey = make_survey(self, Spacing(1.0, largest, SMOOTH, SIDE))
-                self.importance = importance_of(survey.brightness.numpy()[..., 0], self._brightness)
-
-        def _brightness(self, u: NDArray, v: NDArray) -> NDArray:
-            """Return the brightness at points of the picture."""
-            uv = mi.Point2f(*(upload(mi.Float, np.float32(k.ravel())) for k in (u, v)))
-            return light_at(self, uv).numpy().reshape(u.shape)
+                survey = make_survey(self, Spacing(1.0, largest, SMOOTH))
+                self.importance = emission_of(survey, over_sphere=True)
 
         def set_scene(self, scene: mi.Scene) -> None:
             """Take the bounds of a scene.
@@ -292,7 +286,6 @@ def gaussian_environment() -> type:
                 f"  space = {self.space},\n  scale = {float(self.scale[0]):g},\n"
                 f"  prefilter = {self.prefilter_name()},\n  cutoff = {self.cutoff:g},\n"
                 f"  memory = {self.memory.name},\n"
-                f"  leaves = {dr.width(self.importance.places)},\n"
                 f"  resident_bytes = {resident_bytes(self)},\n"
                 f"  to_world = {transform}\n]"
             )

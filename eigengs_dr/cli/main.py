@@ -13,7 +13,7 @@ from .fit import fit
 from .info import info
 from .pack import pack
 from .render import render
-from .scene import convert, scene
+from .scene import scene
 from .train import train
 from .view import view
 
@@ -67,5 +67,5 @@ def main() -> None:
     """
 
 
-for command in (fit, render, train, info, pack, view, scene, convert, doctor, bench):
+for command in (fit, render, train, info, pack, view, scene, doctor, bench):
     main.add_command(command)

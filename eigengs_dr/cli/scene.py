@@ -1,8 +1,4 @@
-"""The commands for Mitsuba scenes.
-
-``eigengs-dr scene`` renders scenes that use the plugins, and ``eigengs-dr convert`` replaces the
-bitmaps of a scene by Gaussians.
-"""
+"""The command ``eigengs-dr scene``, which renders Mitsuba scenes that use the plugins."""
 
 from __future__ import annotations
 
@@ -17,18 +13,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ..backend.doors import label_of
-from ..backend.interrupts import INTERRUPTED, Interrupted
 from ..backend.plain import parse_json
 from ..backend.selection import backend_of, name_of, select
 from ..backend.types import Record
 from ..storage.atomic import atomic_write
 from . import options
-from .console import MISSED, bar, print_message, table
+from .console import bar
 from .outputs import check_outputs, lock_outputs, name_outputs
 
 if TYPE_CHECKING:
-    from ..scene.convert import ConvertedScene
     from ..scene.rendering import Rendering
 
 
@@ -228,98 +221,3 @@ def scene_errors(path: Path) -> Iterator[None]:
         text = re.sub(r"\[\w+\.cpp:\d+\] ", "", str(cause))
         text = re.sub(r"(?<=: )\w+Error: (\[Errno \d+\] )?", "", text)  # of Python, in a plugin
         raise ValueError(f"{path}: {text or type(cause).__name__}") from error
-
-
-@click.command()
-@click.argument("scene", type=options.EXISTING, metavar="SCENE.xml")
-@options.output("New or empty folder.", "FOLDER")
-@click.option(
-    "--target-psnr",
-    "--psnr",
-    "target_psnr",
-    metavar="DB",
-    default=40.0,
-    help="PSNR of the renderings.",
-)
-@options.number("--iterations", "Optimisation steps per number of Gaussians.", 400, 0)
-@options.number(
-    "--spp", "Samples per pixel; 0 renders nothing.  [default: from the scene]", minimum=0
-)
-@click.option("--replace-all", is_flag=True, help="Also replace bitmaps that are better.")
-@variant_option
-@definitions_option
-@options.shared("report", "quiet")
-def convert(
-    run: options.Run,
-    scene: Path,
-    output: Path,
-    target_psnr: float,
-    iterations: int,
-    spp: int | None,
-    replace_all: bool,
-    variant: str | None,
-    definitions: dict[str, str],
-) -> None:
-    """Replace the bitmaps of a Mitsuba scene by Gaussians.
-
-    Each gets as many as cameras resolve. FOLDER gets scene.xml, a set per image, and per camera
-    the renderings before and after, and 8 times their difference. If a rendering misses the PSNR,
-    the exit code is 1. The command keeps bitmaps that are better, such as masks, that would miss
-    the PSNR, or that no camera sees, and says why. The new scene refers to other files relative to
-    FOLDER.
-
-    \b
-    Examples:
-      eigengs-dr convert room.xml -o room-gaussians/ --target-psnr 36
-      eigengs-dr scene room-gaussians/scene.xml -o room.png
-    """
-    check_outputs([run.report], [scene])
-    mi = load_mitsuba(variant, run.quiet)
-    from ..scene.convert import convert_scene
-
-    started = time.perf_counter()
-    try:
-        with scene_errors(scene), bar(run.quiet) as show:
-            converted = convert_scene(
-                scene, output, target_psnr, iterations, spp, definitions, replace_all,
-                lambda done, total, row: show(label_of(row), done, total),
-            )  # fmt: skip
-    except Interrupted:
-        print_message("interrupted")
-        run.context.exit(INTERRUPTED)
-    before = sum(texture.bytes for texture in converted.textures)
-    after = sum(texture.gaussian_bytes for texture in converted.textures)
-    figures: dict[str, object] = {"output": converted.scene, "bytes_before": before, "bytes": after}
-    figures["textures"] = [texture._asdict() for texture in converted.textures]
-    figures["better"] = [texture._asdict() for texture in converted.better]
-    figures["left"] = [{"name": name, "reason": reason} for name, reason in converted.left]
-    figures["psnr_rgb"], figures["noise_psnr_rgb"] = converted.psnr, converted.noise
-    run.write_report(figures, mi.variant().partition("_")[0])
-    seconds = time.perf_counter() - started
-    run.tell(*_table(converted, before, after), f"wrote {converted.scene} in {seconds:.1f} s")
-    if converted.missed(target_psnr):
-        run.context.exit(MISSED)
-
-
-def _table(converted: ConvertedScene, before: int, after: int) -> list[str]:
-    """Format the replaced textures, those that were kept, and the PSNRs of the renderings."""
-    rows: list[Sequence[str]] = [
-        ("texture", "texels", "bytes", "Gaussians", "bytes", "overlap", "PSNR seen")
-    ]
-    for t in [*converted.textures, *converted.better]:
-        bitmap = f"{t.width}x{t.height}", f"{t.bytes:,}"
-        gaussians = f"{t.gaussians:,}", f"{t.gaussian_bytes:,}", f"{t.overlap:.1f}"
-        rows.append((t.names[0], *bitmap, *gaussians, f"{t.psnr:.1f} dB"))
-        rows += [(name, "(the same set)", *[""] * 5) for name in t.names[1:]]
-    lines = table(rows)
-    if before:
-        lines.append(f"memory: {after:,} of {before:,} bytes ({after / before:.3f})")
-    lines += [f"kept, the bitmap is better: {name}" for t in converted.better for name in t.names]
-    if converted.better:
-        lines.append("  (it takes less memory, or many Gaussians overlap; see --replace-all)")
-    lines += [f"left alone: {name}: {reason}" for name, reason in converted.left]
-    psnrs = enumerate(converted.psnr, 1)
-    lines += [f"camera {k}: psnr_rgb {psnr:.1f} dB between the renderings" for k, psnr in psnrs]
-    noise = enumerate(converted.noise, 1)
-    lines += [f"camera {k}: psnr_rgb {psnr:.1f} dB of their noise" for k, psnr in noise]
-    return lines

@@ -8,7 +8,7 @@ which every camera sees the texture at a given PSNR.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -41,7 +41,6 @@ from ..plugins.cone import PIXEL
 from ..plugins.follow import check_scene
 from ..plugins.versions import Texture
 from ..raster.render import render
-from .bitmaps import Unsuitable
 from .rendering import Progress, stages
 from .target import error_weights, seen_by, smoothest_target
 from .visibility import Box, Visibility, visibility
@@ -66,6 +65,9 @@ takes a quarter of the time. 1,024 x 1,024 texels at 6 and more texels per pixel
 DETAIL = 64
 """Fewest seen texels per Gaussian in a fit. A target with four times as many is halved, again and
 again: 200 Gaussians show no more of an enlarged image, and a step takes the time of its texels."""
+
+EXACT = 99.0
+"""PSNR from which on sets are alike."""
 
 ROUNDING = 1e-3
 """By how much data may exceed 0 and 1."""
@@ -314,13 +316,8 @@ def fit_seen(
     goal: Goal,
     iterations: int,
     tell: Progress,
-    aim: Callable[[Gaussians, float], float] | None = None,
 ) -> SceneFit:
-    """Find the fewest Gaussians with which the cameras see an image; see `fit_for_scene`.
-
-    ``aim(gaussians, psnr)`` returns the PSNR to look for, once the cameras have seen a first set at
-    a PSNR; at most `eigengs_dr.scene.target.MARGIN` above that of the goal.
-    """
+    """Find the fewest Gaussians with which the cameras see an image; see `fit_for_scene`."""
 
     def closeness(candidate: Image) -> float:
         tell(0, 1, {"stage": "target"})
@@ -335,17 +332,15 @@ def fit_seen(
 
     def score(gaussians: Gaussians) -> list[Measured]:
         psnr = image.psnr(render(image.without_unseen(gaussians)).numpy())
-        return [Measured({"psnr": min(psnr), "psnr_of_cameras": psnr}, min(psnr) - aimed)]
+        margin = min(*psnr, EXACT) - goal.psnr  # an even image may have no error
+        return [Measured({"psnr": min(psnr), "psnr_of_cameras": psnr}, margin)]
 
-    aimed = goal.psnr
     for count in (-(-most // fewer) for fewer in FEWER):
         objective = _objective(target, weight, image.fine.seen, count, image.kind)
         start = DEFAULT.place_and_solve(objective, count)
         [first] = score(start)
         if first.margin >= -GAIN:
             break
-    if aim:
-        aimed = aim(image.whole(start), first.row["psnr"])
     descent = Descent(
         objective,
         DEFAULT,
@@ -355,7 +350,7 @@ def fit_seen(
     search = fewest(descent, start, max_gaussians, iterations)
     reached = search.row["psnr"]
     if search.stopped == "out of reach" and reached < goal.psnr:
-        raise Unsuitable(
+        raise ValueError(
             f"{len(search.gaussians)} Gaussians reach {reached:.1f} dB, but the cameras shall see "
             f"{goal.psnr:g} dB; lower the PSNR, or allow more Gaussians or iterations"
         )

@@ -1,10 +1,9 @@
-"""Renderings of a scene by its cameras: in passes, with the names of their channels, compared."""
+"""Renderings of a scene by its cameras: in passes, with the names of their channels."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import NamedTuple
 
 import mitsuba as mi
@@ -14,9 +13,6 @@ from numpy.typing import NDArray
 from ..backend.interrupts import defer_interrupts
 from ..backend.recording import collector_off
 from ..backend.types import Record
-from ..image.color import to_coded
-from ..image.io import save_image
-from ..image.metrics import psnr
 from ..plugins.follow import follow_where_asked
 
 Progress = Callable[[int, int, Record], None]
@@ -148,56 +144,3 @@ def _channels(film: mi.Film, integrator: mi.Integrator, count: int) -> list[str]
     others = [name for name in aovs if name[:-2] not in inside]
     channels = [*(plain if inside else []), *layers[len(plain) :], *others]
     return channels if len(channels) == count else [f"channel.{k}" for k in range(count)]
-
-
-LOUDER = 8.0
-"""Factor of the differences in their pictures."""
-
-
-def compare(
-    before: Sequence[NDArray[np.float32]], after: Sequence[NDArray[np.float32]], folder: Path
-) -> list[float]:
-    """Compare the pictures of each camera, from `pictures`, and write them.
-
-    Parameters
-    ----------
-    before, after : sequence of ndarray of float32, shape (H, W, 3) or (H, W, 1)
-    folder : Path
-        Gets before-1.png, after-1.png and difference-1.png, 8 times louder, and so on.
-
-    Returns
-    -------
-    list of float
-        psnr_rgb in dB for each camera.
-    """
-    for number, pair in enumerate(zip(before, after, strict=True), 1):
-        loud = np.clip(LOUDER * np.abs(pair[0] - pair[1]), 0, 1)
-        for name, picture in zip(("before", "after", "difference"), (*pair, loud), strict=True):
-            save_image(folder / f"{name}-{number}.png", picture)
-    return [psnr(*pair) for pair in zip(before, after, strict=True)]
-
-
-def pictures(scene: mi.Scene, spp: int | None, seed: int = 0) -> list[NDArray[np.float32]]:
-    """Render a scene from each camera in sRGB; equal scenes have the same random numbers.
-
-    Parameters
-    ----------
-    scene : mitsuba.Scene
-        Without an integrator, "path" renders it.
-    spp : int or None
-        Samples per pixel, by default those of the camera.
-    seed : int, optional
-
-    Returns
-    -------
-    list of ndarray of float32, shape (H, W, 3) or (H, W, 1)
-    """
-    renderer = scene.integrator() or mi.load_dict({"type": "path"})
-    shown = []
-    for camera in range(len(scene.sensors())):
-        rendering = render_in_passes(scene, camera, spp, integrator=renderer, seed=seed)
-        light = rendering.picture("RGB")
-        if not light.size:  # a renderer of AOVs alone
-            light = rendering.pixels[..., :1]
-        shown.append(np.clip(to_coded(np.maximum(light, 0)), 0, 1).astype(np.float32))
-    return shown

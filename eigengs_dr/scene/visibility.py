@@ -30,7 +30,6 @@ from ..plugins.cone import PIXEL
 from ..plugins.properties import WRAPS, to_uv
 from ..plugins.versions import Texture
 from ..raster.lookup.points import fold
-from .bitmaps import Unsuitable
 
 SPACING = 0.5
 """Largest distance of neighbouring rays in texels, so that rays hit each texel."""
@@ -294,7 +293,7 @@ def visibility(
         np.minimum(footprint, _min_footprint(hits, part.width, part.height), out=footprint)
         lookups.append(_rows(hits, part.width, part.height))
     if not lookups:
-        raise Unsuitable(
+        raise ValueError(
             f"no pixel of the scene's {len(scene.sensors())} cameras sees {_name(texture)}; check "
             "where the cameras look, and what hides the texture"
         )

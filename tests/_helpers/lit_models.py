@@ -1,9 +1,16 @@
 """A model of lights whose photos a formula gives, and the formula."""
 
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
 
 import eigengs_dr as eg
-from eigengs_dr.relight.lights import LightTable
+from _helpers.light import to_linear as to_light
+from _helpers.lit_spheres import directions, photos
+
+__all__ = ["CHANNELS", "PLANES", "SIZE", "LitFormula", "spiral", "to_light"]
 
 SIZE, PLANES, CHANNELS = (24, 16), 2, 3
 
@@ -13,6 +20,24 @@ def spiral(count=40):
     z = np.clip(1 - (np.arange(count) + 0.5) / count, 0, 1)
     turn, ring = np.arange(count) * (np.pi * (3 - 5**0.5)), np.sqrt(1 - z * z)
     return np.c_[ring * np.cos(turn), ring * np.sin(turn), z]
+
+
+@cache
+def any_model():
+    """A model of a few photos, whose file lends its members."""
+    lights = directions(8)
+    return eg.Relightable.fit(photos(lights), lights, gaussians=8, iterations=0, progress=False)
+
+
+def changed(model, **members):
+    """The model of the file of another one with other members."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "m.npz"
+        model.save(path)
+        with np.load(path) as file:
+            members = dict(file) | members
+        np.savez(path, **members)
+        return eg.Relightable.load(path)
 
 
 class LitFormula:
@@ -34,12 +59,15 @@ class LitFormula:
         self.base[:, -1], self.slope[:, -1] = 0.5, r.uniform(-0.08, 0.08, (CHANNELS, 3))
         self.base, self.slope = scale * self.base, scale * self.slope
 
-    def model(self, brightest=1.0):
+    def model(self, brightest=1.0, kind="thin_plate", smoothing=1e-9):
         """The model that shows these photos."""
         lights = spiral()
         values = self.base + np.einsum("ckd,nd->nck", self.slope, lights)
-        table = LightTable(lights, values, "thin_plate", 1e-9)
-        return eg.Relightable(self.planes, table, 30.0, brightest)
+        table = {"lights": np.float32(lights), "values": np.float32(values)}
+        table |= {"kind": np.array(kind), "smoothing": np.array(smoothing)}
+        given = self.planes.to_arrays() | {"size": np.array(SIZE)}
+        table |= {"brightest": np.array(float(brightest)), "psnr_held_out": np.array(40.0)}
+        return changed(any_model(), **given, **table)
 
     def codes(self, lights, uv):
         """Codes (n, 3) under lights (n, 3) of length 1 at places (n, 2) of the photo."""
@@ -51,10 +79,3 @@ class LitFormula:
         planes = np.c_[near @ arrays["color"] + arrays["background"], np.ones(len(uv))]
         factors = self.base + np.einsum("ckd,nd->nck", self.slope, lights)
         return np.einsum("nck,nk->nc", factors, planes)
-
-
-def to_light(codes):
-    """Linear light of sRGB codes, also above 1."""
-    return np.where(
-        codes <= 0.04045, codes / 12.92, ((np.maximum(codes, 0) + 0.055) / 1.055) ** 2.4
-    )

@@ -5,8 +5,6 @@ import pytest
 
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
 
-from scipy.sparse import csr_array  # noqa: E402
-
 import eigengs_dr as eg  # noqa: E402
 
 FOV, SIDE, TEXELS = 40.0, 24, 32
@@ -72,12 +70,3 @@ def albedo(scene):
 def photo(side=48):
     """A photo of a few pixels, shape (side, side, 3)."""
     return eg.sample("astronaut")[: 8 * side : 8, : 8 * side : 8]
-
-
-def blocks(side, times):
-    """Cameras that see means of blocks of texels."""
-    count = side // times
-    y, x = np.mgrid[:side, :side] // times
-    shares = np.full(side * side, 1 / times**2, np.float32)
-    index = ((y * count + x).ravel(), np.arange(side * side))
-    return csr_array((shares, index), shape=(count * count, side * side))

@@ -1,6 +1,6 @@
 """Compose pictures of how-to pages, docs/images/how-to-*.jpg: ``python tools/manual/pictures.py``.
 
-``python tools/manual/pictures.py view convert`` writes these alone. All of them show photos that
+``python tools/manual/pictures.py view number`` writes these alone. All of them show photos that
 scikit-image ships. They take five minutes on two cores; "view" needs Chromium.
 """
 
@@ -275,48 +275,6 @@ def slanted(scene: "mi.Scene", samples: int) -> np.ndarray:
     return to_coded(linear / len(passes))[84:289, 102:307]
 
 
-def conversion() -> list[Row]:
-    """Convert a scene of three bitmaps."""
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        for photo in ("chelsea", "coffee", "brick"):
-            eg.save_image(folder / f"{photo}.png", center_crop(eg.sample(photo), 192, 192))
-        eg.convert_scene(room(folder), folder / "converted", replace_all=True)
-        before, after = (
-            eg.load_image(folder / "converted" / f"{name}-1.png") for name in ("before", "after")
-        )
-    return [{"before": before, "after": after, "difference x 10": error(after, before, 10)}]
-
-
-def room(folder: Path) -> dict:
-    """Return a scene with three photos of a folder: on a wall, a floor and a ball."""
-
-    def bsdf(name: str, **properties: object) -> dict:
-        texture = {"type": "bitmap", "filename": str(folder / f"{name}.png"), **properties}
-        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}
-
-    at = mi.ScalarTransform4f()
-    wall = at.translate([0, 2, 1.6]).rotate([1, 0, 0], 90).scale([1.6, -1.6, 1])
-    film = {"type": "hdrfilm", "width": 276, "height": 207}
-    view = at.look_at([0, -6, 2.6], [0, 0, 1], [0, 0, 1])
-    brick = bsdf("brick", to_uv=at.scale([3, 2, 1]))
-    return {
-        "type": "scene",
-        "integrator": {"type": "direct"},
-        "camera": {
-            "type": "perspective",
-            "fov": 42,
-            "to_world": view,
-            "film": film,
-            "sampler": {"type": "independent", "sample_count": 64},
-        },
-        "sky": {"type": "constant"},
-        "floor": {"type": "rectangle", "to_world": at.scale(3), "bsdf": bsdf("coffee")},
-        "wall": {"type": "rectangle", "to_world": wall, "bsdf": bsdf("chelsea")},
-        "ball": {"type": "sphere", "center": [0.9, -1.6, 0.8], "radius": 0.8, "bsdf": brick},
-    }
-
-
 def descent() -> list[Row]:
     """Descend from the Gaussians of one photo until a wall looks like a rendering of another."""
     start, other = (
@@ -442,7 +400,6 @@ PICTURES: dict[str, Callable[[], list[Row]]] = {
     "split": split,
     "relight": relight,
     "prefilter": aliasing,
-    "convert": conversion,
     "differentiate": descent,
     "view": browser,
 }

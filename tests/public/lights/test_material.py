@@ -1,0 +1,579 @@
+"""Photos under lights as a material: light from the right side, on every surface and way."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.chi_square import assert_density
+from _helpers.light import to_coded
+from _helpers.lit_models import SIZE, LitFormula, to_light
+from _helpers.lit_spheres import directions, photos
+from _helpers.packed import few_groups
+from _helpers.poster import camera
+from _helpers.texture import in_front, mi, picture, texel_centres
+from _helpers.variants import in_variants
+from eigengs_dr.plugins import material_of, resident_bytes
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+TABLE = 4e-3
+"""What the interpolation between directions of the table may cost, of values up to 0.3."""
+
+
+@pytest.fixture(scope="module")
+def formula():
+    return LitFormula()
+
+
+@pytest.fixture(scope="module")
+def saved(formula, tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "m.npz"
+    formula.model().save(path)
+    return str(path)
+
+
+def turn(axis, degrees):
+    """A rotation (3, 3)."""
+    return np.array(mi.ScalarTransform4f().rotate(axis, degrees).matrix, float)[:3, :3]
+
+
+def to_uv(matrix):
+    """The property of a matrix (2, 3)."""
+    return mi.ScalarTransform3f([*np.asarray(matrix, float).tolist(), [0, 0, 1]])
+
+
+def folded(place, wrap):
+    """Where the photo shows a place beyond its borders, and the sign of its axes there."""
+    tile = np.floor(place)
+    odd = (wrap == "mirror") & (tile % 2 == 1)
+    return np.where(odd, 1 - (place - tile), place - tile), np.where(odd, -1, 1)
+
+
+def quad(folder, matrix, flipped=False, normals=False):
+    """A parallelogram, its corners `matrix` times (2 u - 1, 2 v - 1); faces may be turned over."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    normal = np.cross(*matrix.T)
+    order = [1, 4, 3, 2] if flipped else [1, 2, 3, 4]
+    lines = [f"v {x} {y} {z}" for x, y, z in (2 * corners - 1) @ matrix.T]
+    lines += [f"vt {u} {v}" for u, v in corners]
+    lines += [f"vn {normal[0]} {normal[1]} {normal[2]}"] if normals else []
+    names = [f"{k}/{k}/1" if normals else f"{k}/{k}" for k in order]
+    lines += [f"f {names[0]} {names[k]} {names[k + 1]}" for k in (1, 2)]
+    path = folder / "quad.obj"
+    path.write_text("\n".join(lines))
+    return {"type": "obj", "filename": str(path), "flip_tex_coords": False}
+
+
+def values(shape, points, normals, lamps):
+    """What a shape, or a scene, reflects (n, 3) at points that are seen along their normals."""
+    scene = mi.load_dict({"type": "scene", "shape": shape}) if isinstance(shape, dict) else shape
+    origin, towards = (np.float32(a).T for a in (points + 0.5 * normals, -normals))
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(towards)))
+    assert np.array(si.is_valid()).all()
+    light = si.to_local(mi.Vector3f(np.float32(lamps).T))
+    return np.array(si.bsdf().eval(mi.BSDFContext(), si, light)).T
+
+
+def over(normals, seed=2):
+    """Random lamps above each surface."""
+    lamps = np.random.default_rng(seed).normal(size=normals.shape)
+    height = np.einsum("nk,nk->n", lamps, normals)
+    lamps += (1.2 * abs(height) - height + 0.3)[:, None] * normals
+    return lamps / np.linalg.norm(lamps, axis=1, keepdims=True)
+
+
+def wanted(formula, place, ex, ey, normals, lamps, wrap="repeat"):
+    """The values by NumPy: the photo at `place`, whose columns grow along ex, its rows along ey."""
+    uv, sign = folded(place, wrap)
+    ex, ey = ex * sign[:, :1], ey * sign[:, 1:]
+    x = ex / np.linalg.norm(ex, axis=1, keepdims=True)
+    y = -(ey - np.einsum("nk,nk->n", ey, x)[:, None] * x)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    lights = np.stack([np.einsum("nk,nk->n", lamps, axis) for axis in (x, y, normals)], 1)
+    return to_light(formula.codes(lights, uv)) / np.pi
+
+
+UPRIGHT = [[1, 0, 0], [0, -1, 1]]
+PLANE = np.array([[1, 0], [0, 1], [0, 0.0]])
+SHEARED = np.array([[1, 0.5], [0, 0.6], [0, 0.0]])
+
+WALLS = {
+    "upright": (PLANE, UPRIGHT, {}),
+    "a quarter turn": (PLANE, [[0, -1, 1], [1, 0, 0]], {}),
+    "scaled unequally": (PLANE, [[3, 0, 0.2], [0, -0.5, 0.1]], {}),
+    "sheared": (SHEARED, [[2, 0.7, 0.3], [-0.4, -1.5, 0.2]], {}),
+    "mirrored copies": (PLANE, [[2.6, 0, -0.8], [0, -3.3, 1.2]], {"wrap": "mirror"}),
+    "turned, mirrored copies": (SHEARED, [[1.5, -2, 0.8], [2.2, 1.4, -1.2]], {"wrap": "mirror"}),
+    "turned over": (PLANE @ np.diag([1, -1]), UPRIGHT, {"flipped": True, "flip_normals": True}),
+    "uv mirrored": (PLANE[:, ::-1], [[1, 0, 0], [0, 1, 0]], {}),
+    "normals against faces": (SHEARED, UPRIGHT, {"flipped": True, "normals": True}),
+    "normal map": (PLANE @ np.diag([1, 2]), [[1, 0.3, 0], [0, -1, 1]], {"map": True}),
+}
+TURNS = (([1, 2, 3], 200), ([0, 1, 0], 140), ([1, 0, 0], -90))
+
+
+@pytest.mark.parametrize("name", WALLS)
+def test_light_comes_from_the_side_that_the_photo_has_on_a_wall(formula, name, tmp_path):
+    matrix, chart, options = WALLS[name]
+    axis, degrees = TURNS[len(name) % 3]
+    wrap, chart = options.get("wrap", "repeat"), np.array(chart, float)
+    matrix = turn(axis, degrees) @ matrix
+    bsdf = material_of(formula.model(), wrap_mode=wrap, to_uv=to_uv(chart))
+    if "map" in options:
+        texels = mi.TensorXf(np.full((4, 4, 3), [0.5, 0.5, 1], np.float32))
+        flat = {"type": "bitmap", "data": texels, "raw": True}
+        bsdf = {"type": "normalmap", "normalmap": flat, "bsdf": bsdf}
+    shape = quad(tmp_path, matrix, options.get("flipped", False), options.get("normals", False))
+    shape |= {"bsdf": bsdf, "flip_normals": options.get("flip_normals", False)}
+    uv = np.random.default_rng(1).uniform(0.02, 0.98, (200, 2))
+    points, side = (2 * uv - 1) @ matrix.T, np.cross(*matrix.T)
+    normals = np.tile(side / np.linalg.norm(side), (len(uv), 1))
+    lamps, (ex, ey) = over(normals), (2 * matrix @ np.linalg.inv(chart[:, :2])).T
+    expected = wanted(
+        formula,
+        uv @ chart[:, :2].T + chart[:, 2],
+        np.tile(ex, (len(uv), 1)),
+        np.tile(ey, (len(uv), 1)),
+        normals,
+        lamps,
+        wrap,
+    )
+    found = values(shape, points, normals, lamps)
+    assert np.percentile(abs(found - expected), 98) < TABLE
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_light_comes_from_the_side_that_the_photo_has_on_a_sphere(formula, flip):
+    """Mitsuba's u goes round the z axis, and v from its top down."""
+    r = np.random.default_rng(3)
+    turns, polar = r.uniform(0.1, 2 * np.pi - 0.1, 300), r.uniform(0.4, 2.7, 300)
+    round_z, down = (np.stack([np.cos(a), np.sin(a)], 1) for a in (turns, polar))
+    points = np.c_[down[:, 1:] * round_z, down[:, 0]]
+    ex = np.c_[-points[:, 1], points[:, 0], 0 * turns]
+    ey = np.c_[down[:, :1] * round_z, -down[:, 1]]
+    chart, normals = np.array([[0, 1, 0.2], [2, 0, 0.1]]), -points if flip else points
+    uv = np.stack([turns / (2 * np.pi), polar / np.pi], 1)
+    lamps = over(normals)
+    bsdf = material_of(formula.model(), to_uv=to_uv(chart))
+    shape = {"type": "sphere", "bsdf": bsdf, "flip_normals": flip}
+    place = uv @ chart[:, :2].T + chart[:, 2]
+    expected = wanted(formula, place, ey, ex, normals, lamps)  # the transform swaps u and v
+    found = values(shape, points, normals, lamps)
+    assert np.percentile(abs(found - expected), 98) < TABLE
+
+
+def test_an_update_of_to_uv_turns_the_light(saved):
+    points = np.c_[np.random.default_rng(5).uniform(-0.9, 0.9, (50, 2)), np.zeros(50)]
+    normals = np.tile([0, 0, 1.0], (50, 1))
+    bsdf = {"type": "gaussian_relightable", "model": saved}
+    loaded, changed = (
+        mi.load_dict({"type": "scene", "wall": {"type": "rectangle", "bsdf": bsdf | more}})
+        for more in ({"to_uv": to_uv(UPRIGHT)}, {})
+    )
+    parameters = mi.traverse(changed)
+    parameters["wall.bsdf.planes.to_uv"] = to_uv(UPRIGHT)
+    parameters.update()
+    found, expected = (values(s, points, normals, over(normals)) for s in (changed, loaded))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+# --- Samples ---
+
+
+def on_a_wall(count):
+    """Points of a wall, seen from the side, and numbers to sample with."""
+    r = np.random.default_rng(0)
+    si = in_front(dr.zeros(mi.SurfaceInteraction3f, count))
+    si.uv, si.wi = mi.Point2f(r.uniform(0, 1, (2, count))), mi.Vector3f(0, 0.6, 0.8)
+    return si, (mi.Float(r.uniform(0, 1, count)), mi.Point2f(r.uniform(0, 1, (2, count))))
+
+
+def test_samples_have_their_density(saved):
+    from mitsuba.chi2 import SphericalDomain
+
+    bsdf = mi.load_dict({"type": "gaussian_relightable", "model": saved})
+
+    def interaction(count):
+        si = in_front(dr.zeros(mi.SurfaceInteraction3f, count))
+        si.uv, si.wi = mi.Point2f(0.4, 0.6), mi.Vector3f(0, 0.6, 0.8)
+        return si
+
+    def sample(numbers):
+        first = mi.Float(dr.arange(mi.UInt32, dr.width(numbers)) % 1000) / 1000
+        bs, _ = bsdf.sample(mi.BSDFContext(), interaction(dr.width(numbers)), first, numbers)
+        return bs.wo
+
+    def density(wo):
+        return bsdf.pdf(mi.BSDFContext(), interaction(dr.width(wo)), wo)
+
+    assert_density(sample, density, SphericalDomain(), 100_000, 32)
+
+
+def test_samples_weigh_the_value(saved):
+    bsdf, ctx = mi.load_dict({"type": "gaussian_relightable", "model": saved}), mi.BSDFContext()
+    si, numbers = on_a_wall(1000)
+    bs, weight = bsdf.sample(ctx, si, *numbers)
+    value, density = bsdf.eval(ctx, si, bs.wo), bsdf.pdf(ctx, si, bs.wo)
+    np.testing.assert_allclose(np.array(density), np.array(bs.pdf), rtol=1e-4)
+    np.testing.assert_allclose(np.array(weight * density), np.array(value), atol=1e-5)
+    behind = mi.Vector3f(bs.wo.x, bs.wo.y, -bs.wo.z)
+    assert not np.array(bsdf.eval(ctx, si, behind)).any()
+    assert not np.array(bsdf.pdf(ctx, si, behind)).any()
+
+
+# --- Paths from the light ---
+
+
+def plate(bsdf):
+    """Two walls under a lamp, and a slanted camera."""
+    look = mi.ScalarTransform4f().look_at
+    lamp = look([-1, 2, 2], [0, 0, 0], [0, 0, 1]) @ mi.ScalarTransform4f().scale(0.5)
+    light = {"type": "area", "radiance": {"type": "rgb", "value": 5.0}}
+    beside = look([0, -1, 1], [0, 0, 1], [1, 0, 0])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "camera": camera([2, 0.8, 1.0], 12, fov=30, up=[0, 0, 1]),
+            "wall": {"type": "rectangle", "bsdf": bsdf},
+            "side": {"type": "rectangle", "bsdf": bsdf, "to_world": beside},
+            "lamp": {"type": "rectangle", "to_world": lamp, "emitter": light},
+        }
+    )
+
+
+def test_integrators_from_the_light_and_from_the_camera_agree(saved):
+    scene = plate({"type": "gaussian_relightable", "model": saved})
+
+    def mean(name, spp, **more):
+        found = mi.render(scene, integrator=mi.load_dict({"type": name, **more}), spp=spp, seed=1)
+        return found.numpy().mean()
+
+    expected = mean("path", 1024)
+    for name, spp in (("ptracer", 16384), ("volpath", 1024), ("prb", 1024)):
+        assert mean(name, spp) == pytest.approx(expected, rel=0.02), name
+    assert mean("direct", 1024) == pytest.approx(mean("path", 1024, max_depth=2), rel=0.02)
+
+
+# --- Light above white ---
+
+
+def test_light_above_white_survives_and_what_is_brighter_than_the_photos_does_not(tmp_path):
+    formula, brightest = LitFormula(scale=3.0), 2.0
+    uv = np.random.default_rng(1).uniform(0.05, 0.95, (200, 2))
+    points, normals = np.c_[2 * uv - 1, np.zeros(200)], np.tile([0, 0, 1.0], (200, 1))
+    lamps = over(normals)
+    codes = formula.codes(lamps * [1, -1, 1], uv)
+    assert (codes > brightest).any() and ((codes > 1) & (codes < brightest)).any()
+    formula.model(brightest).save(tmp_path / "m.npz")
+    for bsdf, most in (
+        (material_of(formula.model(brightest)), brightest),
+        ({"type": "gaussian_relightable", "model": str(tmp_path / "m.npz")}, brightest),
+        (material_of(formula.model()), 1),  # of photos that end at white
+    ):
+        found = values({"type": "rectangle", "bsdf": bsdf}, points, normals, lamps)
+        expected = to_light(codes.clip(0, most)) / np.pi
+        assert np.percentile(abs(found - expected), 98) < 0.02 * expected.max()
+
+
+def test_an_environment_of_a_model_of_bright_photos_is_not_clamped():
+    formula = LitFormula(scale=3.0)
+    shown = [
+        eg.render(formula.model(most).relight(np.ones((16, 32, 3)))).numpy() for most in (1, 9)
+    ]
+    lights = np.random.default_rng(0).normal(size=(4000, 3))
+    lights /= np.linalg.norm(lights, axis=1, keepdims=True)
+    lights[:, 2] = abs(lights[:, 2])
+    middle = np.tile([[8.5 / SIZE[0], 6.5 / SIZE[1]]], (len(lights), 1))
+    expected = 2 * to_light(formula.codes(lights, middle)).mean(axis=0)  # 2 pi / pi
+    np.testing.assert_allclose(shown[1][6, 8], expected, rtol=0.05)
+    assert shown[0].mean() < 0.8 * shown[1].mean()
+
+
+def test_an_environment_lights_a_model_as_an_envmap_does(formula):
+    """Rows of both go from pole to pole."""
+    y, x = np.mgrid[:16, :32]
+    sky = np.exp(-y / 2) + 0.2 * np.exp(-((x - 11) ** 2 + (y - 9) ** 2) / 8)
+    sky = np.float32(sky[..., None] * [2, 1, 0.5])
+    bsdf = material_of(formula.model(), to_uv=to_uv(UPRIGHT))
+    scene = wall_in_light(bsdf, "direct", 16, {"type": "envmap", "bitmap": mi.Bitmap(sky)})
+    seen = mi.render(scene, spp=1024).numpy()
+    found = eg.render(formula.model().relight(sky), width=16, height=16).numpy()
+    np.testing.assert_allclose(found.mean((0, 1)), seen.mean((0, 1)), rtol=0.02)
+
+
+# --- What is refused ---
+
+
+@pytest.mark.parametrize(
+    "light, error, says",
+    [
+        ("lights", ValueError, "one direction.*environment"),
+        ([[0, 0, 1.0]], ValueError, "one direction"),
+        (np.ones((8, 16)), ValueError, r"image \(h, w, 3\)"),
+        ([0, 1], ValueError, "shape"),
+        (None, TypeError, "type NoneType"),
+        (["0", "0", "1"], TypeError, "type list"),
+        (b"sky.exr", TypeError, "type bytes"),
+        ([[0, 0], [1]], TypeError, "type list"),
+        (-np.ones((8, 16, 3)), ValueError, "light is -1 somewhere"),
+        (np.full((8, 16, 3), np.nan), ValueError, "not finite"),
+    ],
+)
+def test_what_is_neither_a_direction_nor_an_environment_is_refused(formula, light, error, says):
+    model = formula.model()
+    with pytest.raises(error, match=says) as caught:
+        model.relight(model.lights if isinstance(light, str) else light)
+    assert "\n" not in str(caught.value)
+
+
+def test_vectors_of_dr_jit_that_are_no_direction_are_refused_or_shown_from_the_camera(formula):
+    model, nan = formula.model(), float("nan")
+    vectors = [mi.Vector3f(0, 0, 0), mi.Vector3f(nan, 0, 1), dr.opaque(mi.Vector3f, 0)]
+    vectors += [mi.Vector3f([0, 1], 0, 1), mi.Vector2f(0, 1), mi.TensorXf([0.0, 0, 0])]
+    for vector in vectors:
+        with pytest.raises(ValueError, match=r"(one|no) direction"):
+            model.relight(vector)
+    frontal = eg.picture_of(model.relight([0, 0, 1]))
+    computed = dr.opaque(mi.Vector3f, 0) * 2  # unknown until a program has run
+    assert np.allclose(eg.picture_of(model.relight(computed)), frontal, atol=1e-5)
+    assert np.allclose(eg.picture_of(model.relight(mi.TensorXf([0.0, 0, 2]))), frontal, atol=1e-5)
+
+
+def test_pictures_and_bitmaps_are_environments_of_their_own_encoding(formula):
+    model, codes = formula.model(), np.full((8, 16, 3), 128, np.uint8)
+    light = to_light(codes / 255)
+    expected = eg.picture_of(model.relight(light))
+    coded = mi.Bitmap(codes)
+    coded.set_srgb_gamma(True)
+    for environment in (coded, mi.Bitmap(np.float32(light))):
+        found = eg.picture_of(model.relight(environment))
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("scale", [float("nan")]),
+        ("scale", [-1.0]),
+        ("scale", []),
+        ("planes.prefilter", [0.1, 0.2]),
+        ("planes.prefilter", []),
+    ],
+)
+def test_changes_are_checked_as_properties_are(formula, key, value):
+    parameters = mi.traverse(mi.load_dict(material_of(formula.model())))
+    parameters["scale"] = mi.Float(3)
+    parameters.update()
+    parameters[key] = mi.Float(value)
+    name = key.split(".")[-1]
+    with pytest.raises(ValueError, match=f"gaussian_relightable: {name} (is|holds)") as caught:
+        parameters.update()
+    assert "\n" not in str(caught.value)
+
+
+def test_messages_name_the_material(formula, saved):
+    flat = mi.ScalarTransform4f().scale([0, 1, 1])
+    wrong = [{"wrap_mode": "x"}, {"to_uv": flat}, {"to_uv": 3.0}, {"prefilter": -1.0}, {"a": 1}]
+    wrong += [{"memory": "no"}, {"scale": -1.0}, {"light": [0, 0, 1.0]}]
+    for properties in wrong:
+        for bsdf in (
+            {"type": "gaussian_relightable", "model": saved},
+            material_of(formula.model()),
+        ):
+            with pytest.raises(RuntimeError, match="gaussian_relightable: ") as caught:
+                mi.load_dict(bsdf | properties)
+            assert "gaussian_texture" not in str(caught.value)
+
+
+# --- A model in memory ---
+
+
+def test_a_model_in_memory_is_the_material_of_its_file(formula, saved):
+    uv = np.random.default_rng(1).uniform(0, 1, (50, 2))
+    points, normals = np.c_[2 * uv - 1, np.zeros(50)], np.tile([0, 0, 1.0], (50, 1))
+    lamps = over(normals)
+    for options in ({}, {"scale": 2.0, "wrap_mode": "mirror", "to_uv": to_uv(UPRIGHT)}):
+        found, expected = (
+            values({"type": "rectangle", "bsdf": bsdf}, points, normals, lamps)
+            for bsdf in (
+                material_of(formula.model(), prefilter=None, **options),
+                {"type": "gaussian_relightable", "model": saved, "memory": "exact", **options},
+            )
+        )
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    parameters = mi.traverse(mi.load_dict(material_of(formula.model())))
+    assert {"planes.color", "planes.to_uv", "scale"} <= set(parameters.keys())
+
+
+@pytest.mark.parametrize(
+    "change, says", [("lights", "no direction"), ("values", "shape"), ("kind", "kind")]
+)
+def test_arrays_that_are_no_model_are_refused(formula, change, says):
+    bsdf = material_of(formula.model())
+    bsdf[change] = "spline" if change == "kind" else bsdf[change] * 0
+    if change == "values":
+        bsdf[change] = bsdf[change][:3]
+    with pytest.raises(RuntimeError, match=f"gaussian_relightable: .*{says}"):
+        mi.load_dict(bsdf)
+    for nothing in (None, "m.npz", formula.planes):
+        with pytest.raises(TypeError, match="takes a Relightable"):
+            material_of(nothing)
+
+
+def test_a_material_counts_its_table(formula):
+    bsdf = mi.load_dict(material_of(formula.model()))
+    numbers = 32 * 32 * 9  # three colours of two planes and what is added
+    counted = resident_bytes(bsdf) - resident_bytes(bsdf.planes)
+    assert 4 * numbers <= counted < 8 * numbers  # rows of 9 take 16 in Dr.Jit
+
+
+# --- Derivatives, polarization, maps of memory ---
+
+
+def test_planes_are_differentiable(saved):
+    scene = wall_in_light({"type": "gaussian_relightable", "model": saved}, "prb")
+    parameters, key = mi.traverse(scene), "wall.bsdf.planes.background"
+    start = mi.TensorXf(parameters[key])
+
+    def rendered(change):
+        parameters[key] = start + change
+        parameters.update()
+        return dr.mean(mi.render(scene, parameters, spp=16, seed=3), axis=None)
+
+    change, step = dr.zeros(mi.TensorXf, start.shape), 1e-2
+    dr.enable_grad(change)
+    dr.backward(rendered(change))
+    found = dr.grad(change).numpy().ravel()
+    for k in range(len(found)):
+        axis = mi.TensorXf(np.float32(np.arange(len(found)) == k) * step)
+        ends = [float(rendered(sign * axis).array[0]) for sign in (1, -1)]
+        assert found[k] == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.03, abs=1e-4)
+
+
+@in_variants(["llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"])
+def test_a_material_depolarizes(saved, variant):
+    """Beside the light, all parameters of Stokes are 0."""
+    stokes = mi.load_dict({"type": "stokes", "inner": {"type": "direct"}})
+    scene = wall_in_light({"type": "gaussian_relightable", "model": saved}, "direct")
+    seen = mi.render(scene, integrator=stokes, spp=16, seed=1).numpy()
+    shown, total, others = np.split(seen, [-12, -9], axis=2)  # three channels per parameter
+    assert shown.mean() > 0.01 and not others.any()
+    np.testing.assert_allclose(total, np.broadcast_to(shown, total.shape), rtol=1e-3, atol=1e-4)
+
+
+def test_a_file_loses_little(formula, saved):
+    """Rows of 8 words instead of 12 numbers, and no parameters: 9 numbers."""
+    file = {"type": "gaussian_relightable", "model": saved}
+    coded, exact = (mi.load_dict({**file, "memory": name}) for name in ("normal", "exact"))
+    held = resident_bytes(exact) - resident_bytes(coded)
+    number = len(formula.planes)
+    assert held >= 32 * number
+    si = in_front(texel_centres(SIZE))
+    towards = mi.Vector3f(0.3, -0.2, 0.9)
+    values = [picture(one.eval(mi.BSDFContext(), si, towards), SIZE) for one in (coded, exact)]
+    np.testing.assert_allclose(*values, atol=0.01)
+    assert np.abs(values[0]).max() > 0.1
+
+
+# --- A texture that shows one light ---
+
+
+NAME = "wall.bsdf.reflectance.light"
+LIGHT = [0.3, -0.4, 0.8]
+
+
+def wall_in_light(bsdf, integrator, side=12, light=None):
+    """A wall that fills the picture of a camera in front of it, by default under a lamp."""
+    film = {"type": "hdrfilm", "width": side, "height": side, "pixel_format": "rgb"}
+    view = mi.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0])
+    film["rfilter"] = {"type": "box"}
+    lamp = {"type": "directional", "direction": [-0.3, -0.4, -0.8], "irradiance": np.pi}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator},
+            "lamp": light or lamp,
+            "wall": {"type": "rectangle", "bsdf": bsdf},
+            "camera": {"type": "orthographic", "to_world": view, "film": film},
+        }
+    )
+
+
+def test_a_wall_under_a_lamp_looks_like_a_photo(formula, saved):
+    scene = wall_in_light({"type": "gaussian_relightable", "model": saved}, "direct", 24)
+    shown = mi.render(scene, spp=64).numpy()[::-1]  # row 0 lies at v = 0, the bottom of the wall
+    photo = eg.render(formula.model().relight(LIGHT), width=24, height=24).numpy().clip(0, 1)
+    assert eg.psnr(to_coded(shown.clip(0, 1)), photo) > 30
+
+
+class TestTexture:
+    def test_shows_the_model_under_its_light(self, formula, saved):
+        texture = mi.load_dict({"type": "gaussian_texture", "model": saved, "light": LIGHT})
+        parameters = mi.traverse(texture)
+        assert [key for key, _ in parameters] == ["light", "to_uv", "prefilter"]
+        for light in (LIGHT, [-3.0, 2.0, 9.0]):
+            parameters["light"] = mi.Vector3f(*light)
+            parameters.update()
+            found = picture(texture.eval_3(texel_centres(SIZE)), SIZE)
+            expected = eg.picture_of(formula.model().relight(light)).clip(0, 1)
+            np.testing.assert_allclose(found, to_light(expected), atol=1e-3)
+
+    @few_groups()
+    def test_packed_models_are_read(self, formula, saved, tmp_path):
+        eg.pack(formula.model(), tmp_path / "m.egs", max_psnr_drop=0.1)
+        packed = mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "m.egs")})
+        whole = mi.load_dict({"type": "gaussian_texture", "model": saved})
+        found, expected = (picture(t.eval_3(texel_centres(SIZE)), SIZE) for t in (packed, whole))
+        np.testing.assert_allclose(found, expected, atol=0.05)
+
+    @pytest.mark.parametrize("integrator", ["direct", "prb"])
+    def test_the_derivative_is_that_of_finite_differences(self, saved, integrator):
+        texture = {"type": "gaussian_texture", "model": saved, "light": LIGHT}
+        scene = wall_in_light({"type": "diffuse", "reflectance": texture}, integrator)
+        parameters = mi.traverse(scene)
+
+        def rendered(light):
+            parameters[NAME] = light
+            parameters.update()
+            return dr.sum(dr.square(mi.render(scene, parameters, seed=3, spp=16)), axis=None)
+
+        light = mi.Vector3f(*LIGHT)
+        dr.enable_grad(light)
+        dr.backward(rendered(light))
+        step, found = 2e-2, np.array(dr.grad(light)).ravel()
+        ends = [
+            [
+                float(rendered(mi.Vector3f(*(np.array(LIGHT) + s * axis).tolist())).array[0])
+                for s in (step, -step)
+            ]
+            for axis in np.eye(3)
+        ]
+        expected = np.array([up - down for up, down in ends]) / (2 * step)
+        np.testing.assert_allclose(found, expected, rtol=0.02, atol=0.01 * abs(expected).max())
+
+    def test_a_light_that_an_optimiser_spoilt_is_that_of_the_camera(self, saved):
+        texture = mi.load_dict({"type": "gaussian_texture", "model": saved, "memory": "exact"})
+        expected = picture(texture.eval_3(texel_centres(SIZE)), SIZE)
+        parameters = mi.traverse(texture)
+        for light in ([np.nan, 0, 1], [0, 0, 0]):
+            parameters["light"] = mi.Vector3f(*light)
+            parameters.update()
+            found = picture(texture.eval_3(texel_centres(SIZE)), SIZE)
+            np.testing.assert_array_equal(found, expected)
+
+    def test_lights_that_are_refused(self, saved):
+        for light, says in (([0, 0, -1.0], "below the horizon"), ([0, 0, 0.0], "no direction")):
+            with pytest.raises(RuntimeError, match=says):
+                mi.load_dict({"type": "gaussian_texture", "model": saved, "light": light})
+
+
+def test_one_plane_is_a_plane():
+    """As two are, which of another texture would be those of normals, and get a third."""
+    lights = directions(8)
+    model = eg.Relightable.fit(photos(lights), lights, gaussians=8, planes=1, iterations=0)
+    texture = mi.load_dict(material_of(model))
+    si = in_front(texel_centres((24, 24)))
+    found = picture(texture.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1)), (24, 24))
+    expected = eg.picture_of(model.relight([0, 0, 1])).clip(0, 1)
+    np.testing.assert_allclose(found, to_light(expected) / np.pi, atol=5e-3)

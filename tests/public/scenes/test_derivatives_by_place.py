@@ -1,0 +1,303 @@
+"""Derivatives by what moves a picture under a prefilter: finite differences of the rendering.
+
+Gaussians end at their cutoff, and an end has no derivative: some percent may be missing.
+"""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.lit_models import LitFormula
+from _helpers.poster import camera
+from _helpers.texture import at, in_front, mi
+from eigengs_dr.plugins import environment_of, follow, material_of, texture_of
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+PREFILTERS = [0.05, 0.2]
+"""Angles in radians: exact sums, then lookups of the pyramid."""
+
+STEP = 0.01
+
+CORNERS = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+
+
+def gaussians(count=100, size=(32, 32)):
+    rng = np.random.default_rng(1)
+    a, c = rng.uniform(0.25, 0.5, (2, count))
+    factor = np.stack([a, rng.uniform(-0.1, 0.1, count), c], axis=1)
+    return eg.Gaussians.from_arrays(
+        rng.uniform(0, size, (count, 2)),
+        factor,
+        rng.uniform(-0.12, 0.12, (count, 3)),
+        np.full(3, 0.45),
+        size=size,
+        space="linear",
+    )
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory):
+    """The path of a square whose uv goes beyond all borders of the picture."""
+    path = tmp_path_factory.mktemp("mesh") / "square.ply"
+    low, high = -0.4, 1.5
+    rows = [f"{x} {y} 0 {low if x < 0 else high} {low if y < 0 else high}" for x, y in CORNERS]
+    numbers = "\n".join(f"property float {k}" for k in "xyzuv")
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 4\n{numbers}\nelement face 2\n"
+        "property list uchar int vertex_indices\nend_header\n"
+        + "\n".join([*rows, "3 0 1 2", "3 0 2 3", ""])
+    )
+    return str(path)
+
+
+def scene_of(square, surface, integrator="direct"):
+    """A square with a material or an emitter, under a lamp."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator},
+            "lamp": {"type": "point", "position": [0.5, 0.3, 3], "intensity": 10.0},
+            "wall": {"type": "ply", "filename": square, **surface},
+            "camera": camera([0.3, 0.2, 3.5], 10, fov=28),
+        }
+    )
+
+
+def painted(**properties):
+    return {"bsdf": {"type": "diffuse", "reflectance": texture_of(gaussians(), **properties)}}
+
+
+def ratios(scene, key, move, modes=("backward", "forward")):
+    """The derivative along `move` in each mode, over finite differences: both as pictures."""
+    parameters = mi.traverse(scene)
+    start = type(parameters[key])(parameters[key])
+
+    def picture(t):
+        parameters[key] = move(start, t)
+        parameters.update()
+        return mi.render(scene, parameters, spp=256, seed=3)
+
+    ahead, behind = (np.array(picture(mi.Float(t)), np.float64) for t in (STEP, -STEP))
+    wanted = (ahead - behind) / (2 * STEP)
+    found = []
+    for mode in modes:
+        t = mi.Float(0)
+        dr.enable_grad(t)
+        if mode == "backward":
+            dr.backward(dr.sum(picture(t) * mi.TensorXf(np.float32(wanted)), axis=None))
+            found.append(dr.grad(t)[0])
+        else:
+            shown = picture(t)
+            dr.forward(t)
+            found.append((np.array(dr.grad(shown), np.float64) * wanted).sum())
+        picture(mi.Float(0))  # else the scene keeps the graph of t
+    return np.array(found) / np.square(wanted).sum()
+
+
+def assert_close(found):
+    assert ((found > 0.95) & (found < 1.05)).all(), found
+
+
+def slide(uv, t):
+    return uv + mi.Float([1, 0.3] * 4) * t
+
+
+MOVES = {
+    "uv": ("wall.vertex_texcoords", slide),
+    "zoom of uv": ("wall.vertex_texcoords", lambda uv, t: uv * (1 + t)),
+    "vertices": ("wall.vertex_positions", lambda at, t: at + mi.Float([1, 0.3, 0] * 4) * t),
+    "camera": (
+        "camera.to_world",
+        lambda view, t: view @ mi.Transform4f().translate(mi.Vector3f(t, 0.3 * t, 0)),
+    ),
+    "nearer camera": (
+        "camera.to_world",
+        lambda view, t: view @ mi.Transform4f().translate(mi.Vector3f(0, 0, t)),
+    ),
+}
+
+
+class TestTexture:
+    @pytest.mark.parametrize("prefilter", PREFILTERS)
+    @pytest.mark.parametrize("what", MOVES)
+    def test_derivative_by_what_moves(self, square, what, prefilter):
+        scene = scene_of(square, painted(prefilter=prefilter))
+        assert_close(ratios(scene, *MOVES[what]))
+
+    @pytest.mark.parametrize(
+        ("integrator", "properties"),
+        [("path", {}), ("prb", {"wrap_mode": "clamp"}), ("direct", {"wrap_mode": "mirror"})],
+    )
+    def test_other_integrators_and_borders(self, square, integrator, properties):
+        scene = scene_of(square, painted(prefilter=0.05, **properties), integrator)
+        assert_close(ratios(scene, *MOVES["uv"]))
+
+    def test_file_of_words(self, square, tmp_path):
+        gaussians().save(tmp_path / "set.npz")
+        texture = {"type": "gaussian_texture", "filename": str(tmp_path / "set.npz")}
+        texture |= {"memory": "small", "prefilter": 0.05}
+        scene = scene_of(square, {"bsdf": {"type": "diffuse", "reflectance": texture}})
+        assert_close(ratios(scene, *MOVES["uv"], modes=["backward"]))
+
+    def test_light_of_a_surface_that_follows_a_camera(self, square):
+        radiance = texture_of(gaussians(), prefilter=True)
+        scene = scene_of(square, {"emitter": {"type": "area", "radiance": radiance}})
+        follow(scene)
+        assert_close(ratios(scene, *MOVES["uv"]))
+
+    def test_derivative_by_colours_too(self, square):
+        """With derivatives by place beside them, those by the parameters stay what they were."""
+        scene = scene_of(square, painted(prefilter=0.1))
+        parameters = mi.traverse(scene)
+        color, uv = "wall.bsdf.reflectance.color", "wall.vertex_texcoords"
+        found = []
+        for keys in ([color], [color, uv]):
+            for key in keys:
+                parameters[key] = type(parameters[key])(dr.detach(parameters[key]))
+                dr.enable_grad(parameters[key])
+            parameters.update()
+            dr.backward(dr.sum(mi.render(scene, parameters, spp=16, seed=3), axis=None))
+            found.append(np.array(dr.grad(parameters[color])))
+        np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-4 * np.abs(found).max())
+
+
+def test_material_of_lights(square):
+    bsdf = material_of(LitFormula().model(), prefilter=0.2)
+    assert_close(ratios(scene_of(square, {"bsdf": bsdf}), *MOVES["uv"]))
+
+
+def interactions(uv):
+    """Surfaces seen at a right angle from a distance of 1."""
+    return in_front(at(uv.x, uv.y))
+
+
+def points(count=400):
+    return np.random.default_rng(0).uniform(-0.5, 1.5, (2, count)).astype(np.float32)
+
+
+class TestLookupAlone:
+    """Lookups without a scene, where Dr.Jit records nothing."""
+
+    @pytest.mark.parametrize(
+        ("wrap", "prefilter"), [("repeat", 0.3), ("mirror", 0.1), ("clamp", 0.01)]
+    )
+    def test_slope_at_points(self, wrap, prefilter):
+        texture = mi.load_dict(texture_of(gaussians(), prefilter=prefilter, wrap_mode=wrap))
+        x, y = points()
+
+        def looked_up(t):
+            return texture.eval_3(interactions(mi.Point2f(mi.Float(x) + t, mi.Float(y)))).x
+
+        ahead, behind = (np.array(looked_up(mi.Float(t))) for t in (1e-3, -1e-3))
+        wanted = (ahead - behind) / 2e-3
+        for mode in ("forward", "backward"):
+            t = dr.zeros(mi.Float, len(x))
+            dr.enable_grad(t)
+            value = looked_up(t)
+            (dr.forward if mode == "forward" else dr.backward)(t if mode == "forward" else value)
+            found = np.array(dr.grad(value if mode == "forward" else t))
+            # Differences may step over an end of a Gaussian: the median does not see it.
+            assert np.median(np.abs(found - wanted)) < 0.005 * np.abs(wanted).mean()
+            if prefilter == 0.3:  # wide footprints see sums of Gaussians without ends
+                assert 0.99 < (found * wanted).sum() / np.square(wanted).sum() < 1.01
+
+    def test_derivative_by_the_prefilter(self):
+        texture = mi.load_dict(texture_of(gaussians(), prefilter=0.05))
+        parameters = mi.traverse(texture)
+        uv = mi.Point2f(*map(mi.Float, points()))
+
+        def looked_up(angle):
+            parameters["prefilter"] = angle
+            parameters.update()
+            return texture.eval_3(interactions(uv)).x
+
+        angle = mi.Float(0.05)
+        dr.enable_grad(angle)
+        value = looked_up(angle)
+        dr.forward(angle)
+        found = np.array(dr.grad(value))
+        ahead, behind = (np.array(looked_up(mi.Float(0.05 + s))) for s in (1e-3, -1e-3))
+        wanted = (ahead - behind) / 2e-3
+        assert np.median(np.abs(found - wanted)) < 0.005 * np.abs(wanted).mean()
+
+    @pytest.mark.parametrize(("moves", "prefilter"), [("first", 0.05), ("second", 0.0)])
+    def test_one_of_two_lookups_of_a_program(self, moves, prefilter):
+        """A recorded program looks the same points up twice, once without derivatives."""
+        texture = mi.load_dict(texture_of(gaussians(), prefilter=prefilter))
+        x, y = map(mi.Float, points())
+
+        def twice(i, x, total):
+            moving, still = (interactions(mi.Point2f(u, y)) for u in (x, dr.detach(x)))
+            pair = (moving, still) if moves == "first" else (still, moving)
+            first, second = (texture.eval_3(si).x for si in pair)
+            return i + 1, x, total + first + 3 * second
+
+        def summed(x):
+            state = mi.UInt32(0), x, dr.zeros(mi.Float, dr.width(x))
+            return dr.while_loop(state, lambda i, *rest: i < 1, twice, mode="symbolic")[2]
+
+        dr.enable_grad(x)
+        total = summed(x)
+        dr.forward(x)
+        alone = mi.Float(dr.detach(x))
+        dr.enable_grad(alone)
+        value = texture.eval_3(interactions(mi.Point2f(alone, y))).x
+        dr.forward(alone)
+        factor = 1 if moves == "first" else 3
+        wanted = factor * np.array(dr.grad(value))
+        np.testing.assert_allclose(np.array(dr.grad(total)), wanted, rtol=1e-3, atol=1e-4)
+
+
+class TestEnvironment:
+    def sky(self):
+        """Light that is even at the poles and across the seam."""
+        rng = np.random.default_rng(2)
+        mean = rng.uniform([12, 8], [52, 24], (60, 2))
+        color = rng.uniform(0.1, 1, (60, 3))
+        factor = np.tile([0.4, 0.05, 0.35], (60, 1))
+        return eg.Gaussians.from_arrays(
+            mean, factor, color, np.ones(3), size=(64, 32), space="radiance"
+        )
+
+    def test_directions(self):
+        sky = mi.load_dict(environment_of(self.sky(), prefilter=0.2, scale=2.0))
+        rng = np.random.default_rng(0)
+        towards = rng.normal(size=(3, 1000)).astype(np.float32)
+        towards /= np.linalg.norm(towards, axis=0)
+        aside = np.cross(towards.T, [0.3, 0.5, -0.2]).T.astype(np.float32)
+
+        def light(t):
+            si = dr.zeros(mi.SurfaceInteraction3f, towards.shape[1])
+            si.wi = -(mi.Vector3f(*map(mi.Float, towards)) + t * mi.Vector3f(*map(mi.Float, aside)))
+            return sky.eval(si).x
+
+        ahead, behind = (np.array(light(mi.Float(t))) for t in (STEP, -STEP))
+        wanted = (ahead - behind) / (2 * STEP)
+        t = mi.Float(0)
+        dr.enable_grad(t)
+        value = light(t)
+        dr.forward(t, flags=dr.ADFlag.ClearVertices)
+        forward = (np.array(dr.grad(value)) * wanted).sum()
+        dr.set_grad(t, 0)
+        dr.backward(dr.sum(light(t) * mi.Float(np.float32(wanted))))
+        assert_close(np.array([forward, dr.grad(t)[0]]) / np.square(wanted).sum())
+
+    @pytest.mark.parametrize("integrator", ["path", "prb"])
+    def test_turned_in_a_scene(self, integrator):
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": integrator},
+                "sky": environment_of(self.sky(), prefilter=0.1),
+                "camera": camera([0, 0, 0], 10, fov=60, target=[1, 0.2, 0.3]),
+            }
+        )
+
+        def turn(to_world, t):
+            return to_world @ mi.Transform4f().rotate(mi.Vector3f(0, 1, 0), 20 * t)
+
+        assert_close(ratios(scene, "sky.to_world", turn))
+        if integrator != "prb":  # it has no derivatives by a camera
+            assert_close(ratios(scene, "camera.to_world", turn))

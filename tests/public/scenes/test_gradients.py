@@ -1,0 +1,278 @@
+"""Derivatives through Mitsuba's integrators, parameters from a model, what optimisers leave."""
+
+import gc
+import weakref
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.families import small_model
+from _helpers.process import run_python
+from _helpers.sets import SIZE, random_scene
+from _helpers.texture import (
+    at,
+    backend,
+    gaussians,
+    in_front,
+    mi,
+    picture,
+    small_scene,
+    texel_centres,
+    texture,
+)
+from eigengs_dr.plugins import keep_in_bounds, texture_of
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+PARAMETERS = ["mean", "factor", "color", "background"]
+TEXTURE = "wall.bsdf.reflectance"
+SIDE, SPP, SEED = 12, 32, 3
+STEPS = {"mean": 2e-2, "factor": 1e-3, "coefficients": 1e-2}
+
+
+def of_texture(scene):
+    parameters = mi.traverse(scene)
+    parameters.keep(f"{TEXTURE}\\.(?!to_uv|prefilter)")
+    return parameters
+
+
+def wall(g, **properties):
+    return {"type": "diffuse", "reflectance": {**texture_of(g), **properties}}
+
+
+def direction_like(array):
+    return np.random.default_rng(2).normal(size=array.shape).astype(np.float32)
+
+
+def upstream():
+    return np.random.default_rng(1).normal(size=(SIDE, SIDE, 3)).astype(np.float32)
+
+
+def gradients(scene, weight):
+    """Gradient of ``<weight, image>`` with respect to every parameter, from the integrator."""
+    parameters = of_texture(scene)
+    for key, value in parameters:
+        dr.enable_grad(value)
+        parameters[key] = value
+    parameters.update()
+    scene.integrator().render_backward(scene, parameters, weight, seed=SEED, spp=SPP)
+    return {key.split(".")[-1]: np.array(dr.grad(value)) for key, value in parameters}
+
+
+def difference(scene, name, step, direction, weight):
+    """The same along a direction, by finite differences at the same seed."""
+    parameters, key = of_texture(scene), f"{TEXTURE}.{name}"
+    start, losses = np.array(parameters[key]), []
+    for moved in (start + step * direction, start - step * direction, start):
+        parameters[key] = mi.TensorXf(np.float32(moved))
+        parameters.update()
+        with dr.suspend_grad():
+            image = scene.integrator().render(scene, seed=SEED, spp=SPP)
+        losses.append((np.array(image, np.float64) * np.array(weight)).sum())
+    return (losses[0] - losses[1]) / (2 * step)
+
+
+def check_gradients(scene, names):
+    """Compare with finite differences to 1 %, at equal seeds."""
+    weight = mi.TensorXf(upstream())
+    found = gradients(scene, weight)
+    assert list(found) == names
+    for name, gradient in found.items():
+        direction = direction_like(gradient)
+        expected = difference(scene, name, STEPS.get(name, 2e-3), direction, weight)
+        assert abs(expected) > 1e-2
+        assert (gradient * direction).sum() == pytest.approx(expected, rel=0.01), name
+
+
+@pytest.mark.parametrize(
+    ("integrator", "prefilter"), [("direct", 0.0), ("path", 0.0), ("prb", 0.05)]
+)
+def test_gradients_are_finite_differences(integrator, prefilter):
+    """A cutoff of 6 leaves no edge for finite differences to cross."""
+    bsdf = wall(gaussians("ycbcr"), cutoff=6.0, prefilter=prefilter)
+    check_gradients(small_scene(bsdf, integrator, SIDE, SPP), PARAMETERS)
+
+
+def along_parameters(integrator):
+    """A picture whose parameters depend on one variable, and this variable."""
+    scene = small_scene(wall(gaussians()), integrator, SIDE, 8)
+    parameters, along = of_texture(scene), mi.Float(0)
+    dr.enable_grad(along)
+    for name in PARAMETERS:
+        start = mi.TensorXf(parameters[f"{TEXTURE}.{name}"])
+        parameters[f"{TEXTURE}.{name}"] = start + along * mi.TensorXf(direction_like(start))
+    parameters.update()
+    return mi.render(scene, parameters, seed=SEED, spp=8), along
+
+
+@pytest.mark.parametrize("integrator", ["direct", "prb"])
+def test_forward_mode_in_the_usual_order(integrator):
+    """Rendered first and walked then, from a variable behind the parameters."""
+    image, along = along_parameters(integrator)
+    dr.forward(along)
+    found = (np.array(dr.grad(image)) * upstream()).sum()
+    image, along = along_parameters(integrator)
+    dr.backward(dr.sum(image * mi.TensorXf(upstream()), axis=None))
+    assert abs(dr.grad(along)[0]) > 1e-3
+    assert found == pytest.approx(dr.grad(along)[0], rel=1e-3)
+
+
+FORWARD_WITH_PREFILTER = """
+import drjit as dr, eigengs_dr as eg, mitsuba as mi
+from eigengs_dr.plugins import texture_of
+mi.set_variant("llvm_ad_rgb")
+eg.register_plugins()
+g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1, 1, 1]], size=(8, 8), space="linear")
+texture = mi.load_dict(texture_of(g, prefilter=0.05))
+parameters, along = mi.traverse(texture), mi.Float(0)
+dr.enable_grad(along)
+parameters["color"] = parameters["color"] + along
+parameters.update()
+try:
+    dr.forward(along)
+except RuntimeError as error:
+    print(error, flush=True)
+"""
+
+
+def test_forward_mode_of_a_prefilter_says_that_there_is_none():
+    """In another process: after an error in a walk, Dr.Jit 1.5 may end it when it exits."""
+    told = run_python(FORWARD_WITH_PREFILTER).stdout
+    assert told.startswith("no forward mode of Gaussians with a prefilter")
+
+
+def test_derivatives_that_nobody_walks_keep_nothing_alive():
+    """Operations that hold their texture would be left when the process ends, and end it badly."""
+    tex = texture(gaussians(), prefilter=0.05)
+    parameters = mi.traverse(tex)
+    dr.enable_grad(parameters["color"])
+    parameters.update()
+    dr.eval(tex.eval_3(in_front(at(0.3, 0.4))))
+    alive = weakref.ref(tex)
+    del tex, parameters
+    gc.collect()
+    assert alive() is None
+
+
+class TestBroken:
+    @pytest.mark.parametrize("name", PARAMETERS)
+    def test_parameters_leave_a_finite_picture(self, name):
+        tex = texture(gaussians(), prefilter=0.01)
+        parameters = mi.traverse(tex)
+        start = np.array(parameters[name])
+        for value in (np.nan, np.inf, -np.inf, 0.0, -5.0, 1e30, 1e-20):
+            broken = start.copy()
+            broken[: max(1, len(broken) // 4)] = value
+            parameters[name] = mi.TensorXf(broken)
+            parameters.update()
+            found = np.array(tex.eval(in_front(texel_centres())))
+            assert np.isfinite(found).all(), value
+            assert found.min() >= 0 and found.max() <= 1, value
+
+    def test_one_broken_splat_is_as_none(self):
+        scene = random_scene(0)
+        broken = scene.factor.copy()
+        broken[5] = np.nan
+        kept = scene.permuted(np.setdiff1d(np.arange(len(broken)), 5))
+        tex = texture(gaussians(), raw=True)
+        parameters = mi.traverse(tex)
+        parameters["factor"] = mi.TensorXf(broken.astype(np.float32))
+        parameters.update()
+        g = kept._replace(color=0.04 * kept.color, background=np.full(3, 0.5)).on(backend())
+        np.testing.assert_allclose(
+            picture(tex.eval_3(texel_centres())), eg.render(g).numpy(), atol=1e-5
+        )
+
+    def test_bounds(self):
+        """Deviations of 0.25 pixels to twice the longer side."""
+        optimizer = mi.ad.Adam(lr=0.1)
+        optimizer["t.mean"] = mi.TensorXf(np.float32([[1, 2], [np.nan, 99], [-3, 4]]))
+        optimizer["t.factor"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
+        optimizer["t.color"] = mi.TensorXf(np.float32([[1, 2, 3], [np.nan, 99, -1], [1, 0, 1]]))
+        keep_in_bounds(optimizer, "t", gaussians())
+        for name, expected in (
+            ("mean", [[1, 2], [SIZE[0] / 2, SIZE[1]], [0, 4]]),
+            ("factor", [[1, 2, 3], [4, 4, 1 / (2 * max(SIZE))], [1, 0, 1]]),
+            ("color", [[1, 2, 3], [0, 99, -1], [1, 0, 1]]),
+        ):
+            np.testing.assert_allclose(np.array(optimizer[f"t.{name}"]), expected)
+
+
+HUGE = 3.3e38
+
+
+@pytest.mark.parametrize(
+    "factor",
+    [
+        (1e-20, 0, 1e-20),
+        (1e-37, 0, 1),
+        (1, 0, 1e-37),
+        (HUGE, 0, HUGE),
+        (1, HUGE, 1),
+        (HUGE, HUGE, HUGE),
+    ],
+)
+def test_extreme_gaussians_stay_finite(factor):
+    """Very wide, very narrow and very long ones, near, and from afar in the pyramid."""
+    scene = random_scene()
+    scene.factor[0] = factor
+    tex = texture(scene.on(backend(), space="rgb"), prefilter=0.1, wrap_mode="clamp")
+    for distance in (0.01, 0.5, 2.0, 10.0):
+        points = in_front(at(mi.Float(0.1, 0.45, 0.99), mi.Float(0.3, 0.5, 0.02)), distance)
+        assert np.isfinite(np.array(tex.eval_1(points))).all()
+
+
+class TestModel:
+    @pytest.fixture
+    def saved(self, tmp_path):
+        model = small_model(backend())
+        model.save(tmp_path / "m.npz")
+        return str(tmp_path / "m.npz"), eg.EigenGS.load(tmp_path / "m.npz", backend())
+
+    def test_coefficients_give_the_model_s_picture(self, saved):
+        path, model = saved
+        rng = np.random.default_rng(0)
+        rows = [0.1 * rng.normal(size=k).astype(np.float32) for k in model.components]
+        tex = mi.load_dict({"type": "gaussian_texture", "model": path, "raw": True})
+        parameters = mi.traverse(tex)
+        assert [key for key, _ in parameters] == ["coefficients", "to_uv", "prefilter"]
+        assert parameters["coefficients"].shape == (3, max(model.components))
+        table = np.zeros(parameters["coefficients"].shape, np.float32)
+        for padded, row in zip(table, rows, strict=True):
+            padded[: len(row)] = row
+        for given in (table, table * 0):
+            parameters["coefficients"] = mi.TensorXf(given)
+            parameters.update()
+            expected = model.reconstruct(
+                [r[:k] for r, k in zip(given, model.components, strict=True)]
+            )
+            found = picture(tex.eval_3(texel_centres((32, 32))), (32, 32))
+            np.testing.assert_allclose(found, eg.render(expected).numpy(), atol=1e-4)
+
+    def test_gradients_are_finite_differences(self, saved):
+        bsdf = {"type": "diffuse", "reflectance": {"type": "gaussian_texture", "model": saved[0]}}
+        check_gradients(small_scene(bsdf, "prb", SIDE, SPP), ["coefficients"])
+
+    def test_coefficients_of_another_shape_or_that_are_not_finite(self, saved):
+        path, model = saved
+        given = {"type": "gaussian_texture", "model": path}
+        few = mi.TensorXf(np.zeros((2, 2), np.float32))
+        with pytest.raises(RuntimeError, match=r"coefficients has shape \(2, 2\), expected \(3, "):
+            mi.load_dict({**given, "coefficients": few})
+        broken = np.zeros((3, max(model.components)), np.float32)
+        broken[:, -1] = np.nan
+        with pytest.raises(RuntimeError, match="coefficients must be finite"):
+            mi.load_dict({**given, "coefficients": mi.TensorXf(broken)})
+        tex = mi.load_dict({**given, "memory": "exact"})
+        expected = np.array(tex.eval(texel_centres()))
+        parameters = mi.traverse(tex)
+        parameters["coefficients"] = mi.TensorXf(broken)  # as a step of an optimiser may leave
+        parameters.update()
+        np.testing.assert_array_equal(np.array(tex.eval(texel_centres())), expected)
+
+    def test_a_set_is_no_model(self, tmp_path):
+        gaussians().save(tmp_path / "x.npz")
+        with pytest.raises(RuntimeError, match=r"x\.npz"):
+            mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "x.npz")})

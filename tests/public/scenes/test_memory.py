@@ -1,0 +1,225 @@
+"""What a texture holds, which it says, and what it loses where it holds less."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.materials import material
+from _helpers.sets import SIZE
+from _helpers.skies import sky, uniform
+from _helpers.texture import (
+    at,
+    backend,
+    gaussians,
+    in_front,
+    mi,
+    picture,
+    small_scene,
+    texel_centres,
+    texture,
+)
+from eigengs_dr.plugins import (
+    bake_environment,
+    environment_of,
+    follow,
+    gaussians_of,
+    resident_bytes,
+    texture_of,
+)
+
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
+
+LOSS = 2e-3
+"""What colours lose at most: 20 Gaussians overlap, with colours of 0.04 and errors of their weights
+of some 2^-10 each; decoding to light and a prefilter add little."""
+
+
+def in_a_file(folder, g=None, **properties):
+    """The dictionary of a texture of a file."""
+    path = folder / "set.npz"
+    (gaussians() if g is None else g).save(path)
+    return {"type": "gaussian_texture", "filename": str(path), **properties}
+
+
+def seen(tex):
+    return picture(tex.eval_3(in_front(texel_centres())))
+
+
+class TestBytes:
+    def test_of_a_gaussian(self, tmp_path):
+        """Of a photo of 32 pixels for each, as it is placed."""
+        image = eg.sample("coffee")[100:260, 200:360]
+        g = eg.fit(image, 800, 0, backend=backend(), progress=False).gaussians
+        file = in_a_file(tmp_path, g)
+        held = {
+            name: resident_bytes(mi.load_dict({**file, "memory": name})) / 800
+            for name in ("exact", "normal", "small")
+        }
+        assert held["normal"] <= 66 and held["small"] <= 38
+        # The rows are half as long, and there are no parameters.
+        assert held["exact"] - held["normal"] == pytest.approx(48, abs=1)
+        assert resident_bytes(mi.load_dict(file)) == pytest.approx(800 * held["normal"], abs=100)
+
+    def test_of_derivatives_and_of_sampled_light(self):
+        tex = texture(gaussians())
+        assert f"resident_bytes = {resident_bytes(tex)}," in str(tex)
+        parameters = mi.traverse(tex)
+        held, number = resident_bytes(tex), len(np.ravel(parameters["color"]))
+        dr.eval(tex.sample_position(mi.Point2f(0.3, 0.4)))
+        with_light = resident_bytes(tex)
+        assert with_light >= held + 2 * 4 * SIZE[0] * SIZE[1]
+        dr.enable_grad(parameters["color"])
+        parameters.update()
+        dr.backward(dr.sum(tex.eval_1(at(0.3, 0.6))))
+        dr.eval(dr.grad(parameters["color"]))
+        assert resident_bytes(tex) >= held + 4 * number
+
+    @pytest.mark.texture_units
+    @pytest.mark.parametrize(("channels", "padded"), [(1, 1), (3, 4)])
+    def test_of_a_bitmap_are_those_of_its_texels(self, channels, padded):
+        """As Dr.Jit stores them from the first rendering on."""
+        scene = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((64, 32, channels), np.uint8))}
+        assert resident_bytes(mi.load_dict(scene | {"raw": True})) == 64 * 32 * padded
+
+    @pytest.mark.texture_units
+    def test_of_an_environment_are_fewer_than_those_of_an_envmap(self):
+        """Which has 16 bytes of a texel, and 4 x 7/3 of the sampling table."""
+        g = sky(count=500, size=(512, 256), deviation=(3.0, 20.0))
+        sums, texels = (
+            resident_bytes(mi.load_dict(make(g))) for make in (environment_of, bake_environment)
+        )
+        assert sums < 0.2 * texels
+        assert texels == pytest.approx(512 * 256 * (16 + 28 / 3), rel=0.02)
+
+
+class TestLoss:
+    @pytest.mark.parametrize(("memory", "prefilter"), [("small", 0.0), ("normal", 0.05)])
+    def test_pictures_lose_little(self, tmp_path, memory, prefilter):
+        file = in_a_file(tmp_path, prefilter=prefilter)
+        exact = mi.load_dict({**file, "memory": "exact"})
+        np.testing.assert_array_equal(seen(exact), seen(texture(gaussians(), prefilter=prefilter)))
+        tex = mi.load_dict({**file, "memory": memory})
+        assert resident_bytes(tex) < resident_bytes(exact)
+        np.testing.assert_allclose(seen(tex), seen(exact), atol=LOSS)
+        slopes = [np.array(t.eval_1_grad(in_front(texel_centres()))) for t in (tex, exact)]
+        np.testing.assert_allclose(*slopes, atol=0.02 * np.abs(slopes[1]).max())
+
+    def test_what_words_do_not_hold_stays_floats(self, tmp_path):
+        arrays = gaussians().to_arrays()
+        arrays["factor"][0] = 1e-12, 0, 1
+        g = eg.Gaussians.from_arrays(**arrays, size=SIZE, space="rgb", backend=backend())
+        np.testing.assert_array_equal(seen(mi.load_dict(in_a_file(tmp_path, g))), seen(texture(g)))
+
+    def test_light_above_65504(self, tmp_path):
+        arrays = gaussians("radiance").to_arrays()
+        arrays["color"] = np.abs(arrays["color"]) * (1e6 / np.abs(arrays["color"]).max())
+        g = eg.Gaussians.from_arrays(**arrays, size=SIZE, space="radiance", backend=backend())
+        whole = {"cutoff": 8.0}  # at the usual one, the sun has an edge of 1 %
+        exact = seen(texture(g, **whole))
+        assert exact.max() > 1e5
+        coded = seen(mi.load_dict(in_a_file(tmp_path, g, **whole)))
+        np.testing.assert_allclose(coded, exact, rtol=0.02, atol=LOSS)
+
+    def test_an_environment_loses_little(self, tmp_path):
+        sky().save(tmp_path / "sky.npz")
+        file = {"type": "gaussian_environment", "filename": str(tmp_path / "sky.npz")}
+        lights = [  # at the usual cutoff, Gaussians have edges of 1 %
+            mi.load_dict({**file, "prefilter": 0.05, "cutoff": 8.0, "memory": name})
+            for name in ("normal", "exact", "small")
+        ]
+        si = dr.zeros(mi.SurfaceInteraction3f, 500)
+        si.wi = mi.warp.square_to_uniform_sphere(uniform(500))
+        coded, exact, small = (np.array(light.eval(si)) for light in lights)
+        np.testing.assert_allclose(coded, exact, rtol=0.01, atol=1e-3 * exact.max())
+        np.testing.assert_allclose(small, coded, rtol=1e-4, atol=1e-5 * exact.max())
+        sizes = [resident_bytes(light) for light in lights]
+        assert sizes[2] < sizes[0] < sizes[1]
+
+
+class TestParameters:
+    def test_are_made_when_they_are_asked_for(self, tmp_path):
+        tex = mi.load_dict(in_a_file(tmp_path))
+        before, held = seen(tex), resident_bytes(tex)
+        parameters = mi.traverse(tex)
+        assert resident_bytes(tex) == held + 4 * 8 * len(gaussians()) + 4 * 3
+        np.testing.assert_array_equal(seen(tex), before)
+        for name, tensor in eg.to_tensors(gaussians()).items():
+            np.testing.assert_array_equal(np.array(parameters[name]), np.array(tensor))
+
+    def test_nothing_but_traverse_asks_for_them(self, tmp_path):
+        """Neither a mean, nor a lamp, nor a camera that is followed, nor Mitsuba itself."""
+        tex = mi.load_dict(in_a_file(tmp_path, prefilter=True))
+        scene = small_scene({"type": "diffuse", "reflectance": tex}, "direct")
+        follow(scene)
+        mi.render(scene, spp=1)
+        tex.mean(), tex.max(), str(tex)
+        tex.traverse(mi.TraversalCallback())  # as C++ of Mitsuba 3.10 looks for textures to filter
+        dr.eval(tex.sample_position(mi.Point2f(0.3, 0.4)))
+        held = resident_bytes(tex)
+        mi.traverse(tex)
+        assert resident_bytes(tex) >= held + 4 * 8 * len(gaussians())
+
+    @pytest.mark.parametrize("space", ["ycbcr", "linear"])
+    def test_without_its_file_a_texture_shows_what_its_rows_hold(self, tmp_path, space):
+        g = gaussians(space)
+        tex = mi.load_dict(in_a_file(tmp_path, g, prefilter=0.05))
+        (tmp_path / "set.npz").unlink()
+        found = gaussians_of(mi.traverse(tex), "", like=g).to_arrays()
+        for name, values in g.to_arrays().items():
+            np.testing.assert_allclose(found[name], values, rtol=4e-3, atol=2e-3, err_msg=name)
+
+    def test_maps_lose_little_and_without_their_file_show_what_rows_hold(self, tmp_path):
+        whole = material(size=SIZE, backend=backend())
+        whole.save(tmp_path / "m.npz")
+        file = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz"), "prefilter": 0.05}
+        textures = {m.name: mi.load_dict({**file, "map": m.name}) for m in whole.maps}
+        for name, tex in textures.items():
+            exact = mi.load_dict({**file, "map": name, "memory": "exact"})
+            values = [np.array(t.eval(in_front(texel_centres()))) for t in (tex, exact)]
+            np.testing.assert_allclose(*values, atol=5 * LOSS)
+            assert resident_bytes(tex) < resident_bytes(exact)
+        (tmp_path / "m.npz").write_bytes(b"another one")
+        for name, tex in textures.items():
+            found = gaussians_of(mi.traverse(tex), "", like=whole[name]).to_arrays()
+            for key, values in whole[name].to_arrays().items():
+                np.testing.assert_allclose(found[key], values, rtol=4e-3, atol=2e-3, err_msg=key)
+
+    def test_derivatives_are_those_of_a_texture_of_floats(self, tmp_path):
+        found = []
+        for given in (in_a_file(tmp_path), texture_of(gaussians())):
+            bsdf = {"type": "diffuse", "reflectance": {**given, "prefilter": 0.05}}
+            scene = small_scene(bsdf, "prb")
+            parameters = mi.traverse(scene)
+            parameters.keep(r".*reflectance\.(mean|factor|color|background)")
+            for key, value in parameters:
+                dr.enable_grad(value)
+                parameters[key] = value
+            parameters.update()
+            image = mi.render(scene, parameters, spp=4, seed=1)
+            dr.backward(dr.sum(dr.square(image), axis=None))
+            found.append([np.array(dr.grad(value)) for _, value in parameters])
+        assert len(found[0]) == 4
+        for ours, expected in zip(*found, strict=True):
+            largest = np.abs(expected).max()
+            assert largest > 1e-3
+            np.testing.assert_allclose(ours, expected, rtol=1e-3, atol=1e-4 * largest)
+
+    @pytest.mark.parametrize("asks", [False, True])
+    def test_frozen_renderings_follow_a_texture_that_becomes_one_of_floats(self, tmp_path, asks):
+        """Also where the frozen function is the first to ask."""
+        scene = small_scene({"type": "diffuse", "reflectance": in_a_file(tmp_path)}, "direct")
+
+        def render(scene, seed):
+            return mi.render(scene, mi.traverse(scene) if asks else None, spp=4, seed=seed)
+
+        frozen = dr.freeze(render)
+        for step in range(4):
+            if step > 1:
+                parameters = mi.traverse(scene)
+                key = next(key for key, _ in parameters if key.endswith("reflectance.color"))
+                parameters[key] = 0.9 * parameters[key]
+                parameters.update()
+            shown = np.array(frozen(scene, mi.UInt32(step)))
+            expected = np.array(mi.render(scene, spp=4, seed=step))
+            np.testing.assert_allclose(shown, expected, atol=1e-6)
