@@ -6,31 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from _helpers.benchmarks import lines_of, moment, row
-from eigengs_bench import inverse, kodak, pareto, rate, stability, tables
+from _helpers.benchmarks import lines_of, row
+from eigengs_bench import inverse, kodak, pareto, rate, stability
 from eigengs_bench.sky import psnr_without_noise
-
-
-def test_few_columns_have_what_the_paper_prints_beside_ours():
-    usual = {"set": "faces256", "iterations": 1000, "gaussians": 60, "space": "ycbcr"}
-    starts = {"default": "", "gaussianimage": "", "eigengs": "natural256"}
-    made = [
-        row(
-            {**usual, "preset": preset, "source": source, "components": 300 * bool(source)}
-            | {"split": "auto", "image": image},
-            moments=[moment(0, 20.0 + k), moment(1000, 30.0 + k)],
-        )
-        for image in ("a", "b")
-        for k, (preset, source) in enumerate(starts.items())
-    ]
-    [few] = [t for t in tables.summarize(made).tables if t.name == "main_1000"]
-    assert list(few.frame) == ["set", "method", "0", "1,000", "s"]
-    assert lines_of(few) == [
-        ("faces256", "default", "20.0", "30.0", "1.00"),
-        ("", "gaussianimage", "21.0", "31.0 (30.0)", "1.00"),
-        ("", "eigengs, universal basis", "22.0 (28.7)", "32.0 (42.2)", "1.00"),
-    ]
-    assert few.rows == made and "CelebA" in few.caption
 
 
 @given(st.lists(st.tuples(st.floats(0.1, 9), st.one_of(st.floats(0, 50), st.just(np.nan)))))
@@ -110,23 +88,6 @@ def test_a_psnr_without_noise():
     low, high = 1.055 * np.array([0.3, 0.32]) ** (1 / 2.4) - 0.055  # sRGB
     expected = -20 * np.log10(high - low)
     assert psnr_without_noise(pictures[1], pictures[0]) == pytest.approx(expected, abs=0.2)
-
-
-def test_gains_are_means_of_seeds():
-    figures = {"seconds": 1.0, "color_constant": 20.0, "gaussians": 100, "parameters": 800}
-    job = {"scene": "ball", "cameras": 2, "spp": 4}
-    rows = [
-        {"job": {**job, "method": method, "steps": steps, "seed": seed}, **figures}
-        | {"psnr_rgb": 30.0 + 2 * seed * (method == "fit"), "color": 30.0}
-        for method in ("pyramid", "fit")
-        for steps, seeds in ((120, 2), (240, 1))
-        for seed in range(seeds)
-    ]
-    gains = inverse.summarize(rows).tables[0]
-    assert gains.frame.to_numpy().tolist() == [["ball, 2 cameras", "+1.0", "+0.0 (1)"]]
-    assert gains.caption.endswith("means of 2 seeds, or of as many as brackets say")
-    [alone, *_] = inverse.summarize([r for r in rows if not r["job"]["seed"]]).tables
-    assert "seeds" not in alone.caption
 
 
 def test_gain_at_equal_seconds():

@@ -181,9 +181,7 @@ def test_a_folder_without_sets_is_refused_by_what_it_lacks(photo, command):
     [
         {"figures": np.zeros(2)},
         {"figures": np.zeros(3, np.float32)},
-        {"figures": np.array([1.0, 2.0, -3.0])},
         {"source": np.array("x" * 65)},
-        {"source": np.zeros(3)},
     ],
 )
 def test_hostile_figures_are_refused_in_one_line(change, set_file):
@@ -197,7 +195,6 @@ def test_hostile_figures_are_refused_in_one_line(change, set_file):
     [
         ({"mean": np.full((64, 2), np.nan, np.float32)}, "not finite"),
         ({"size": np.array([0, 32])}, "size is (0, 32)"),
-        ({"size": np.array([], np.int64)}, "size is ()"),
         ({"space": np.array("a\x1b[31m")}, r"space is 'a\x1b[31m'"),
         (
             {"color": np.full((64, 3), 3e38, np.float32)},

@@ -86,14 +86,11 @@ def test_what_is_no_material_is_never_replaced(fitted, folder, tmp_path):
 FIT = ["fit", "--map", "albedo={0}/albedo.png", "-o", "x.npz"]
 MISTAKES = {
     "size": ([*FIT, "--map", "b={0}/other.png"], "differ in size: albedo 32x32, b 8x9"),
-    "name": ([*FIT, "--map", "1={0}/other.png"], "expected a name and a file"),
     "no file": ([*FIT, "--map", "ao={0}/ao.png"], "no such file"),
     "space": ([*FIT, "--map", "ao:hsv={0}/other.png"], "space 'hsv' is not in"),
     "twice": ([*FIT, "--map", "albedo={0}/other.png"], "--map albedo is given twice"),
     "an image": ([*FIT, "{0}/other.png"], "the image has no name"),
     "colour": ([*FIT, "--space", "rgb"], "--space and --map exclude each other"),
-    "basis": ([*FIT, "--basis", "natural"], "--basis and --map exclude each other"),
-    "suffix": ([*FIT, "-o", "x.egs"], "the name must end in .npz"),
     "channels": (
         [*FIT, *(w for k in range(5) for w in ("--map", f"n{k}:normal={{0}}/normal.png"))],
         "the maps have 18 channels, the limit is 16",
@@ -101,12 +98,7 @@ MISTAKES = {
     "no output": (FIT[:3], "--map needs -o"),
     "nothing": (["fit"], "no image is given"),
     "no map": (["render", "{1}", "-o", "x.png"], "holds the maps albedo, roughness, normal"),
-    "unknown": (["render", "{1}", "-o", "x.png", "--map", "ao"], "no map is named 'ao'; it"),
     "image": (["pack", "{1}", "-o", "x.egs", "--image", "{0}/albedo.png"], "--map"),
-    "one of three": (
-        ["pack", "{1}", "-o", "x.egs", "--map", "albedo={0}/albedo.png"],
-        "give one of each",
-    ),
     "levels": (["pack", "{1}", "-o", "x.egs", "--levels", 2], "a material has no levels"),
 }
 

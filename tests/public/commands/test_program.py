@@ -140,6 +140,7 @@ def test_fit_writes_the_best_so_far_and_shows_a_bar(photo, tmp_path):
     assert len(eg.Gaussians.load(tmp_path / "x.npz")) == 64
 
 
+@pytest.mark.slow
 def test_several_images_go_on(tmp_path):
     """Images of one size are fitted together, so these end one after the other."""
     photos, fits, report = tmp_path / "photos", tmp_path / "fits", tmp_path / "r.json"

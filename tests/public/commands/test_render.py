@@ -117,15 +117,12 @@ def sky(tmp_path_factory):
     return folder, light
 
 
-def test_fit_of_light(sky, tmp_path):
+def test_fit_of_light(sky):
     folder, _ = sky
     figures = json.loads((folder / "r.json").read_text())
     assert figures["psnr_ycbcr"] > 25 and figures["encoding"] is None
     assert eg.load_image(folder / "p.png").shape[1] > 32
     assert eg.Gaussians.load(folder / "sky.npz").space == "log"
-    command = ["pack", folder / "sky.npz", "-o", tmp_path / "y.egs", "--image", folder / "sky.exr"]
-    command += ["--max-psnr-drop", 3]
-    assert "psnr in log" in said(*command)
 
 
 @pytest.mark.parametrize(("name", "bits"), [("y.exr", 32), ("y.tif", 32), ("h.exr", 16)])
