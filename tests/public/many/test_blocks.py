@@ -114,11 +114,6 @@ def test_light_that_no_display_shows(color):
     assert found.psnr_rgb == pytest.approx(whole.psnr_rgb, abs=1.5)
 
 
-def test_flat_image():
-    result = eg.fit_large(np.full((96, 96), 100, np.uint8), block=48, iterations=10)
-    assert result.psnr_rgb > 60
-
-
 def test_progress():
     rows = []
     eg.fit_large(
@@ -264,19 +259,6 @@ def test_interrupted_run_goes_on(tmp_path, stage, act, short, long):
     assert_same_bits(whole, again)
     assert not folder.exists()
     check_equal(eg.Gaussians.load(output, backend="llvm"), whole.gaussians.to_arrays())
-
-
-def test_a_block_is_kept_before_its_end_is_told(tmp_path):
-    """A callable that raises does not lose the block that has just ended."""
-    stop_after(tmp_path / "a.npz", mosaic(128), "fit", 0)
-    assert eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW).resumed == 1
-
-
-def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
-    """The Gaussians of an image would else lie on the disk once for every round."""
-    stop_after(tmp_path / "a.npz", mosaic(128), "measure", 0)
-    kept = {path.name for path in (tmp_path / "a.npz.checkpoint").glob("fit*")}
-    assert kept == {f"fit2-{number}.npz" for number in range(4)}
 
 
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
