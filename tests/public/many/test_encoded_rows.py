@@ -38,9 +38,7 @@ def test_a_set_without_the_mean_is_no_picture(model):
 
 
 def test_a_bound_above_an_image_leaves_it_one_gaussian_per_pixel():
-    photo = eg.sample("chelsea")[100:132, 150:182]
+    photo = eg.sample("chelsea")[100:106, 150:156]
     goal = eg.Goal(99, max_gaussians=100)
-    rows = eg.fit_many([photo, photo[:6, :6]], target_psnr=goal, iterations=2)
-    assert [(row.status, row.stopped) for row in rows] == [("done", "out of reach")] * 2
-    assert [row.gaussians for row in rows] == [100, 36]
-    assert len(eg.fit(photo[:6, :6], target_psnr=goal, iterations=2).gaussians) == 36
+    [row] = eg.fit_many([photo], target_psnr=goal, iterations=2)
+    assert (row.status, row.gaussians, row.stopped) == ("done", 36, "out of reach")
