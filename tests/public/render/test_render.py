@@ -1,9 +1,7 @@
 """Rendering: against a float64 sum over all pairs, of good and of bad numbers and arguments."""
 
 import math
-from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given
@@ -159,17 +157,6 @@ def test_extreme_widths(backend, diagonal, width):
     image = rendered(scene, backend, width=width)
     exact = np.broadcast_to(scene.background + (diagonal < 1) * scene.color, image.shape)
     np.testing.assert_allclose(image, exact, atol=1e-6)
-
-
-@pytest.mark.parametrize("opaque", [False, True])
-def test_a_value_that_all_splats_share(backend, opaque):
-    scene = random_scene(10)._replace(factor=np.tile([0.5, 0.25, 0.75], (COUNT, 1)))
-    gaussians = scene.on(backend)
-    shared = type(gaussians.factor)(0.5, 0.25, 0.75)
-    if opaque:
-        dr.make_opaque(shared)
-    image = eg.render(replace(gaussians, factor=shared))
-    np.testing.assert_array_equal(image, eg.render(gaussians))
 
 
 # --- Spaces ------------------------------------------------------------------------------------
