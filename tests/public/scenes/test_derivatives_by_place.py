@@ -163,6 +163,7 @@ class TestTexture:
         np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-4 * np.abs(found).max())
 
 
+@pytest.mark.slow
 def test_material_of_lights(square):
     bsdf = material_of(LitFormula().model(), prefilter=0.2)
     assert_close(ratios(scene_of(square, {"bsdf": bsdf}), *MOVES["uv"]))

@@ -124,7 +124,8 @@ import drjit as dr, eigengs_dr as eg, mitsuba as mi
 from eigengs_dr.plugins import texture_of
 mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()
-g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1, 1, 1]], size=(8, 8), space="linear")
+arrays = [[4, 4]] * 24, [[0.5, 0, 0.5]] * 24, [[0.01] * 3] * 24, [0.5] * 3
+g = eg.Gaussians.from_arrays(*arrays, size=(22, 17), space="linear")
 texture = mi.load_dict(texture_of(g, prefilter=0.05))
 parameters, along = mi.traverse(texture), mi.Float(0)
 dr.enable_grad(along)
