@@ -270,7 +270,10 @@ def direction_like(array):
 
 
 class TestDerivatives:
-    @pytest.mark.parametrize(("space", "prefilter"), [("radiance", 0.0), ("log", 0.2)])
+    @pytest.mark.parametrize(
+        ("space", "prefilter"),
+        [("radiance", 0.0), pytest.param("log", 0.2, marks=pytest.mark.slow)],
+    )
     def test_are_finite_differences(self, space, prefilter):
         emitter = environment_of(sky(space, count=12), cutoff=6.0, prefilter=prefilter)
         scene = mi.load_dict({"type": "scene", "sky": emitter})

@@ -199,6 +199,7 @@ class TestFit:
         counts = [count for count, reached in found.tried if reached >= BOUND]
         assert min(counts) == len(found.gaussians)
 
+    @pytest.mark.slow
     def test_data_of_one_channel(self):
         data = photo()[..., :1]
         found = fitted(camera([0, 0, 5.0]), image=data, space="data")

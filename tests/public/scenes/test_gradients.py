@@ -87,7 +87,8 @@ def check_gradients(scene, names):
 
 
 @pytest.mark.parametrize(
-    ("integrator", "prefilter"), [("direct", 0.0), ("path", 0.0), ("prb", 0.05)]
+    ("integrator", "prefilter"),
+    [("direct", 0.0), pytest.param("path", 0.0, marks=pytest.mark.slow), ("prb", 0.05)],
 )
 def test_gradients_are_finite_differences(integrator, prefilter):
     """A cutoff of 6 leaves no edge for finite differences to cross."""
@@ -142,6 +143,25 @@ def test_forward_mode_of_a_prefilter_says_that_there_is_none():
     """In another process: after an error in a walk, Dr.Jit 1.5 may end it when it exits."""
     told = run_python(FORWARD_WITH_PREFILTER).stdout
     assert told.startswith("no forward mode of Gaussians with a prefilter")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["direct_projective", "prb_projective"])
+def test_projective_integrators(kind):
+    """Their pictures, and the derivatives that the plain ones have too: those of colours."""
+    seen, slopes = [], []
+    for name in (kind, kind.removesuffix("_projective")):
+        scene = small_scene(wall(gaussians("linear")), "direct", spp=256)
+        parameters, key = mi.traverse(scene), f"{TEXTURE}.color"
+        dr.enable_grad(parameters[key])
+        parameters.update()
+        image = mi.render(scene, parameters, integrator=mi.load_dict({"type": name}), seed=1)
+        dr.backward(dr.mean(dr.square(image), axis=None))
+        seen.append(np.array(image))
+        slopes.append(np.array(dr.grad(parameters[key])))
+    assert np.abs(slopes[1]).max() > 1e-4
+    for found, expected in (seen, slopes):  # but for noise
+        assert np.linalg.norm(found - expected) < 0.1 * np.linalg.norm(expected)
 
 
 def test_derivatives_that_nobody_walks_keep_nothing_alive():

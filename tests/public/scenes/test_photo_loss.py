@@ -115,6 +115,7 @@ class TestFits:
         few(loss, gaussians=None, start=start, iterations=60, method=method)
         assert light[LIGHT][0] == pytest.approx(1.5, abs=0.05)
 
+    @pytest.mark.slow
     def test_an_environment_map_is_recovered(self):
         """The light of a matt ball: the mean over half of the directions is all that it shows."""
         y, x = np.mgrid[:32, :32]
