@@ -45,7 +45,7 @@ help:
 	@echo "make pages      write measured tables, charts and figures into README.md and docs/"
 	@echo "make dist       the wheel and the source distribution, in dist/, checked"
 	@echo "make bench      time the renderer"
-	@echo "make report     measure a part of everything and write build/results, in half an hour; resumes after a break"
+	@echo "make report     measure a part of everything into build/report, in half an hour; resumes after a break"
 	@echo "make basis      train the basis that ships, again"
 	@echo "make setup      only set up .venv, and libLLVM where none works"
 	@echo "make clean      remove what these made"
@@ -94,7 +94,7 @@ layers: $(READY)
 	$(BIN)/lint-imports
 
 test-slow: $(READY)
-	$(BIN)/python -m pytest -q -m slow
+	$(BIN)/python -m pytest -q -m slow $(ON_ALL_CORES)
 
 # CUDASIM_APPROX: the simulated driver rounds approximate instructions as coarsely as a GPU may.
 # It compiles every program with gcc at its first use, within the time of the test.
@@ -129,8 +129,8 @@ dist: $(READY)
 bench: $(READY)
 	$(BIN)/eigengs-dr bench kernels
 
-# The report shows all that is in build/report. To show more, run these commands with more images, sets
-# or steps, and 'bench number', 'bench rate' and 'bench scaling', then the last one.
+# To measure more, run these commands with more images, sets or steps, and 'bench number', 'bench rate'
+# and 'bench scaling'.
 report: $(READY)
 	@mkdir -p $(RESULTS)
 	$(BIN)/eigengs-dr bench stability -o $(RESULTS)
@@ -138,7 +138,6 @@ report: $(READY)
 	$(BIN)/eigengs-dr bench pictures $(wildcard $(DATA)) -o $(RESULTS) --images 2
 	$(if $(wildcard $(DATA)),$(BIN)/eigengs-dr bench tables $(DATA) -o $(RESULTS) --images 4 \
 		--set faces256 --set cats256 --set cars256 --set natural256)
-	$(BIN)/eigengs-dr bench report $(RESULTS) -o build/results
 
 basis: $(READY)
 	$(BIN)/python tools/train_natural.py eigengs_dr/eigenbasis/data/natural.npz

@@ -33,7 +33,7 @@ from .image.pixels import ImageError as ImageError
 from .many.fit_large import LargeFit as LargeFit
 from .many.fit_large import fit_large as fit_large
 from .many.fit_many import fit_many as fit_many
-from .many.manifest import ImageRow as ImageRow
+from .many.images import ImageRow as ImageRow
 from .plugins import register_plugins as register_plugins
 from .raster.render import picture_of as picture_of
 from .raster.render import render as render

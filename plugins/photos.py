@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.messages import warn
@@ -28,14 +27,6 @@ from eigengs_dr.image.space import space_of
 from .environment import texels_of
 from .follow import check_scene, sensor_of
 
-JUDGED = 4
-"""Photos with held-out pixels, spread over all."""
-
-JUDGE_SAMPLES = 2
-"""Samples of a held-out pixel in each of two renderings, as a multiple of those of a step. The
-product of the differences of two independent renderings to a photo has the squared error of their
-mean as its mean, without the noise of renderings."""
-
 
 @door
 def photo_loss(
@@ -46,7 +37,6 @@ def photo_loss(
     sensors: Sequence[mi.Sensor | int] | None = None,
     integrator: mi.Integrator | None = None,
     spp: int = 4,
-    held_out: float = 0.0,
     bounds: tuple[float, float] | Literal["auto"] | None = "auto",
     parameters: Any = None,
     seed: int = 0,
@@ -80,20 +70,13 @@ def photo_loss(
         By default that of the scene.
     spp : int, optional
         Samples per pixel of a step.
-    held_out : float, optional
-        Share of the pixels of four photos that no step sees, in [0, 1). Their error is then the
-        ``loss`` of the trace, and the number of Gaussians doubles while it falls; by default there
-        is one for 4 texels, or for 3 pixels of all photos if these are fewer. It takes many photos:
-        with few, a held-out pixel leaves a hole in the texture that no other photo sees, and the
-        number that suits holes is far too small.
     bounds : "auto", (float, float) or None, optional
         See `eigengs_dr.Loss`; "auto" is (0, 1), and None for an ``envmap``.
     parameters : optimiser, optional
         Of other parameters of the scene, by their names there, see `eigengs_dr.Loss`. A
         `mitsuba.ad.Adam` with the key ``"lamp.emitter.radiance.value"`` looks for a light, say.
     seed : int, optional
-        Seed of the renderings and of the choice of the pixels, at least 0. Seeds that are equal
-        modulo 2^32 give equal renderings.
+        Seed of the renderings, at least 0. Seeds that are equal modulo 2^32 give equal renderings.
     encoding : {"srgb", "linear"}, optional
         What the numbers of all photos are, instead: "srgb" for arrays of `eigengs_dr.load_image`.
 
@@ -138,8 +121,6 @@ def photo_loss(
     """
     check_scene("photo_loss", scene)
     check_encoding(encoding)
-    if not 0 <= held_out < 1:
-        raise ValueError(f"photo_loss: held_out is {held_out}; it must be in [0, 1)")
     for name, number, least in (("spp", spp, 1), ("seed", seed, 0)):
         if number < least:
             raise ValueError(f"photo_loss: {name} is {number}; it must be at least {least}")
@@ -158,29 +139,13 @@ def photo_loss(
             _check_photo(number, photo, sensor.film().crop_size(), encoding)
             for number, (photo, sensor) in enumerate(zip(photos, chosen, strict=True))
         ]
-    judged = sorted({k * len(targets) // JUDGED for k in range(JUDGED)})
-    generator = np.random.default_rng(seed)
-    shares = [held_out * (number in judged) for number in range(len(targets))]
-    masks = [
-        generator.random((*target.shape[:2], 1)) < share
-        for target, share in zip(targets, shares, strict=True)
-    ]
-    for number in judged if held_out else ():
-        count, pixels = int(masks[number].sum()), masks[number].size
-        if not 0 < count < pixels:
-            raise ValueError(
-                f"photo_loss: held_out is {held_out}, {count} of the {pixels} pixels of photo "
-                f"{number}; some must be held out and others not"
-            )
-    hidden = [mi.TensorXf(np.float32(mask)) for mask in masks]
     drawn = scene, known, keys, chosen, integrator, spp
-    taken = _Photos(*drawn, targets, hidden, judged, parameters, _first_of(seed))
+    taken = _Photos(*drawn, targets, parameters, _first_of(seed))
     spaces = {name: _space_for(known, name, key) for name, key in keys.items()}
     space = spaces if isinstance(pictures, Mapping) else spaces[""]
     bounds = _bounds_for({*spaces.values()}) if bounds == "auto" else bounds
-    judge = taken.judge if held_out else None
-    pixels = sum(mask.size - int(mask.sum()) for mask in masks)
-    loss = Loss(taken.loss, bounds, parameters, judge, space=space, pixels=pixels)
+    pixels = sum(target.shape[0] * target.shape[1] for target in targets)
+    loss = Loss(taken.loss, bounds, parameters, space=space, pixels=pixels)
     for key in parameters.keys() if parameters is not None else ():
         _check_known(known, key)
     return loss
@@ -188,7 +153,7 @@ def photo_loss(
 
 @dataclass(repr=False)  # that of a scene takes hundreds of lines
 class _Photos:
-    """Photos of a scene, and the parts of them that no step sees.
+    """Photos of a scene.
 
     Attributes
     ----------
@@ -200,10 +165,6 @@ class _Photos:
     integrator : mitsuba.Integrator
     spp : int
     photos : list of tensor, shape (H, W, 3)
-    hidden : list of tensor, shape (H, W, 1)
-        1 for held-out pixels, else 0.
-    judged : list of int
-        The photos that have some.
     parameters : optimiser, or None
     first : int
         Seed of the first rendering.
@@ -216,8 +177,6 @@ class _Photos:
     integrator: mi.Integrator
     spp: int
     photos: list[mi.TensorXf]
-    hidden: list[mi.TensorXf]
-    judged: list[int]
     parameters: Any
     first: int
 
@@ -232,7 +191,9 @@ class _Photos:
         if self.parameters is None and dr.grad_enabled(picture):
             return dr.custom(_Frozen, partial(self.slopes, number, seed), texels)
         self.show(texels)
-        return _mean(dr.square(self.difference(number, seed, self.spp)), 1 - self.hidden[number])
+        sensor, integrator = self.sensors[number], self.integrator
+        shown = mi.render(self.scene, self.known, sensor, integrator, seed, spp=self.spp)
+        return _squared_error(shown, self.photos[number])
 
     def show(self, texels: dict) -> None:
         """Put texels and the parameters of the user into the scene."""
@@ -249,7 +210,7 @@ class _Photos:
             known = ((k, v) for k, v in self.known if k not in texels and dr.grad_enabled(v))
             others = {key: type(value)(value) for key, value in known}
             drawn = self.scene, self.sensors[number], self.integrator, self.spp
-            seen = dr.opaque(mi.UInt32, seed), self.photos[number], 1 - self.hidden[number]
+            seen = dr.opaque(mi.UInt32, seed), self.photos[number]
             try:
                 self.known.update(leaves | {key: dr.detach(value) for key, value in others.items()})
                 try:
@@ -274,20 +235,6 @@ class _Photos:
         else:
             warn(f"photo_loss: a recording failed, its step renders anew: {reason_of(cause)}")
 
-    def judge(self, picture: Any) -> Any:
-        """Return the squared error of held-out pixels, see `JUDGE_SAMPLES`."""
-        self.show(self.texels(picture))
-        samples = JUDGE_SAMPLES * self.spp
-        means = [
-            _mean(
-                self.difference(number, self.first, samples)
-                * self.difference(number, (self.first + 1) % SEEDS, samples),
-                self.hidden[number],
-            )
-            for number in self.judged
-        ]
-        return sum(means) / len(means)
-
     def texels(self, picture: Any) -> dict[str, mi.TensorXf]:
         """Return the texels of each bitmap by its name in the scene."""
         named = picture if isinstance(picture, Mapping) else {"": picture}
@@ -305,12 +252,6 @@ class _Photos:
             )
         return {key: texels_of(self.known, key, named[name]) for name, key in self.keys.items()}
 
-    def difference(self, number: int, seed: int, samples: int) -> Any:
-        """Return a rendering less its photo."""
-        sensor, integrator = self.sensors[number], self.integrator
-        shown = mi.render(self.scene, self.known, sensor, integrator, seed, spp=samples)
-        return shown[..., :3] - self.photos[number]
-
 
 def _add_slopes(
     scene: mi.Scene,
@@ -319,7 +260,6 @@ def _add_slopes(
     spp: int,
     seed: mi.UInt32,
     photo: mi.TensorXf,
-    weight: mi.TensorXf,
 ) -> mi.TensorXf:
     """Return the squared error of a rendering; parameters of the scene get its derivatives.
 
@@ -327,7 +267,7 @@ def _add_slopes(
     memory of the recording, which may be gone.
     """
     shown = mi.render(scene, mi.traverse(scene), sensor, integrator, seed, spp=spp)
-    error = _mean(dr.square(shown[..., :3] - photo), weight)
+    error = _squared_error(shown, photo)
     dr.backward(error)
     return dr.detach(error)
 
@@ -350,9 +290,9 @@ class _Frozen(dr.CustomOp):
         self.set_grad_in("arrays", {key: slope * rate for key, slope in self.slopes.items()})
 
 
-def _mean(values: Any, weight: Any) -> Any:
-    """Return the mean of pixels (H, W, 3) by weights (H, W, 1)."""
-    return dr.sum(values * weight, axis=None) / (3 * dr.sum(weight, axis=None))
+def _squared_error(shown: Any, photo: mi.TensorXf) -> Any:
+    """Return the mean squared difference of a rendering, whose colours come first, to a photo."""
+    return dr.mean(dr.square(shown[..., :3] - photo), axis=None)
 
 
 SEEDS = 1 << 32

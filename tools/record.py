@@ -533,10 +533,8 @@ def _() -> Figures:
     rows = eg.fit_many(folder() / "photos", output, **options)
     again = eg.fit_many(folder() / "photos", output, **options)
     files = sorted(output.glob("*.npz"))
-    manifest = (output / "manifest.jsonl").read_text(encoding="utf-8").splitlines()
     return of_rows(rows) | {
         "again": " ".join(row.status for row in again),
-        "manifest": " ".join(sorted(set().union(*(json.loads(line) for line in manifest)))),
         "bits": bits(*(eg.Gaussians.load(path, BACKEND) for path in files)),
     }
 

@@ -12,8 +12,6 @@ from eigengs_bench.names import (
     KODAK_COUNTS,
     PAPER_SETS,
     PARTS,
-    PEERS,
-    PICTURES,
     PRESETS,
     SAMPLES,
     SETS,
@@ -124,7 +122,6 @@ def main() -> None:
     Examples:
       eigengs-dr bench kernels
       eigengs-dr bench tables data/ --set natural256 --images 3
-      eigengs-dr bench report build/bench -o report/
     """
 
 
@@ -140,7 +137,6 @@ def tables() -> None:
     \b
     main      gaussianimage, default, and eigengs with its own and with the universal basis
     ablation  eigengs in YCbCr or RGB, with and without the frequency-aware split
-    cross     eigengs with the basis of other images
 
     FOLDER/models keeps trained bases and models: about a gigabyte per set.
     """
@@ -148,16 +144,10 @@ def tables() -> None:
 
 @question("pictures")
 @data_argument
-@several("--picture", "pictures", PICTURES, "What to draw, by default all")
-@number("--images", "Images per set, for curves.", 8, 1)
+@number("--images", "Number of images from each set.", 8, 1)
 @number("--iterations", "Steps of every fit.", 1000, 1)
 def pictures() -> None:
-    """Draw PSNR over steps, and where Gaussians show as tiles.
-
-    \b
-    curves  PSNR every 50 iterations
-    tiles   a slow gradient by every method, and its errors
-    """
+    """Draw PSNR over steps of every method, as the paper does."""
 
 
 @question("pareto", (SAMPLES,))
@@ -230,25 +220,6 @@ def kodak() -> None:
     """
 
 
-@question("peers", ("kodak384",))
-@data_argument
-@sets_option(("kodak384",))
-@several("--peer", "peers", PEERS, "What to compare with, by default all")
-@several("--image", "photos", click.STRING, "Name of an image, by default the first of a set")
-@number("--gaussians", "Number of Gaussians of a fit.", 2000, 1)
-@number("--images", "Number of images from each set.", 1, 1)
-@number("--iterations", "Steps of our longer fits.", 1000, 1)
-@click.option("--timed", is_flag=True, help="Record seconds: nothing else runs on the machine.")
-def peers() -> None:
-    """Compare fits with the alternatives on a laptop.
-
-    \b
-    splatthis  2D Gaussians in PyTorch, in an environment in FOLDER: a gigabyte, minutes per photo
-    texels     the best bitmap with a pyramid that takes no more memory
-    JPEG, AVIF files of as many bytes as a packed fit
-    """
-
-
 @question("relight")
 @click.argument("data", type=options.folder, metavar="DATA")
 @click.option("--set", "names", multiple=True, help="Folder in DATA, by default all.")
@@ -314,21 +285,6 @@ def inverse() -> None:
 
     Steps render 4 samples per pixel, others 1 and 16. Everything takes more than an hour.
     """
-
-
-@main.command()
-@click.argument("folder", type=options.folder, metavar="FOLDER")
-@options.output("Folder for README.md and its charts.", "REPORT")
-@options.shared("quiet")
-def report(run: options.Run, folder: Path, output: Path) -> None:
-    """Write a README.md with tables and charts of the rows of a folder.
-
-    Every section names the commands, days, machines, versions and commits behind its figures.
-    """
-    from eigengs_bench.report import write_report
-
-    write_report(folder, output)
-    run.tell(f"wrote {output / 'README.md'}")
 
 
 @main.command()

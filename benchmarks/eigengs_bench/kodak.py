@@ -10,6 +10,8 @@ from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from itertools import product
+from statistics import mode
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,6 +25,7 @@ from eigengs_bench.names import KODAK_COUNTS, SOLVE_STEPS
 from eigengs_bench.rows import Job, Row, Task
 
 SET = "kodak"
+LEGIBLE = 10.5  # points of text that a chart of 5.4 inches shows with 14 pixels, on a phone with 9
 
 KIND = ["iterations", "solve_steps"]
 FIT = [*KIND, "gaussians"]
@@ -113,6 +116,10 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     ]
     table = fr.table(CAPTION, COLUMNS, lines, "all")
     charts = {"kodak-gaussians": _over_gaussians(photos, others)}
+    machine = mode(fr.machine_of(row["run"]) for row in rows)  # seconds of two do not compare
+    timed = fr.frame_of(row for row in rows if fr.machine_of(row["run"]) == machine)
+    if timed.timed.any():
+        charts["kodak-speed"] = _over_seconds(timed, others.dropna(subset="seconds"))
     return fr.Section([table, _by_counts(both)], charts, _figures(ours, others))
 
 
@@ -178,4 +185,37 @@ def _over_gaussians(photos: pd.DataFrame, others: pd.DataFrame) -> Figure:
         axis.plot(part.gaussians, part.psnr_float, f"{marker}--", ms=5, color=color, label=label)
     fr.label_axes(axis, "Gaussians", "PSNR in RGB / dB", legend=False)
     fr.legend_beside(figure, axis)
+    return figure
+
+
+def _over_seconds(fits: pd.DataFrame, others: pd.DataFrame) -> Figure:
+    """Draw PSNR over seconds, beside published figures, for a front page and for phones."""
+    figure = fr.new_figure(5.4, 5.2)
+    axis = figure.subplots()
+    timed = fits[fits.timed & (fits.iterations > 0)]
+    for (steps, part), alpha in zip(timed.groupby("iterations"), (1.0, 0.5), strict=False):
+        points = part.groupby("gaussians").agg({"seconds": "median", "psnr_float": "mean"})
+        label = f"eigengs_dr, {steps:,} steps, by Gaussians"
+        x, y = points.seconds, points.psnr_float
+        axis.plot(x, y, "o-", ms=5, color=fr.BLUE, alpha=alpha, label=label)
+        for count, point in points.iterrows() if alpha == 1 else ():
+            words = f"{count:,} Gaussians" if count == points.index.min() else f"{count:,}"
+            place: Any = {"xytext": (-6, 3), "textcoords": "offset points", "ha": "right"}
+            axis.annotate(words, (point.seconds, point.psnr_float), **place, fontsize=LEGIBLE - 1)
+    groups = others.groupby("method", sort=False)
+    for color, marker, (name, part) in zip(
+        (fr.RED, fr.ORANGE, fr.GREY), "*XP", groups, strict=False
+    ):
+        method, counts = name.partition(" (")[0], ", ".join(f"{n:,}" for n in part.gaussians)
+        label = f"{method}, {counts}, {part.machine.iloc[0]} ({part.source.iloc[0]})"
+        axis.plot(part.seconds, part.psnr_float, marker, color=color, ms=9, label=label)
+    axis.margins(y=0.1)  # for the words beside the topmost point
+    fr.label_axes(axis, "seconds per photo", "PSNR in RGB / dB", legend=False)
+    axis.xaxis.set_minor_formatter("")  # the axis is of several decades
+    axis.tick_params(labelsize=LEGIBLE)
+    axis.set_title(f"{fits.image.nunique()} photos of Kodak,\n2 cores beside GPUs")
+    for text in (axis.xaxis.label, axis.yaxis.label, axis.title):
+        text.set_fontsize(LEGIBLE)
+    named = axis.get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower center", fontsize=LEGIBLE, ncols=1)
     return figure

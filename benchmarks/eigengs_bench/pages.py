@@ -23,8 +23,7 @@ from pathlib import Path
 from matplotlib import __version__ as drawn_with
 from matplotlib.figure import Figure
 
-from eigengs_bench import overview
-from eigengs_bench.report import QUESTIONS, Table, as_text, chart_file, machine_of, table
+from eigengs_bench.report import Table, as_text, chart_file, machine_of, table
 from eigengs_bench.rows import Row, code_name, read
 from eigengs_dr.storage.atomic import atomic_write
 
@@ -104,15 +103,14 @@ def contents(
     rows: dict[str, list[Row]] = {}
     for row in (every := read(path)):
         rows.setdefault(row["bench"], []).append(row)
-    parts = {"table: all.runs": _runs(every), **_tables_measured_once(rows.get("once", []))}
-    charts = {name: draw(figure) for name, figure in overview.charts(rows).items()}
-    for bench in QUESTIONS:
-        if measured := rows.get(bench):
-            section = import_module(f"eigengs_bench.{bench}").summarize(measured)
-            tables = [one for one in section.tables if not one.frame.empty]
-            parts |= {f"table: {bench}.{one.name}": _captioned(one, measured) for one in tables}
-            parts |= {f"figure: {bench}.{name}": text for name, text in section.figures.items()}
-            charts |= {name: draw(figure) for name, figure in section.charts.items()}
+    parts = {"table: all.runs": _runs(every), **_tables_measured_once(rows.pop("once", []))}
+    charts = dict[str, bytes]()
+    for bench, measured in rows.items():
+        section = import_module(f"eigengs_bench.{bench}").summarize(measured)
+        tables = [one for one in section.tables if not one.frame.empty]
+        parts |= {f"table: {bench}.{one.name}": _captioned(one, measured) for one in tables}
+        parts |= {f"figure: {bench}.{name}": text for name, text in section.figures.items()}
+        charts |= {name: draw(figure) for name, figure in section.charts.items()}
     return parts, charts
 
 

@@ -2,11 +2,9 @@
 
 A row has "points": setting, planes, bytes of a file with its tables, bytes_per_pixel, and psnr_rgb,
 the mean over the photos that were left out; and "exact", the PSNR without any rounding, or for
-Gaussians before packing, with the bytes per pixel that are "held" in memory, and how far lights are
-that Mitsuba finds from one photo.
+Gaussians before packing, with the bytes per pixel that are "held" in memory.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from io import BytesIO
@@ -26,8 +24,6 @@ import eigengs_dr as eg
 from eigengs_bench import report as fr
 from eigengs_bench.rate import AVIF
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_dr.cli.scene import load_mitsuba
-from eigengs_dr.image.color import to_linear
 from eigengs_dr.relight.fit import find_planes, read_photos
 from eigengs_dr.relight.lights import functions_at, read_lights
 
@@ -41,7 +37,6 @@ PLANES = (9, 12, 18)
 QUALITIES = (20, 35, 50, 65, 80, 90, 95)
 CODEC = AVIF | {"speed": 6}
 RIDGE = 1e-3  # of PTM and HSH
-FOUND, STEPS, RATE = 5, 60, 0.03  # photos whose light is looked for; of each descent
 # Ranges of all planes that are nearly alike give nearly equal steps of rounding, which is best for
 # the sum of squared errors: AVIF takes 20 to 45 % fewer bytes at equal PSNR (two sets).
 ALIKE = 0.75
@@ -134,57 +129,7 @@ def gaussians(task: Task, pixels: int, seen: Lit, unseen: Lit) -> Row:
     arrays = (*planes.mean, *planes.factor, *planes.color, *planes.background)
     held = sum(dr.width(a) * dr.itemsize_v(a) for a in arrays) + 4 * model.table.values.size
     figures = {"table": model.table.kind, "held": held / (height * width)}
-    if pixels == USUAL[0]:
-        figures["light_degrees"] = light_error(task, model, unseen)
     return {"points": points, "exact": psnr_of(model), **figures}
-
-
-def light_error(task: Task, model: eg.Relightable, unseen: Lit) -> float:
-    """Return the median angle in degrees between lights and those found from one photo each.
-
-    Adam descends on the squared error of a rendering by Mitsuba, from the light of the photo of the
-    model that is closest: errors have several minima.
-    """
-    mi = load_mitsuba("cuda_ad_rgb" if task.backend == "cuda" else "llvm_ad_rgb", quiet=False)
-    with TemporaryDirectory() as folder:
-        model.save(Path(folder) / "model.npz")
-        scene = mi.load_dict(wall(mi, Path(folder) / "model.npz", *unseen.photos.shape[2:0:-1]))
-    parameters, key, angles = mi.traverse(scene), "wall.bsdf.reflectance.light", []
-
-    def error(light: Any, target: Any) -> Any:
-        parameters[key] = light
-        parameters.update()
-        return dr.mean(dr.square(mi.render(scene, parameters, spp=1) - target), axis=None)
-
-    for photo, light in list(zip(*unseen, strict=True))[:FOUND]:
-        target = mi.TensorXf(to_linear(photo).astype(np.float32))
-        known = [mi.Vector3f(*direction.tolist()) for direction in model.lights]
-        start = min(known, key=lambda direction: float(error(direction, target).array[0]))
-        adam = mi.ad.Adam(lr=RATE, params={key: start})
-        for step in range(STEPS):
-            adam.set_learning_rate(RATE * (0.5 + 0.5 * math.cos(math.pi * step / STEPS)))
-            dr.backward(error(adam[key], target))
-            adam.step()
-        found = np.array(adam[key], np.float64).ravel()
-        cosine = found @ light / np.linalg.norm(found) / np.linalg.norm(light)
-        angles.append(math.degrees(math.acos(min(cosine, 1.0))))
-    return float(np.median(angles))
-
-
-def wall(mi: Any, model: Path, width: int, height: int) -> dict[str, Any]:
-    """Describe a wall that fills the picture: its reflectance, without noise, row 0 on top."""
-    at, box = mi.ScalarTransform4f(), {"type": "box"}
-    film = {"type": "hdrfilm", "pixel_format": "rgb", "width": width, "height": height}
-    view = at.look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]) @ at.scale([1, width / height, 1])
-    paint = {"type": "gaussian_texture", "model": str(model), "wrap_mode": "clamp"}
-    bsdf = {"type": "diffuse", "reflectance": paint}
-    return {
-        "type": "scene",
-        "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1},
-        "sky": {"type": "constant", "radiance": 1.0},
-        "wall": {"type": "rectangle", "to_world": at.scale([1, -1, 1]), "bsdf": bsdf},
-        "camera": {"type": "orthographic", "to_world": view, "film": film | {"rfilter": box}},
-    }
 
 
 def polynomial(lights: Array) -> Array:
@@ -346,8 +291,7 @@ def comparison(points: pd.DataFrame, exact: pd.DataFrame) -> dict[str, float]:
     named = exact.set_index("method").exact
     found["better"] = max(named[RELIGHT], named["HSH"])
     fit = exact[exact.pixels == USUAL[0]].iloc[0]
-    found |= {"held": fit.held, "degrees": fit.light_degrees}
-    return found | {"exact": fit.exact - found["better"]}
+    return found | {"held": fit.held, "exact": fit.exact - found["better"]}
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
@@ -371,7 +315,6 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
             *(fr.number(row[method], 2) for method in CODED),
             f"{row.exact:+.1f}",
             fr.number(row.held, 1),
-            f"{fr.number(row.degrees, 1)}°",
         )
         for name, row in [*frame.iterrows(), ("median", middle)]
     ]
@@ -379,11 +322,10 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
         "Bytes of packed Gaussians over those of planes of pixels at equal PSNR of photos that "
         "were left out (in brackets where no size of ours meets it); what Gaussians before packing "
         "reach above the better of 9 principal components with RBF and 27 planes of HSH, both "
-        "without rounding; bytes per pixel in memory; the error of the light that Mitsuba finds "
-        f"from one left-out photo, median of {FOUND}"
+        "without rounding; bytes per pixel in memory"
     )
-    columns = ("set", "dB; bytes per pixel", *ratios, "PSNR, dB", "in memory", "light")
-    figures = {name: fr.number(middle[name], 2) for name in ("bytes", "held", "degrees", "exact")}
+    columns = ("set", "dB; bytes per pixel", *ratios, "PSNR, dB", "in memory")
+    figures = {name: fr.number(middle[name], 2) for name in ("bytes", "held", "exact")}
     figures |= {f"over_{k}": fr.number(middle[name], 2) for k, name in enumerate(ratios)}
     charts = {"relight": _chart(points)}
     return fr.Section([fr.table(caption, columns, lines, "sets")], charts, figures)

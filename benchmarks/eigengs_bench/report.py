@@ -1,9 +1,8 @@
-"""Rows as data frames, tables and charts, and a Markdown report of all rows of a folder."""
+"""Rows as data frames, tables and charts, and the sources of their figures."""
 
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from importlib import import_module
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from eigengs_bench.rows import FILE, Row, code_name, read
+from eigengs_bench.rows import Row, code_name
 from eigengs_dr.storage.atomic import atomic_write
 
 TAG = re.compile(rb"<[^>]+>")  # of an SVG file
@@ -24,23 +23,6 @@ MISSING = ""  # cell of a missing figure
 BLUE, RED, GREEN, ORANGE = "#0072b2", "#d55e00", "#009e73", "#e69f00"
 SKY, PINK, GREY, INK = "#56b4e9", "#cc79a7", "#888888", "#222222"
 COLORS = {"default": BLUE, "gaussianimage": RED, "eigengs": GREEN}
-
-# Titles, and the modules of this package that make tables and charts of their rows.
-QUESTIONS = {
-    "tables": "The methods",
-    "pictures": "The paper's curves and pictures",
-    "pareto": "Speed against accuracy",
-    "stability": "Where methods fail",
-    "kodak": "The Kodak photos, beside published figures",
-    "number": "Gaussians that a PSNR takes",
-    "rate": "Bytes that a PSNR takes",
-    "peers": "What else one would pick",
-    "scaling": "What size costs",
-    "kernels": "How fast the renderer is",
-    "texture": "How fast a texture is in Mitsuba",
-    "relight": "Photos under many lights",
-    "inverse": "What recovers a texture from photos",
-}
 
 
 class Table(NamedTuple):
@@ -61,27 +43,6 @@ class Section(NamedTuple):
     tables: Sequence[Table] = ()
     charts: Mapping[str, Figure] = {}
     figures: Mapping[str, str] = {}
-
-
-def write_report(folder: Path, output: Path) -> None:
-    """Write a README.md with charts for all questions that the rows of a folder answer.
-
-    `ValueError` if the folder holds no rows, or damaged ones.
-    """
-    parts = ["# Measurements"]
-    output.mkdir(parents=True, exist_ok=True)
-    for bench, title in QUESTIONS.items():
-        if rows := read(folder / FILE, bench):
-            section = import_module(f"eigengs_bench.{bench}").summarize(rows)
-            parts += [f"## {title}", *(as_text(table, "pipe") for table in section.tables)]
-            for name, figure in section.charts.items():
-                save_figure(output / f"{name}.svg", figure)
-                parts.append(f"![{name}]({name}.svg)")
-            parts.append("\n".join(f"- {line}" for line in sources_of(rows)))
-    if len(parts) == 1:
-        raise ValueError(f"{folder}: holds no rows; run a command of eigengs-dr bench first")
-    with atomic_write(output / "README.md") as temporary:
-        temporary.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
 def sources_of(rows: Sequence[Row]) -> list[str]:

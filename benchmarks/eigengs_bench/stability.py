@@ -3,7 +3,7 @@
 Every cell is a call of `eigengs_dr.fit`, as a user makes it.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import product
 from typing import Any
@@ -105,20 +105,19 @@ def _start(case: Case, image: Image, backend: str | None) -> eg.Gaussians:
 
 
 def summarize(rows: Sequence[Row]) -> fr.Section:
-    """Lay out two matrices of cases and methods: PSNRs, and seconds.
+    """Lay out a matrix of cases and methods: PSNRs.
 
     With several seeds, a cell has the mean, and the range of the ends.
     """
     steps = " or ".join(f"{n:,}" for n in sorted({row["job"]["iterations"] for row in rows}))
     ends = f"PSNR in dB, YCbCr, at the end, from the start; {steps} steps"
-    costs = _matrix("Seconds", _seconds, rows, "costs")
     figures = {
         row["job"]["case"]: f"{_decibels(row['end_ycbcr'])} dB"
         for row in rows
         if row["job"]["preset"] == "default" and "end_ycbcr" in row
     }
     charts = {"stability": _heat_map(rows)}
-    return fr.Section([_matrix(ends, _ends, rows, "ends"), costs], charts, figures)
+    return fr.Section([_matrix(ends, rows)], charts, figures)
 
 
 def _heat_map(rows: Sequence[Row]) -> Figure:
@@ -142,9 +141,7 @@ def _heat_map(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _matrix(
-    caption: str, cell: Callable[[list[Row]], str], rows: Sequence[Row], name: str
-) -> fr.Table:
+def _matrix(caption: str, rows: Sequence[Row]) -> fr.Table:
     """Arrange the rows in a matrix of cases and methods; the last of equal rows is shown.
 
     A cell holds the rows of all seeds.
@@ -154,12 +151,12 @@ def _matrix(
         job = row["job"]
         groups.setdefault((job["case"], job["preset"]), {})[job.get("seed", 0)] = row
     cells = pd.DataFrame(
-        [(case, preset, cell(list(group.values()))) for (case, preset), group in groups.items()],
+        [(case, preset, _ends(list(group.values()))) for (case, preset), group in groups.items()],
         columns=["case", "preset", "cell"],
     )
     matrix = cells.pivot(index="case", columns="preset", values="cell").fillna(fr.MISSING)
     matrix = matrix.loc[cells.case.unique(), cells.preset.unique()].reset_index()
-    return fr.Table(caption, matrix, name)
+    return fr.Table(caption, matrix, "ends")
 
 
 def _ends(rows: list[Row]) -> str:
@@ -173,11 +170,6 @@ def _ends(rows: list[Row]) -> str:
     if len(rows) > 1:
         end += f" ({fr.number(min(ends), 2)} to {fr.number(max(ends), 2)})"
     return f"{end} from {_decibels(float(np.mean(starts)))}"
-
-
-def _seconds(rows: list[Row]) -> str:
-    seconds = [row["seconds"] for row in rows if "seconds" in row]
-    return fr.number(float(np.median(seconds)) if seconds else None)
 
 
 def _decibels(value: float) -> str:

@@ -3,7 +3,7 @@
 A row has "job" with set, image, iterations, gaussians and the fields of `Method`, and "moments", a
 list of `score`.
 
-Tai et al., "EigenGS Representation", CVPR 2025: tables 1 (FFHQ), 2 (transfer) and 3 (ablation).
+Tai et al., "EigenGS Representation", CVPR 2025: tables 1 (FFHQ) and 3 (ablation).
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,6 @@ from eigengs_bench.rows import Job, Row, Task
 # Iterations of the paper's tables, and 0 and 10.
 ITERATIONS = (0, 10, 100, 500, 1000, 5000, 10000)
 COMPONENTS = (300, 500)  # components per channel in the paper's tables
-LENT = {"faces256": "cats256", "cats256": "faces256"}  # the sets that lend each other their basis
 
 
 class Method(NamedTuple):
@@ -41,17 +40,13 @@ class Method(NamedTuple):
 def methods(name: str, table: str, sources: Sequence[str]) -> list[Method]:
     """List the methods that a table compares on a set; `sources` are the sets with a basis."""
     trained = [name] if name in sources else []
-    lent = [LENT[name]] if LENT.get(name) in sources else []
     universal = [NATURAL] if NATURAL in sources and name != NATURAL else []
-    plain, count = [Method("gaussianimage")], COMPONENTS[0]
+    count = COMPONENTS[0]
     if table == "ablation":
         pairs = [(color, split) for color in ("ycbcr", "rgb") for split in ("split", "whole")]
         return [Method("eigengs", name, count, *pair) for _ in trained for pair in pairs]
-    if table == "cross":
-        others = [Method("eigengs", source, count) for source in lent + universal]
-        return plain + others if others else []
     bases = [Method("eigengs", source, k) for source in trained + universal for k in COMPONENTS]
-    return [*plain, Method("default"), *bases]
+    return [Method("gaussianimage"), Method("default"), *bases]
 
 
 def run(task: Task, names: Sequence[str], tables: Sequence[str]) -> list[Row]:
@@ -112,10 +107,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
                 used = [row for row in rows if tuple(row["job"][k] for k in KEY) in shown]
                 made = _ablation(chosen) if kind == "ablation" else _few(chosen)
                 tables.append(made._replace(name=f"{kind}_{length}", rows=used))
-    caption = (
-        "What the paper prints of FFHQ, 512 x 512 pixels, 20,000 Gaussians: PSNR / dB by steps"
-    )
-    return fr.Section([*tables, fr.Table(caption, _published("ffhq"), "ffhq", ())])
+    return fr.Section(tables)
 
 
 def _published(name: str) -> pd.DataFrame:

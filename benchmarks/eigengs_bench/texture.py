@@ -14,7 +14,7 @@ import numpy as np
 
 import eigengs_dr as eg
 from eigengs_bench import poster, sky
-from eigengs_bench.clock import interleaved, interleaved_apart
+from eigengs_bench.clock import interleaved_apart
 from eigengs_bench.names import TEXTURE_PARTS
 from eigengs_bench.report import Section, Table, table
 from eigengs_bench.rows import Job, Row, Task
@@ -40,9 +40,7 @@ def run(task: Task, parts: Sequence[str] = TEXTURE_PARTS) -> list[Row]:
     parameters by `prb`, `ratio_step_filtered` these with the prefilter, and `ratio_step_drawn`
     these by a bitmap that `eg.render` draws in each step. Each scene has a process of its own, as
     beside others Mitsuba takes longer.
-    `change_N` and `change_filtered_N` take over N changed shapes, without and with prefilter, and
-    `colors_N` and `colors_filtered_N` N changed colours. `bytes_N` is what a texture holds in
-    memory, `held_N` that over the arrays of its file, `first_N_ms` from file to first lookup.
+    `bytes_N` is what a texture holds in memory, `held_N` that over the arrays of its file.
     For the other rows see `eigengs_bench.poster` and `eigengs_bench.sky`.
     """
     variant = f"{task.backend}_ad_rgb"
@@ -61,7 +59,7 @@ def summarize(rows: Sequence[Row]) -> Section:
     lights = [row for row in rows if "light" in row["job"]]
     balls = [row for row in rows if not {"poster", "light"} & row["job"].keys()]
     tables = [
-        *(_costs(balls) if balls else []),
+        *([_ball(balls)] if balls else []),
         *([_posters(posters)] if posters else []),
         *([_losses(balls, posters)] if balls and posters else []),
         *([_lights(lights)] if lights else []),
@@ -69,29 +67,10 @@ def summarize(rows: Sequence[Row]) -> Section:
     return Section(tables, figures=_figures(balls, posters, lights))
 
 
-def _costs(balls: Sequence[Row]) -> list[Table]:
-    """Lay out the time of pictures, of changes, and memory, of the last row."""
-    row = balls[-1]
-    lines = [(k, f"{v:.4g}") for k, v in row.items() if isinstance(v, float)]
-    costs = [(f"{n:,} Gaussians", f"{row[f'ratio_{n}']:.2f}") for n in COUNTS]
-    costs += [(f"{n:,} Gaussians, prefilter", f"{row[f'ratio_filtered_{n}']:.2f}") for n in CHANGED]
-    costs.append((f"a step of prb, {SETTLED:,} Gaussians", f"{row['ratio_step']:.2f}"))
-    costs.append(("a step of prb, prefilter", f"{row['ratio_step_filtered']:.2f}"))
-    costs.append(("a step of prb, drawn into a bitmap", f"{row['ratio_step_drawn']:.2f}"))
-    changes = [
-        (what, *(f"{row[f'{name}_{n}_ms']:.1f} ms" for n in CHANGED))
-        for what, name in LOOKUPS.items()
-    ]
-    over = f"Time of a picture over that with a bitmap of {TEXELS:,} x {TEXELS:,} texels"
-    after = "Time to take over a change of all shapes, or of all colours"
-    columns = ("lookup", *(f"{n:,} Gaussians" for n in CHANGED))
-    tables = [
-        table("Texture", ("figure", "value"), lines),
-        table(over, ("texture", "over a bitmap"), costs, name="costs"),
-        table(after, columns, changes, name="changes"),
-        _memory(row),
-    ]
-    return [one._replace(rows=balls) for one in tables]
+def _ball(balls: Sequence[Row]) -> Table:
+    """List the figures of the last row."""
+    lines = [(k, f"{v:.4g}") for k, v in balls[-1].items() if isinstance(v, float)]
+    return table("Texture", ("figure", "value"), lines)._replace(rows=balls)
 
 
 HELD_BY_POSTERS = ("bitmap_bytes", "bytes", "filtered_bytes", "small_bytes")
@@ -191,32 +170,10 @@ def _losses(balls: Sequence[Row], posters: Sequence[Row]) -> Table:
     return table(caption, columns, lines, name="losses")._replace(rows=[*balls, *posters])
 
 
-LOOKUPS = {
-    "points": "change",
-    "points, colours alone": "colors",
-    "prefilter": "change_filtered",
-    "prefilter, colours alone": "colors_filtered",
-}
-
-
-def _memory(row: Row) -> Table:
-    """Lay out the memory of textures, beside that of bitmaps with the pixels of their pictures."""
-    caption = f"Memory of a texture of {PIXELS} pixels per Gaussian; time from file to first lookup"
-    columns = ["Gaussians", "arrays of the file", "points", "prefilter", "BC7", "ASTC 6x6"]
-    columns += ["bitmap, mip maps", "points, ms", "prefilter, ms"]
-    lines = []
-    for n in HELD:
-        held = [row[f"bytes_{n}"] / row[f"held_{n}"], row[f"bytes_{n}"], row[f"bytes_filtered_{n}"]]
-        rivals = [PIXELS * n * bits / 8 for bits in (8, 128 / 36, 4 / 3 * 32 * 3)]
-        times = [f"{row[f'first_{name}{n}_ms']:.2g}" for name in ("", "filtered_")]
-        lines.append((f"{n:,}", *(f"{b / 1e6:.3g} MB" for b in held + rivals), *times))
-    return table(caption, columns, lines, name="memory")
-
-
 def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Row:
     """Measure the figures of `run`."""
     mi = load_mitsuba(variant, quiet=False)
-    from eigengs_dr.plugins import pixel_angle, texture_of
+    from eigengs_dr.plugins import pixel_angle
 
     picture, sets = eg.sample("coffee")[:400, 100:500], {}
     counts = sorted({*COUNTS, *CHANGED})
@@ -237,15 +194,8 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         makers |= {f"step_{n}": partial(makers[end], by_step=True) for n, end in ends.items()}
         makers["step_drawn"] = partial(_drawn_step, variant, SIDE, SPP, files[SETTLED])
         timed = interleaved_apart(makers, WARM_UP, ROUNDS, partial(progress, "pictures"))
-    programs: dict[str, Callable[[], Any]] = {}
-    for count in CHANGED:
-        for name, given in (("", 0.0), ("filtered_", angle)):
-            texture = mi.load_dict(texture_of(sets[count], prefilter=given))
-            programs[f"change_{name}{count}"] = partial(_change, mi, texture, "factor")
-            programs[f"colors_{name}{count}"] = partial(_change, mi, texture, "color")
-    timed |= interleaved(programs, WARM_UP, ROUNDS, partial(progress, "changes"))
     return {
-        **hold(mi, angle, progress),
+        **hold(mi, progress),
         **{f"{name}_ms": ms for name, ms in timed.items()},
         **{f"ratio_{n}": timed[f"gaussians_{n}"] / timed["bitmap"] for n in counts},
         **{f"ratio_filtered_{n}": timed[f"filtered_{n}"] / timed["bitmap"] for n in CHANGED},
@@ -344,16 +294,10 @@ def _step(mi: Any, scene: Any) -> Callable[[], Any]:
     return step
 
 
-def _change(mi: Any, texture: Any, name: str) -> Any:
-    """Change a parameter by a millionth; equal values would be no change for Mitsuba."""
-    parameters = mi.traverse(texture)
-    parameters[name] = dr.detach(parameters[name]) * dr.opaque(mi.Float, 1 + 1e-6)
-    parameters.update()
-    return texture.table
+def hold(mi: Any, progress: Callable[..., None] = lambda *_: None) -> Row:
+    """Measure the memory of textures from files."""
+    from eigengs_dr.plugins import resident_bytes
 
-
-def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None) -> Row:
-    """Measure the memory of textures from files, and the time to their first lookup."""
     row: Row = {}
     for done, count in enumerate(HELD):
         side = round(math.sqrt(PIXELS * count))
@@ -361,25 +305,8 @@ def hold(mi: Any, angle: float, progress: Callable[..., None] = lambda *_: None)
         with TemporaryDirectory() as folder:
             path = Path(folder) / "set.npz"
             eg.fit(picture, count, 0).gaussians.save(path)
-            for name, given in ((str(count), 0.0), (f"filtered_{count}", angle)):
-                firsts = [_first_lookup(mi, path, given) for _ in range(4)]
-                bytes_held = firsts[0][0]
-                row[f"bytes_{name}"] = bytes_held
-                row[f"held_{name}"] = bytes_held / sum(sizes_of(path).values())
-                row[f"first_{name}_ms"] = 1e3 * median(s for _, s in firsts[1:])  # compiled
+            file = {"type": "gaussian_texture", "filename": str(path)}
+            row[f"bytes_{count}"] = resident_bytes(mi.load_dict(file))
+            row[f"held_{count}"] = row[f"bytes_{count}"] / sum(sizes_of(path).values())
         progress("files", done + 1, len(HELD))
     return row
-
-
-def _first_lookup(mi: Any, path: Path, angle: float) -> tuple[int, float]:
-    """Load a texture and look it up once; return the bytes of its arrays, and the seconds."""
-    from eigengs_dr.plugins import resident_bytes
-
-    started = time.perf_counter()
-    file = {"type": "gaussian_texture", "filename": str(path), "prefilter": angle}
-    texture, si = mi.load_dict(file), dr.zeros(mi.SurfaceInteraction3f)
-    si.uv, si.t, si.wi = mi.Point2f(0.4, 0.6), 1, mi.Vector3f(0, 0, 1)
-    dr.eval(texture.eval_1(si))
-    dr.sync_thread()
-    seconds = time.perf_counter() - started
-    return resident_bytes(texture), seconds

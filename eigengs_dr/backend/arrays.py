@@ -5,7 +5,7 @@ precision have 20 bits (PTX: ``rcp.approx.ftz.f64``). This package uses the two 
 module instead.
 
 The last functions are the uses of `drjit.detail`, which Dr.Jit may change in any version;
-``tests/backend/test_detail.py`` shows what each of them is needed for.
+``tests/kernels/detail/`` shows what each of them is needed for.
 """
 
 from __future__ import annotations

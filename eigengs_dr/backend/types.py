@@ -16,7 +16,7 @@ import numpy.typing
 from numpy.typing import NDArray
 
 PathLike = str | os.PathLike[str]
-"""The path of a file or a folder, or a URL."""
+"""The path of a file or a folder."""
 
 Doubles = NDArray[np.float64]
 Singles = NDArray[np.float32]

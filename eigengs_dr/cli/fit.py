@@ -79,7 +79,7 @@ EXCLUDED_BY_MAPS = ("basis", "start", "space", "blocks", "cluster", "recursive")
 @options.shared("cluster", "backend", "report", "quiet")
 def fit(
     run: options.Run,
-    images: tuple[Path | str, ...],
+    images: tuple[Path, ...],
     output: Path | None,
     maps: dict[str, MapFile],
     basis: str | None,
@@ -90,9 +90,9 @@ def fit(
 ) -> None:
     """Fit sums of Gaussians to images. Grey images become RGB; --space data keeps one channel.
 
-    IMAGE may be a folder, a pattern in quotes, or a URL. For several images, -o and --preview name
-    folders, whose files are named after the images; manifest.jsonl has a row per image. If one
-    fails, the others are fitted, and the exit code is 2.
+    IMAGE may be a folder, or a pattern in quotes. For several images, -o and --preview name
+    folders, whose files are named after the images; --report has a row per image. If one fails,
+    the others are fitted, and the exit code is 2.
 
     A single result is replaced. Of several images, those with results are skipped, so the same
     command continues a run; results of other options are an error. Files that are not sets of
@@ -125,9 +125,8 @@ def fit(
         _check_maps(run.context, images, output)
     elif not images:
         raise click.UsageError("no image is given; give image files, or maps with --map")
-    files = [m.path for m in maps.values()] or [
-        file for given in images for file in _expand(given, recursive)
-    ]
+    files = [m.path for m in maps.values()]
+    files = files or [file for given in images for file in _expand(given, recursive)]
     settings = _settings(choices, basis, run.backend)
     several = not maps and (len(files) > 1 or files != list(images))
     if recursive and files == list(images):
@@ -176,7 +175,7 @@ def fit(
     run.context.exit(_exit_code(records, len(inputs), settings))
 
 
-def _check_maps(context: click.Context, images: Sequence[Path | str], output: Path | None) -> None:
+def _check_maps(context: click.Context, images: Sequence[Path], output: Path | None) -> None:
     """Reject images and options that cannot be combined with maps."""
     if images:
         raise ValueError(f"{images[0]}: the image has no name; with --map, name all images")
@@ -246,12 +245,11 @@ def _method(preset: str, init: str | None) -> Method:
     return method if init is None else replace(method, place=places[init])
 
 
-def _expand(source: Path | str, recursive: bool) -> Sequence[Path | str]:
-    """Expand a folder, a pattern or a URL to its images."""
+def _expand(source: Path, recursive: bool) -> Sequence[Path]:
+    """Expand a folder or a pattern to its images."""
     from ..image.folder import list_images
 
-    single = isinstance(source, Path) and source.exists() and not source.is_dir()
-    return [source] if single else list_images(source, recursive)
+    return [source] if source.exists() and not source.is_dir() else list_images(source, recursive)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -261,7 +259,7 @@ def _expand(source: Path | str, recursive: bool) -> Sequence[Path | str]:
 
 def _fit_at_once(
     show: Show,
-    source: Path | str | dict[str, MapFile],
+    source: Path | dict[str, MapFile],
     output: Path,
     picture: Path | None,
     settings: FitOptions,
@@ -293,7 +291,7 @@ def _fit_at_once(
     return [record], _summary(str(output if maps else source), record, settings, picture)
 
 
-def load_images(source: Path | str | dict[str, MapFile], space: str, encoding: str | None) -> Any:
+def load_images(source: Path | dict[str, MapFile], space: str, encoding: str | None) -> Any:
     """Read an image, or the images of maps by name; grey data keeps one channel."""
     from ..gaussian.channels import usual_space
     from ..image.io import read_file
@@ -428,7 +426,7 @@ def _exit_code(records: list[Record], expected: int, settings: FitOptions) -> in
 
 def _fit_several(
     show: Show,
-    files: Sequence[Path | str],
+    files: Sequence[Path],
     outputs: list[Path],
     pictures: Sequence[Path | None],
     settings: FitOptions,
@@ -535,7 +533,7 @@ def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
 
 
 def _fit_by_blocks(
-    show: Show, path: Path | str, output: Path, settings: FitOptions, side: int, client: Any
+    show: Show, path: Path, output: Path, settings: FitOptions, side: int, client: Any
 ) -> Fitted:
     """Fit one image by blocks into a file; an interrupt keeps the finished blocks beside it."""
     names = ("gaussians", "iterations", "method", "seed", "backend", "encoding")

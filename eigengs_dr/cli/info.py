@@ -128,10 +128,10 @@ def _describe_fit(file: Path) -> Record:
     facts = _describe_set(data)
     if not data.maps and (figures := set_file.read_figures(file)):
         for name in ("psnr_ycbcr", "psnr_rgb"):  # JSON has no infinity
-            value = getattr(figures, name)
-            facts[name] = round(value, 2) if isfinite(value) else str(value)
+            if (value := getattr(figures, name)) is not None:
+                facts[name] = round(value, 2) if isfinite(value) else str(value)
         facts |= {"iterations": figures.iterations, "source": figures.source}
-    return facts
+    return {name: value for name, value in facts.items() if value is not None}
 
 
 def _describe_packed(file: Path) -> Record:

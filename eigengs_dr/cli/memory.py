@@ -65,7 +65,7 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
     )
 
 
-def check_memory(path: Path | str, settings: FitOptions, has_blocks: bool) -> str | None:
+def check_memory(path: Path, settings: FitOptions, has_blocks: bool) -> str | None:
     """Check that the memory suffices for a fit, estimated from the header of the file.
 
     Parameters

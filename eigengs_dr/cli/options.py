@@ -13,8 +13,7 @@ import click
 from ..backend.messages import printable
 from ..backend.selection import BACKENDS
 from ..backend.types import Record
-from ..image.pixels import ENCODINGS
-from ..image.remote import is_url
+from ..image.pixels import ENCODINGS, local_path
 from ..image.space import SPACES
 from ..storage.atomic import atomic_write, refuse_url
 from .outputs import describe_run, plain
@@ -47,23 +46,22 @@ def path(text: str) -> Path:
     return Path(text)
 
 
-def image(text: str) -> Path | str:
-    """Parse an image file, or its URL."""
-    return text if is_url(text) else EXISTING.convert(text, None, None)
+def image(text: str) -> Path:
+    """Parse an image file."""
+    return EXISTING.convert(local_path(text), None, None)
 
 
-def images(text: str) -> Path | str:
-    """Parse an image file, a folder of images, a pattern such as "a/*.png", or a URL of these."""
-    if is_url(text):
-        return text
-    pattern = glob.has_magic(text) and not Path(text).exists()
+def images(text: str) -> Path:
+    """Parse an image file, a folder of images, or a pattern such as "a/*.png"."""
+    file = local_path(text)
+    pattern = glob.has_magic(text) and not file.exists()
     return click.Path(exists=not pattern, path_type=Path).convert(text, None, None)
 
 
-def folder(text: str) -> Path | str:
-    """Parse an existing folder, or its URL."""
+def folder(text: str) -> Path:
+    """Parse an existing folder."""
     kind = click.Path(exists=True, file_okay=False, path_type=Path)
-    return text if is_url(text) else kind.convert(text, None, None)
+    return kind.convert(local_path(text), None, None)
 
 
 def sets_in(path: Path, suffixes: tuple[str, ...] = (".npz", ".egs")) -> list[Path]:
@@ -149,7 +147,7 @@ class MapFile(NamedTuple):
     """The image file of a map, and its space if it is not the default of its name."""
 
     name: str
-    path: Path | str
+    path: Path
     space: str | None
 
 
@@ -163,9 +161,9 @@ def map_file(text: str) -> MapFile:
         raise click.BadParameter(f"{text}: expected a name and a file, such as albedo=bark.jpg")
     if colon and space not in SPACES:
         raise click.BadParameter(f"{text}: space {space!r} is not in {', '.join(SPACES)}")
-    if not is_url(file) and not Path(file).is_file():
+    if not local_path(file).is_file():
         raise click.BadParameter(f"{file}: no such file")
-    return MapFile(name, file if is_url(file) else Path(file), space or None)
+    return MapFile(name, Path(file), space or None)
 
 
 def by_name(

@@ -12,21 +12,20 @@ import click
 
 from ..backend.selection import describe
 from ..gaussian.file import FORMAT, MATERIAL
-from ..image.remote import stem_of
 from ..storage import npz
 from ..storage.atomic import lock_output, remove_stale, require_writable
 from .console import NAME
 
 
 def name_outputs(
-    inputs: Sequence[Path | str], output: Path | None, suffixes: Sequence[str], folder: bool = False
+    inputs: Sequence[Path], output: Path | None, suffixes: Sequence[str], folder: bool = False
 ) -> list[Path]:
     """Name one output file for each input.
 
     Parameters
     ----------
     inputs : sequence of Path or str
-        The input files, or their URLs.
+        The input files.
     output : Path or None
         The output file or folder. Several inputs need a folder, which is created if it is missing.
         Files in a folder are named after the inputs. None is the current folder.
@@ -56,7 +55,7 @@ def name_outputs(
         return [output]
     if not output.is_dir() and (output.exists() or output.suffix.lower() in suffixes):
         raise ValueError(f"{output}: is a file; several images, or a folder of them, need a folder")
-    names = [stem_of(path) + suffixes[0] for path in inputs]
+    names = [path.stem + suffixes[0] for path in inputs]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         advice = "give an image once, or rename one of them"
         raise ValueError(f"{output / twice[0]}: two images have this name; {advice}")
@@ -69,7 +68,7 @@ def name_outputs(
 
 
 def name_pictures(
-    inputs: Sequence[Path | str], output: Path | None, folder: bool = False
+    inputs: Sequence[Path], output: Path | None, folder: bool = False
 ) -> list[Path | None]:
     """Name a picture for each input, as `name_outputs` does; None for each without an output."""
     from ..image.formats import PICTURE_SUFFIXES
@@ -89,7 +88,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | str]) 
     outputs : iterable of Path or None
         The files to write; None is skipped.
     inputs : iterable of Path or str
-        The files to read, or their URLs.
+        The files to read.
 
     Raises
     ------

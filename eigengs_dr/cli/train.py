@@ -9,7 +9,6 @@ import click
 
 from ..backend.selection import select
 from ..backend.types import Record
-from ..image.remote import is_url
 from . import options
 from .console import INTERRUPTED, bar, open_cluster, print_message
 from .outputs import check_outputs, lock_outputs, name_outputs, name_pictures
@@ -50,13 +49,13 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
 @options.shared("cluster", "backend", "report", "quiet")
 def train(
     run: options.Run,
-    folder: Path | str,
+    folder: Path,
     output: Path,
     preview: Path | None,
     lights: Path | None,
     **choices: Any,
 ) -> None:
-    """Train a model on the images of a folder, a pattern or a URL.
+    """Train a model on the images of a folder or a pattern.
 
     A model is one set of Gaussians that renders all principal components of the images. One image
     in ten is held out; up to 100 of them are measured. --energy refers to each channel of the
@@ -133,13 +132,13 @@ def train(
     )
 
 
-def _named(folder: Path | str) -> Path | str:
+def _named(folder: Path) -> Path:
     """Return the folder after which outputs are named; of a pattern, the one that holds it."""
-    return folder if is_url(folder) or os.path.isdir(folder) else Path(folder).absolute().parent
+    return folder if os.path.isdir(folder) else Path(folder).absolute().parent
 
 
-def _find_lights(run: options.Run, folder: Path | str) -> Path | None:
-    """Return the list of lights in a folder, and say so; None of a URL, a pattern or a family."""
+def _find_lights(run: options.Run, folder: Path) -> Path | None:
+    """Return the list of lights in a folder, and say so; None of a pattern or a family."""
     from ..image.folder import find_lists
     from ..image.formats import READ_SUFFIXES
 
@@ -173,7 +172,7 @@ FOR_FAMILIES = ("size", "energy", "target_psnr", "frequency_aware", "preset", "s
 
 def _train_on_lights(
     run: options.Run,
-    folder: Path | str,
+    folder: Path,
     output: Path,
     lights: Path,
     preview: Path | None,
@@ -187,8 +186,6 @@ def _train_on_lights(
 
     if given := _given(run, *FOR_FAMILIES):
         raise click.UsageError(f"{given} and --lights exclude each other; give one of them")
-    if is_url(folder):
-        raise click.UsageError("--lights takes a folder of this machine")
     planes = choices["components"] if _given(run, "components") else None
     if isinstance(planes, tuple):
         raise click.UsageError("--components is one number with --lights: that of planes")

@@ -41,7 +41,7 @@ def view(
     run: options.Run,
     file: Path,
     output: Path | None,
-    image: Path | str | None,
+    image: Path | None,
     encoding: str | None,
     light: tuple[float, ...] | None,
     name: str | None,

@@ -1,11 +1,4 @@
-"""Dask workers; the only folder that imports Dask.
-
-- ``executor``: connection to a cluster, and its `eigengs_dr.backend.executor.Executor`
-- ``worker``: execution of tasks on a worker
-- ``local``: workers on this machine
-
-Dask is imported only for a Dask client.
-"""
+"""Dask workers; the only folder that imports Dask, and only for a Dask client."""
 
 from __future__ import annotations
 

@@ -1,65 +1,68 @@
 """Dask: connection to a cluster, and an executor that submits tasks as workers become free.
 
-A cluster is not changed: neither its plugins and its configuration nor the limits of its workers.
-`eigengs_dr.cluster.worker` sets what a task needs for the duration of the task.
+Dask copies, prints and drops the arguments and results of tasks in threads of its own. If those
+were Dr.Jit arrays, these threads would use Dr.Jit at the same time as a task, and hang. So Dask
+only sees bytes: the thread of the task unpickles and frees the values.
+
+A cluster is not changed: what a task needs of its process is set for the duration of the task.
+Dask loads this module in the workers of ``local`` before their first task.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import re
+import signal
 import threading
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+import traceback
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
-from uuid import uuid4
 
 import dask
-from dask.utils import funcname
-from distributed import CancelledError, Client, Future, as_completed
+from distributed import (
+    CancelledError,
+    Client,
+    Future,
+    LocalCluster,
+    Worker,
+    as_completed,
+    get_worker,
+)
 from distributed.comm import CommClosedError
 from distributed.protocol.pickle import dumps, loads
 from distributed.scheduler import KilledWorker
+from threadpoolctl import threadpool_limits
 
 from ..backend.executor import ClusterError, Done, Function, Task, Value
 from ..backend.interrupts import defer_interrupts, terminate_as_interrupt
 from ..backend.plain import read_json
-from ..version import __version__
-from .local import local_cluster
-from .worker import package_versions, run_task, share
+from ..backend.recording import exclusive
 
-CONNECT_SECONDS = 30.0
-"""Time limit for connecting to the scheduler."""
+CONNECT_TIMEOUT = "distributed.comm.timeouts.connect"
+"""Dask setting of the time limit for connecting to the scheduler, and for the first worker."""
 
-LOST_WORKER_SETTING = {"distributed.deploy.lost-worker-timeout": "52w"}
-"""Dask setting for the workers of ``local``. This time after a worker ended, by default 15 s, Dask
-checks whether the worker is back. If it starts slowly, or has just ended again, Dask closes the
-nanny that is about to restart it, and the cluster stays smaller for good."""
+LOCAL_SETTINGS = {
+    "distributed.deploy.lost-worker-timeout": "52w",
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 27,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
+}
+"""Dask settings for the workers of ``local``. By default, Dask closes the nanny of a worker that is
+not back 15 s after it ended, and the cluster stays smaller for good. With its 64 KiB instead of the
+thresholds, every large array gets new pages from the kernel, and a fit of 256x256 pixels takes a
+tenth longer."""
 
-LARGE_TASK_SETTING = {"distributed.admin.large-graph-warning-threshold": "1GiB"}
-"""Dask setting that avoids warnings about large tasks, because tasks hold images."""
-
-_SUBMIT_LOCK = threading.Lock()
-"""Protects `LARGE_TASK_SETTING`: one thread would reset what another has set."""
-
-SILENCED_LOGGERS = (
-    "distributed",
-    "distributed.client",
-    "distributed.gc",
-    "tornado.application",
-    "asyncio",
-)
-"""Loggers that report a lost connection in many lines; this package reports it in one."""
+PACKAGES = ("eigengs-dr", "drjit", "numpy")
+"""Packages that determine the bits of results."""
 
 
 @contextmanager
 def connect(cluster: str) -> Iterator[Client]:
-    """Connect to a cluster during a block.
+    """Connect to a cluster during a block, in which nothing is logged: errors take one line.
 
     Parameters
     ----------
@@ -82,61 +85,71 @@ def connect(cluster: str) -> Iterator[Client]:
     KeyboardInterrupt
         After Ctrl-C or SIGTERM while the workers start.
     """
-    with ExitStack() as stack:
-        stack.enter_context(_silenced_loggers())
+    logging.disable()
+    try:
         if match := re.fullmatch(r"local(?::([1-9]\d*))?", cluster):
-            stack.enter_context(dask.config.set(LOST_WORKER_SETTING))
-            with defer_interrupts() as interrupted:  # Dask does not stop workers that are starting
-                workers = local_cluster(int(match[1] or 0) or dask.system.CPU_COUNT)
-                client = stack.enter_context(Client(stack.enter_context(workers)))
-            if interrupted():
-                raise KeyboardInterrupt
+            with dask.config.set(LOCAL_SETTINGS):
+                with defer_interrupts() as interrupted:  # Dask leaves workers that are starting
+                    workers = local_cluster(int(match[1] or 0) or dask.system.CPU_COUNT)
+                with workers, Client(workers) as client:
+                    if interrupted():
+                        raise KeyboardInterrupt
+                    yield client
         else:
-            is_address = "://" in cluster
-            if not is_address and not Path(cluster).is_file():
-                raise ValueError(
-                    f"cluster {cluster!r} is unknown; use local, local:N, tcp://HOST:PORT, or the "
-                    "file of a scheduler"
-                )
-            if not is_address:
-                _check_scheduler_file(cluster)
-            location = {"address" if is_address else "scheduler_file": cluster}
-            try:
-                client = stack.enter_context(Client(**location, timeout=CONNECT_SECONDS))
-            except OSError as error:
-                raise ClusterError(f"{cluster}: no scheduler answers; start it first") from error
-        yield client
-
-
-def _check_scheduler_file(path: str) -> None:
-    """Raise ValueError unless a file names an address; Dask would connect to None."""
-    try:
-        str(read_json(path)["address"])
-    except (ValueError, KeyError, TypeError):
-        raise ValueError(
-            f"cluster {path!r} is not the file of a scheduler, as 'dask scheduler "
-            "--scheduler-file FILE' writes it"
-        ) from None
-
-
-@contextmanager
-def _silenced_loggers() -> Iterator[None]:
-    """Silence Dask's loggers during a block."""
-    levels = {name: logging.getLogger(name).level for name in SILENCED_LOGGERS}
-    try:
-        for name in SILENCED_LOGGERS:
-            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-        yield
+            with _client_of(cluster) as client:
+                yield client
     finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)
+        logging.disable(logging.NOTSET)
 
 
-TASKS_PER_WORKER = 2
-"""Number of submitted tasks per worker: one that runs, and one that waits there."""
+def _client_of(cluster: str) -> Client:
+    """Return a client of a scheduler by its address, or by its file."""
+    if "://" not in cluster and not Path(cluster).is_file():
+        raise ValueError(
+            f"cluster {cluster!r} is unknown; use local, local:N, tcp://HOST:PORT, or the file of "
+            "a scheduler"
+        )
+    address = cluster
+    if "://" not in cluster:
+        try:
+            address = str(read_json(cluster)["address"])
+        except (ValueError, KeyError, TypeError):
+            raise ValueError(
+                f"cluster {cluster!r} is not the file of a scheduler, as 'dask scheduler "
+                "--scheduler-file FILE' writes it"
+            ) from None
+    try:
+        return Client(address)
+    except OSError as error:
+        raise ClusterError(f"{cluster}: no scheduler answers; start it first") from error
 
-NO_WORKER_SECONDS = 60.0
-"""Time without any worker after which a run ends. A nanny restarts a worker within seconds."""
+
+def local_cluster(workers: int) -> LocalCluster:
+    """Start single-threaded worker processes on this machine.
+
+    They are spawned, never forked, because Dr.Jit's threads do not survive a fork.
+    """
+    return LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        preload=[*dask.config.get("distributed.worker.preload"), __name__],
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    )
+
+
+def dask_setup(worker: Worker) -> None:
+    """Set up the process of a worker; Dask calls this function before the first task."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes
+    gpus = len(list(Path("/proc/driver/nvidia/gpus").glob("*")))
+    if gpus > 1 and isinstance(worker.name, int):  # as the workers of a `LocalCluster` are named
+        os.environ.setdefault("CUDA_VISIBLE_DEVICES", str(worker.name % gpus))
+    # Dr.Jit keeps memory for reuse during a task, so neither pausing nor spilling to disk helps. At
+    # 95 % of its limit a worker is restarted. A configuration would not reach the new process.
+    worker.memory_manager.memory_pause_fraction = False
+    worker.memory_manager.memory_spill_fraction = False
+    worker.memory_manager.memory_target_fraction = False
 
 
 class ClusterExecutor:
@@ -154,105 +167,54 @@ class ClusterExecutor:
     Raises
     ------
     ClusterError
-        If there is no worker within `NO_WORKER_SECONDS`, or one lacks this version of the package.
+        If there is no worker within `CONNECT_TIMEOUT`, or one has other versions of `PACKAGES`.
     """
 
     def __init__(self, client: Client) -> None:
         self.client = client
         self.address = client.scheduler.address if client.scheduler else "?"
         with self._cluster_errors():
-            self._require_worker(f"the scheduler {self.address} has no workers; start some")
-            self._require_package()
-            self.workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
+            try:
+                client.wait_for_workers(1, timeout=dask.config.get(CONNECT_TIMEOUT))
+            except asyncio.TimeoutError:  # since Python 3.11, TimeoutError
+                raise ClusterError(
+                    f"the scheduler {self.address} has no workers; start some"
+                ) from None
+            versions: Any = client.get_versions(packages=PACKAGES)
+        for address, worker in versions["workers"].items():
+            _compare(address, worker["packages"], versions["client"]["packages"])
+        self.workers = max(1, len(versions["workers"]))
 
     def map(
         self, function: Function[Task, Value], tasks: Iterable[Task], shared: Any = None
     ) -> Generator[Done, None, None]:
         """Call ``function(task, shared)`` for every task; see `Executor.map`.
 
-        If a worker crashes, all of its tasks are lost. Tasks that Dask gives up are therefore tried
-        again at the end, one at a time, so that no task fails because of another.
+        Each worker has one task at a time, so that a worker that ends loses no other.
         """
-        suspects: deque[Task] = deque()
+        waiting, submitted = iter(tasks), dict[Future, Task]()
+        ended = as_completed(loop=self.client.loop)
         with self._cluster_errors(), terminate_as_interrupt():
             # A task instead of `scatter`: the scheduler repeats it if its workers are lost.
-            constant = self._submit("share", share, dumps((function, shared)), package_versions())
-            name = funcname(function)
-            with closing(
-                self._run(name, tasks, constant, TASKS_PER_WORKER * self.workers)
-            ) as ended:
-                for done in ended:
-                    if done.lost:  # perhaps because of another task of that worker
-                        suspects.append(done.task)
-                    else:
-                        yield done
-            with closing(self._run(name, suspects, constant, 1)) as ended:
-                yield from ended
-
-    def _run(
-        self, name: str, tasks: Iterable[object], constant: Future, limit: int
-    ) -> Generator[Done, None, None]:
-        """Run tasks, at most `limit` of them at the same time."""
-        submitted: dict[Future, object] = {}
-        waiting = iter(tasks)
-        ended = self._watch(submitted)
-        try:
-            while True:
-                for task in islice(waiting, limit - len(submitted)):
-                    future = self._submit(name, run_task, dumps(task), constant)
-                    submitted[future] = task
-                    ended.add(future)
-                try:
+            constant = self.client.submit(bytes, dumps((function, shared)), pure=False)
+            try:
+                while True:
+                    for task in islice(waiting, self.workers - len(submitted)):
+                        future = self.client.submit(_run_task, dumps(task), constant, pure=False)
+                        submitted[future] = task
+                        ended.add(future)
+                    if not submitted:
+                        return
                     future = next(ended)
-                except StopIteration:
-                    return
-                except asyncio.TimeoutError:  # since Python 3.11, TimeoutError
-                    # The time is counted from the first task.
-                    self._require_worker(
-                        "no worker is left; start some, and the same call continues the run"
-                    )
-                    ended = self._watch(submitted)
-                    continue
-                yield _done(submitted.pop(future), future)
-                future.release()
-        finally:
-            if submitted and self.client.status == "running":
-                self.client.cancel(list(submitted))
-
-    def _watch(self, futures: Iterable[Future]) -> as_completed:
-        return as_completed(list(futures), loop=self.client.loop, timeout=NO_WORKER_SECONDS)
-
-    def _submit(self, name: str, function: Callable, *arguments: object) -> Future:
-        """Submit a task. Dask estimates its duration from tasks of the same name."""
-        with _SUBMIT_LOCK, dask.config.set(LARGE_TASK_SETTING):
-            return self.client.submit(function, *arguments, key=f"{name}-{uuid4()}")
-
-    def _require_worker(self, message: str) -> None:
-        """Wait until there is a worker; raise an error with the message if there is none."""
-        try:
-            self.client.wait_for_workers(1, timeout=NO_WORKER_SECONDS)
-        except asyncio.TimeoutError:
-            raise ClusterError(message) from None
-
-    def _require_package(self) -> None:
-        """Check the version of the package on all workers.
-
-        The call uses a function of the standard library, because a function that workers cannot
-        load closes their connection.
-        """
-        answers = self.client.run(resolve_name, "eigengs_dr:__version__", on_error="return")
-        for address, answer in answers.items():
-            if isinstance(answer, ModuleNotFoundError):
-                raise answer
-            if isinstance(answer, str) and answer != __version__:
-                raise ClusterError(
-                    f"worker {address} has eigengs_dr {answer}, but this process has "
-                    f"{__version__}; install equal versions"
-                )
+                    yield _done(submitted.pop(future), future)
+                    future.release()
+            finally:
+                if submitted and self.client.status == "running":
+                    self.client.cancel(list(submitted))
 
     @contextmanager
     def _cluster_errors(self) -> Iterator[None]:
-        """Convert errors about a lost cluster or a missing package to a one-line `ClusterError`."""
+        """Convert errors about a lost cluster to a `ClusterError` of one line."""
         try:
             yield
         except (CancelledError, CommClosedError) as error:
@@ -260,10 +222,16 @@ class ClusterExecutor:
                 f"the scheduler {self.address} is gone; start it, and the same call continues the "
                 "run"
             ) from error
-        except ModuleNotFoundError as error:
+
+
+def _compare(address: str, worker: dict[str, str | None], client: dict[str, str | None]) -> None:
+    """Raise `ClusterError` if the versions of a worker are not those of the client."""
+    for name in PACKAGES:
+        if worker[name] != client[name]:
             raise ClusterError(
-                f"a worker lacks {error.name}; install the packages of this process there"
-            ) from None
+                f"worker {address} has {name} {worker[name]}, but this process has "
+                f"{client[name]}; install equal versions"
+            )
 
 
 def _done(task: object, future: Future) -> Done:
@@ -274,3 +242,51 @@ def _done(task: object, future: Future) -> Done:
         times = dask.config.get("distributed.scheduler.allowed-failures") + 1
         reason = f"its worker ended {times} times during the work"
         return Done(task, None, f"{reason}; it may need more memory than a worker has")
+
+
+def _run_task(task: bytes, shared: bytes) -> bytes:
+    """Call the function of a run for one task, on a worker, with the worker's number of threads.
+
+    Dr.Jit's pool ignores OMP variables and uses every core, so two workers would use each core
+    twice. It keeps freed memory for reuse, so that a worker that Dask pauses because of its memory,
+    by default at 80 % of its limit, would never continue.
+    """
+    import drjit as dr
+
+    worker = get_worker()
+    with _unprofiled(worker), exclusive(), threadpool_limits(worker.state.nthreads):
+        before = dr.thread_count()
+        dr.set_thread_count(worker.state.nthreads)
+        try:
+            function, constant = loads(shared)
+            return dumps(function(loads(task), constant))
+        except BaseException as error:
+            _clear_frames(error)
+            raise
+        finally:
+            dr.set_thread_count(before)
+            dr.flush_malloc_cache()
+
+
+def _clear_frames(error: BaseException | None) -> None:
+    """Free the arrays in the frames of an error, which Dask would free in its own thread."""
+    while error is not None:
+        traceback.clear_frames(error.__traceback__)
+        error = error.__cause__ or error.__context__
+
+
+@contextmanager
+def _unprofiled(worker: Worker) -> Iterator[None]:
+    """Hide this thread from Dask's profiler during a block.
+
+    The profiler accesses the frames of all tasks a hundred times per second. If a function returns
+    at that moment, the profiler keeps its variables, so that Dask's thread frees Dr.Jit arrays.
+    """
+    thread = threading.get_ident()
+    with worker.active_threads_lock:
+        key = worker.active_threads.pop(thread)
+    try:
+        yield
+    finally:
+        with worker.active_threads_lock:
+            worker.active_threads[thread] = key

@@ -28,7 +28,7 @@ from .truncation import TruncationCurve, curve_from_eigenvalues, name_components
 
 if TYPE_CHECKING:  # training, encoding and runs over many images are imported on demand
     from ..image.folder import TrainingImages
-    from ..many.manifest import ImageRow, Images
+    from ..many.images import ImageRow, Images
     from .basis import Eigenbasis
     from .encoder import ModelEncoder
 
@@ -306,7 +306,7 @@ class EigenGS:
         ValueError, OSError, Interrupted
             See `encode` and `eigengs_dr.fit_many`.
         """
-        from ..many.manifest import fingerprint
+        from ..many.images import digest, fingerprint
         from ..many.run import Job, run_images
 
         check_coding(colors, mean, target_psnr)
@@ -315,7 +315,7 @@ class EigenGS:
         options = {"colors": colors, "mean": mean, "target_psnr": target_psnr, "encoding": encoding}
         options |= {"model": fingerprint(self)}
         read, has_picture = partial(_read, encoding=encoding), mean != "dense"
-        job = Job(work, None, read, 0, options, list(options), has_picture)
+        job = Job(work, None, read, 0, digest(options), has_picture)
         return run_images(images, output, overwrite, job, progress, client)
 
     def _colored(self, columns: Doubles, size: tuple[int, int] | None) -> Gaussians:

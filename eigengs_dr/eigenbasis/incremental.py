@@ -30,8 +30,7 @@ from ..backend.types import Doubles, Singles, Values
 from ..cluster import executor_for
 from ..image.folder import ReadProgress, TrainingImages, list_images, read_blocks
 from ..image.notes import NotedImages, kept_notes, tell_all
-from ..image.pixels import ImageError
-from ..image.remote import is_url
+from ..image.pixels import ImageError, local_path
 from ..storage.checkpoint import read_arrays, write_arrays
 from ..storage.memory import check_usable
 
@@ -422,10 +421,7 @@ def _absolute(images: Images) -> Images:
     if not isinstance(images, Sequence):
         return images
     is_file = (str, os.PathLike)
-    return [
-        Path(item).absolute() if isinstance(item, is_file) and not is_url(item) else item
-        for item in images
-    ]
+    return [local_path(item).absolute() if isinstance(item, is_file) else item for item in images]
 
 
 def _read(file: Path) -> EigenState:

@@ -19,7 +19,6 @@ from ..image.folder import list_images
 from ..image.io import Codes, ImageError, check_member
 from ..image.metrics import psnr
 from ..image.notes import series
-from ..image.remote import is_url
 from ..image.resize import center_crop
 from ..paper.joint_training import State
 from ..raster.render import render
@@ -112,7 +111,7 @@ def train_model(
                 f"{folder}: the images have changed since this training began; it continues with "
                 f"the original {len(checkpoint.files)}"
             )
-        files = [name if is_url(name) else root / name for name in checkpoint.files]
+        files = [root / name for name in checkpoint.files]
         held_out = files[HELD_OUT - 1 :: HELD_OUT][:MAX_HELD_OUT]
         training = [path for i, path in enumerate(files) if i % HELD_OUT != HELD_OUT - 1]
         run = _Run(checkpoint, settings, backend, progress, interrupted, held_out, client)
@@ -150,7 +149,7 @@ class _Run(NamedTuple):
     backend: str | None
     progress: Callable[[int, int, Record], None]
     interrupted: Callable[[], bool]
-    held_out: Sequence[Path | str]
+    held_out: Sequence[Path]
     client: object
 
     def report(self, stage: str, done: int, total: int) -> None:
@@ -167,7 +166,7 @@ class _Run(NamedTuple):
         raise Interrupted(None, "nothing is saved")
 
 
-def _basis(files: list[Path | str], run: _Run) -> Eigenbasis:
+def _basis(files: list[Path], run: _Run) -> Eigenbasis:
     """Compute the components, or read them from the checkpoint, which also stores shards."""
     settings, checkpoint = run.settings, run.checkpoint
     if (path := checkpoint.folder / "basis.npz").exists():

@@ -290,10 +290,10 @@ def texel_sums(
     moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)
     pictures, time = objective.seen(sums), dr.opaque(types.Float, 0)
     squares = zeros_like(values[0])
-    with freeze_program(advance) as take_step, objective.traced() as differentiate:
+    with freeze_program(advance) as take_step:
         yield sums
         for _ in range(steps):
-            slopes, size = objective.step(pictures, differentiate)
+            slopes, size = objective.step(pictures)
             values, moments, time, sums, pictures, squares = take_step(
                 values, moments, time, sums, slopes, size, squares
             )

@@ -84,7 +84,7 @@ class Fit:
     loss : float
         The loss of the set, from the same row; NaN without a loss.
     source : str
-        Name of the image, if it was a file or a URL.
+        Name of the image, if it was a file.
     maps : dict of str to dict
         For maps, psnr_ycbcr and psnr_rgb of each, from the same row.
     """
@@ -154,18 +154,18 @@ def fit(
 
     Parameters
     ----------
-    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL; or a mapping
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like; or a mapping
         A file, see `eigengs_dr.load_image`, or pixels, see `eigengs_dr.image.io.check_image`. A
         mapping holds the images of maps by name, with at most 16 channels together; a `Map` says
         the space, the weight and the goal of one. Data whose three channels are equal count as one
         channel. Without an image, give a loss and the size of its picture.
     gaussians : int or sequence of int, optional
         Number of Gaussians, at most one per pixel. By default 5000, or one per pixel for smaller
-        images; with a start, the number of its Gaussians; without an image, one for 4 pixels, or
-        as many as the judge of the loss finds best, see `eigengs_dr.Loss`. Several rising numbers
-        such as ``[5000, 7000, 9000]`` are levels of detail, see `level_counts`: the first Gaussians
-        form the image too, and ``result.gaussians[:n]`` is a level. Inside a level, Gaussians with
-        a larger removal cost come first, so that every prefix forms an image.
+        images; with a start, the number of its Gaussians; without an image, one for 4 pixels.
+        Several rising numbers such as ``[5000, 7000, 9000]`` are levels of detail, see
+        `level_counts`: the first Gaussians form the image too, and ``result.gaussians[:n]`` is a
+        level. Inside a level, Gaussians with a larger removal cost come first, so that every prefix
+        forms an image.
     iterations : int, optional
         Largest number of refinement steps; 0 keeps the colours of the solve.
     target_psnr : float or Goal, optional

@@ -1,4 +1,4 @@
-"""A fit of a loss without an image: texels, then the number of Gaussians, then the Gaussians."""
+"""A fit of a loss without an image: texels, then Gaussians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from .loss import LossObjective
 from .measure import Measured, Row
 from .method import DEFAULT
 from .objective import Pixels
-from .options import max_gaussians_for
 from .place import Adaptive
 from .problem import Problem
 from .search import fewest
@@ -38,9 +37,6 @@ texture 1.1 dB."""
 STEPS_PER_TEXEL = 8
 """Steps of a fit of the texels' picture for each texel of a Gaussian: Gaussians of 4 texels show it
 after 30 steps, and those of 64 need 150."""
-
-FIRST_PIXELS = 128
-"""Pixels of the picture per Gaussian, for the smallest number that a judge tries."""
 
 
 @dataclass
@@ -91,9 +87,8 @@ class Watch:
 def fit_loss(problem: Problem, watch: Watch) -> tuple[Refinement, float]:
     """Descend on a loss from nothing or from a set; also return the seconds before Gaussians move.
 
-    A pyramid of texels takes the first steps, see `Coarse`. Gaussians are fitted to its picture: a
-    given number, or numbers that double while a judge gains from it. They take the remaining steps,
-    in which a search finds the fewest for a target.
+    A pyramid of texels takes the first steps, see `Coarse`. Gaussians are fitted to its picture,
+    and take the remaining steps, in which a search finds the fewest for a target.
     """
     options, taken, trace = problem.options, 0, list[Row]()
     loss = options.loss
@@ -102,14 +97,14 @@ def fit_loss(problem: Problem, watch: Watch) -> tuple[Refinement, float]:
         place = options.method.place
         coarse = place if isinstance(place, Coarse) else Coarse()
         objective = _descend_texels(problem, coarse, watch)
-        taken, rows = objective.calls.step, list[Row]()
+        taken = objective.calls.step
         with watch.may_end():
             if objective.is_called_by_row:
-                rows = [{"loss": objective.judge(objective.seen(_rows(objective)))}]
+                value = objective.judge(objective.seen(_rows(objective)))
             else:
-                rows = [{"loss": objective.calls.recent()}]
-        start, numbers = _start(objective, problem, coarse, watch)
-        trace = [{"seconds": watch.seconds, "iteration": taken, **row} for row in [*rows, *numbers]]
+                value = objective.calls.recent()
+            trace = [{"seconds": watch.seconds, "iteration": taken, "loss": value}]
+        start = _start(objective, problem, coarse)
     else:
         start = _set_for(problem)
         blank = near(problem, np.zeros(problem.number * problem.size[0] * problem.size[1]))
@@ -187,37 +182,16 @@ def _descend_texels(problem: Problem, coarse: Coarse, watch: Watch) -> LossObjec
     return replace(near(problem, sums.numpy()), calls=objective.calls)
 
 
-def _start(
-    objective: LossObjective, problem: Problem, coarse: Coarse, watch: Watch
-) -> tuple[Gaussians, list[Row]]:
-    """Fit Gaussians to the image of an objective; also return rows for the numbers tried."""
+def _start(objective: LossObjective, problem: Problem, coarse: Coarse) -> Gaussians:
+    """Fit Gaussians to the image of an objective."""
     options, image, loss = problem.options, objective.image(), objective.loss
     pixels = problem.size[0] * problem.size[1]
     method = replace(DEFAULT, place=options.method.place, cutoff=options.method.cutoff)
     if not isinstance(method.place, Adaptive):  # the choice of a placement is not undone
         method = method.without("grows", "places")
-
-    def fitted(count: int) -> Gaussians:
-        start = method.place_and_solve(image, count, options.seed)
-        steps = min(coarse.fit_steps, STEPS_PER_TEXEL * pixels // len(start))
-        states = descend(image, method, begin(start), steps, options.seed)
-        return last(states, start)
-
-    if options.gaussians is not None or options.searches or loss.judge is None:
-        count = pixels // PIXELS_PER_GAUSSIAN
-        if loss.pixels is not None:
-            count = min(count, loss.pixels // SEEN_PER_GAUSSIAN)
-        return fitted(options.count or max(1, count)), []
-    max_count, count = max_gaussians_for(pixels, objective.channels), pixels // FIRST_PIXELS
-    best, rows = fitted(max(1, count)), list[Row]()
-    gaussians = best
-    with watch.may_end():
-        while True:
-            rows.append({"gaussians": len(gaussians), **objective.judged(gaussians)})
-            if len(rows) > 1 and rows[-1]["loss"] >= rows[-2]["loss"]:
-                break
-            best, count = gaussians, 2 * max(1, count)
-            if count > max_count or watch.ended():
-                break
-            gaussians = fitted(count)
-    return best, rows
+    count = pixels // PIXELS_PER_GAUSSIAN
+    if loss.pixels is not None:
+        count = min(count, loss.pixels // SEEN_PER_GAUSSIAN)
+    start = method.place_and_solve(image, options.count or max(1, count), options.seed)
+    steps = min(coarse.fit_steps, STEPS_PER_TEXEL * pixels // len(start))
+    return last(descend(image, method, begin(start), steps, options.seed), start)

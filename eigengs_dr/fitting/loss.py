@@ -11,9 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from inspect import signature
-from types import FunctionType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
@@ -23,14 +21,13 @@ from ..backend.arrays import types_of
 from ..backend.doors import check_types
 from ..backend.messages import shown
 from ..backend.recording import collector_off, freeze_program
-from ..backend.types import Float, Record, Tensor, UInt
+from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.space import Affine
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import forward, pixels_inside
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import bin_gaussians, to_tensor
-from .frozen import arrays_of
 from .objective import Channels, Pixels, Quadratic, Slope
 
 if TYPE_CHECKING:
@@ -39,9 +36,6 @@ if TYPE_CHECKING:
 
 LossFunction: TypeAlias = Callable[[Any, int], Any]
 """``function(picture, step) -> number``, see `Loss`."""
-
-Differentiate: TypeAlias = Callable[[list[Float], int], tuple[Float, list[Float]]]
-"""Returns the value of a loss and its derivatives by the pictures of a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,21 +71,6 @@ class Loss:
         Number of pixels that the function looks at, such as those of all photos of a texture. More
         than one Gaussian for 3 of them would show their noise: without an image or a number, there
         are no more.
-    frozen : bool, optional
-        Whether Dr.Jit records the function and its derivative in the first step, and replays their
-        kernels in the others, where the function is not called: L1 and SSIM of 64x64 pixels take a
-        seventh of the time, those of 256x256 nine tenths (CPU). A replay sees another picture and
-        another step, which is an array UInt of one number then. All else is as it was in the first
-        step: each number and each array that the function uses, by closures and global names too;
-        the size; the state of a generator of random numbers, so take ``dr.rng(seed=step)``. Each
-        descent of a fit records anew: texels, Gaussians, and each number that a search tries.
-        In the steps 0, 1, 2, 4, 8 and so on, and in every hundredth, the function is called too. If
-        its value and derivative differ by more than 0.1 %, something that it uses has changed, and
-        the fit ends with an error. Rows, controls and the judge call the function itself.
-        It must be a plain function of Dr.Jit's functions and arrays, of `eigengs_dr.ssim`, of
-        numbers, and of such functions. An array of NumPy that it converted would end the process:
-        a function that names anything of NumPy or of another package is refused. So are methods,
-        sorting, branches on values, and `parameters`.
 
     Raises
     ------
@@ -99,8 +78,8 @@ class Loss:
         If the bounds are not two finite numbers that rise, the target is no number above 0, or
         there are no pixels.
     TypeError
-        If the function or the judge takes other arguments, the function is frozen already, the
-        parameters are no optimiser, or ``frozen=True`` comes with a method or with parameters.
+        If the function or the judge takes other arguments, the function is frozen already, or the
+        parameters are no optimiser.
 
     Examples
     --------
@@ -121,7 +100,6 @@ class Loss:
     target: float | None = None
     space: str | Mapping[str, str] | None = None
     pixels: int | None = None
-    frozen: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.function, Loss):
@@ -145,12 +123,6 @@ class Loss:
             raise TypeError(
                 f"Loss: parameters are {type(self.parameters).__name__}; give an optimiser of "
                 "Dr.Jit, such as drjit.opt.Adam"
-            )
-        plain = isinstance(self.function, FunctionType) and self.parameters is None
-        if not isinstance(self.frozen, bool) or (self.frozen and not plain):
-            raise TypeError(
-                f"Loss: frozen is {shown(self.frozen)}; give True or False, and True only with a "
-                "plain function and no parameters"
             )
         if self.bounds is not None:
             object.__setattr__(self, "bounds", _check_bounds(self.bounds))
@@ -319,15 +291,6 @@ has next to no weight disturb the others: twice the loss."""
 CHECK_EVERY = 10
 """Calls after which the values are read back; each read waits for the device."""
 
-CHECK_FROZEN = 100
-"""Steps between two comparisons of a frozen loss with its function. One takes as long as 8 replays
-of L1 and SSIM, for a picture of 64x64 pixels."""
-
-ROUNDING = 1e-3
-"""Largest difference of a frozen loss from its function, relative to value and derivative. That of
-equal programs is 1e-7: Dr.Jit adds numbers in no fixed order."""
-
-
 TINY = 1e-30
 """Lower bound of a loss before its logarithm."""
 
@@ -373,7 +336,6 @@ class LossObjective(Pixels):
         """Give the derivative at the picture of each step, see `Pixels.models`."""
         with (
             freeze_program(self.draw) as draw,
-            self.traced() as differentiate,
             freeze_program(self.to_slope) as to_slope,
         ):
 
@@ -383,47 +345,17 @@ class LossObjective(Pixels):
                 sums, pictures = draw(
                     state.moving.packed, list(background), state.lists[-1], radius
                 )
-                slopes, size = self.step(pictures, differentiate)
+                slopes, size = self.step(pictures)
                 return Slope(to_slope(sums, slopes), size)
 
             yield model_at
 
-    @contextmanager
-    def traced(self) -> Iterator[Differentiate]:
-        """Give `differentiate` for a descent: frozen if the loss is, and checked now and then."""
-        if not self.loss.frozen:
-            yield partial(self.differentiate, parameters=self.loss.parameters)
-            return
-        assert isinstance(self.loss.function, FunctionType)
-        used = arrays_of(self.loss.function)
-        with freeze_program(
-            lambda pictures, step, used: self.differentiate(pictures, step)
-        ) as replay:
-
-            def checked(pictures: list[Float], step: int) -> tuple[Float, list[Float]]:
-                try:
-                    replayed = replay(pictures, dr.opaque(self.types.UInt, step), used)
-                except Exception as error:
-                    self.differentiate(pictures, step)  # it may raise the same
-                    reason = str(error).partition("\n")[0]
-                    raise ValueError(
-                        f"loss: frozen=True, but Dr.Jit cannot record its function: {reason}; take "
-                        "the step as an array, make arrays outside, or drop frozen=True"
-                    ) from error
-                if step & (step - 1) == 0 or step % CHECK_FROZEN == 0:
-                    _compare(replayed, self.differentiate(pictures, step), step)
-                return replayed
-
-            yield checked
-
-    def step(
-        self, pictures: list[Float], differentiate: Differentiate
-    ) -> tuple[list[Float], Float]:
+    def step(self, pictures: list[Float]) -> tuple[list[Float], Float]:
         """Return the derivatives by the pictures of a step, and their size, see `derivative`.
 
         Parameters of the user get theirs, and step.
         """
-        value, slopes, size = self.derivative(pictures, differentiate)
+        value, slopes, size = self.derivative(pictures, self.loss.parameters)
         if self.loss.parameters is not None:
             self.loss.parameters.step()
         self.calls.add(value, size)
@@ -481,20 +413,20 @@ class LossObjective(Pixels):
         return dr.fma(pull, excess, inwards)
 
     def derivative(
-        self, pictures: list[Float], differentiate: Differentiate | None = None
+        self, pictures: list[Float], parameters: Any = None
     ) -> tuple[Float, list[Float], Float]:
         """Return the value of the loss, its derivatives by the pictures, and their size.
 
         The derivatives are in a unit of their own, see `Calls.unit`; the size is the sum of their
         absolute values, 0 if the loss has no derivative at this step.
         """
-        value, slopes = (differentiate or self.differentiate)(pictures, self.calls.step)
+        value, slopes = self.differentiate(pictures, self.calls.step, parameters)
         dr.make_opaque(slopes)
         size = sum(dr.sum(dr.abs(slope)) for slope in slopes)
         return value, self.calls.in_unit(slopes, size), size
 
     def differentiate(
-        self, pictures: Sequence[Float], step: int | UInt, parameters: Any = None
+        self, pictures: Sequence[Float], step: int, parameters: Any = None
     ) -> tuple[Float, list[Float]]:
         """Return the value of the loss, and its derivatives by the pictures.
 
@@ -641,20 +573,6 @@ class _Name(str):
             f"such as pictures[{str(self)!r}]"
         )
         yield ""  # so that the error comes with the first letter, where Dr.Jit passes it on
-
-
-def _compare(
-    replayed: tuple[Float, list[Float]], called: tuple[Float, list[Float]], step: int
-) -> None:
-    """Raise ValueError if a frozen loss differs from its function by more than rounding."""
-    pairs = list(zip([replayed[0], *replayed[1]], [called[0], *called[1]], strict=True))
-    difference = sum(dr.sum(dr.abs(a - b)) for a, b in pairs)
-    if (difference > ROUNDING * sum(dr.sum(dr.abs(b)) for _, b in pairs))[0]:
-        raise ValueError(
-            f"loss: frozen=True, but at step {step} its value is {replayed[0][0]:g}, and that of "
-            f"its function {called[0][0]:g}: something that it uses changed after it was recorded; "
-            "drop frozen=True"
-        )
 
 
 def _call(function: Callable[..., Any], *arguments: Any) -> Any:

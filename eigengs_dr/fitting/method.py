@@ -133,10 +133,10 @@ class Method:
         parts = [(name, getattr(self, name), kind) for name, kind in kinds.items()]
         if not isinstance(self.controls, (tuple, list)):
             raise TypeError(f"Method: controls is {shown(self.controls)}; give a tuple of controls")
-        for name, part, kind in [*parts, *(("controls", c, Control) for c in self.controls)]:
+        for name, part, kind in [*parts, *(("a control", c, Control) for c in self.controls)]:
             if isinstance(part, type) or not isinstance(part, kind):
                 raise TypeError(
-                    f"Method: {name} holds {shown(part)}, which lacks what a {kind.__name__} has; "
+                    f"Method: {name} is {shown(part)}, which lacks what a {kind.__name__} has; "
                     f"see {kind.__module__}.{kind.__name__}"
                 )
         rates = self.rates if isinstance(self.rates, Mapping) else {}

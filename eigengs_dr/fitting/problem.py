@@ -56,7 +56,7 @@ class Map:
 
     Attributes
     ----------
-    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like or URL
+    image : array_like, shape (H, W, 3), (H, W, 1) or (H, W); or path-like
     space : str or None
         By default "linear" for albedo, color and the like, "normal" for normals, and "data" for
         other names, see `eigengs_dr.gaussian.channels.usual_space`.

@@ -73,7 +73,8 @@ MAPS: dict[str, Field] = {
 """Arrays of a file with maps, instead of the space."""
 
 FIGURES: dict[str, Field] = {"figures": Field("f8", 1, 3), "source": Field("U", 0)}
-"""Optional arrays of a file with the results of the fit; see `FitFigures`."""
+OPTIONS: dict[str, Field] = {"options": Field("U", 0)}
+"""Optional arrays of a file with the results of the fit, and of a run; see `FitFigures`."""
 
 MAX_SOURCE = 64
 """Number of characters of the name of an image, counted from its end, that a file stores."""
@@ -116,12 +117,25 @@ class SetData(NamedTuple):
 
 
 class FitFigures(NamedTuple):
-    """Results of a fit in a file: PSNR in dB, number of steps, and name of the image."""
+    """Results of a fit, or of an encoding, in a file.
 
-    psnr_ycbcr: float
-    psnr_rgb: float
-    iterations: int
+    Attributes
+    ----------
+    psnr_ycbcr, psnr_rgb : float or None
+        PSNR in dB; None for what is no picture.
+    iterations : int or None
+        Number of steps; None for an encoding.
+    source : str
+        Name of the image.
+    options : str
+        Digest of the options of a run over many images.
+    """
+
+    psnr_ycbcr: float | None
+    psnr_rgb: float | None
+    iterations: int | None
     source: str = ""
+    options: str = ""
 
 
 def check_suffix(path: str | os.PathLike[str]) -> None:
@@ -161,8 +175,10 @@ def write_set(
     else:
         members["space"] = np.array(data.space)
     if figures is not None and not data.maps:
-        members["figures"] = np.array(figures[:3], np.float64)
+        members["figures"] = np.array(figures[:3], np.float64)  # None becomes NaN
         members["source"] = np.array(figures.source[-MAX_SOURCE:])
+        if figures.options:
+            members["options"] = np.array(figures.options)
     compressed = len(members["mean"]) < UNCOMPRESSED_COUNT
     npz.write(path, kind, VERSIONS[kind], members, compressed)
 
@@ -256,15 +272,19 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
 
 def read_figures(path: Path) -> FitFigures | None:
     """Return the results of the fit from an ``.npz`` file, if any; errors as for `read_head`."""
-    if not set(FIGURES) <= set(npz.sizes_of(path)):
+    names = set(npz.sizes_of(path))
+    if not set(FIGURES) <= names:
         return None
-    members = npz.read(path, FORMAT, VERSIONS[FORMAT], FIGURES)
-    values, source = members["figures"], str(members["source"])
-    if values.shape != (3,) or not (np.isfinite(values[2]) and 0 <= values[2] < 1 << 53):
+    layout = FIGURES | OPTIONS if set(OPTIONS) <= names else FIGURES
+    members = npz.read(path, FORMAT, VERSIONS[FORMAT], layout)
+    values = [None if np.isnan(value) else value for value in members["figures"].tolist()]
+    if len(values) != 3 or not (values[2] is None or 0 <= values[2] < 1 << 53):
         raise ValueError(
-            f"{path}: figures are {values.tolist()}, expected two PSNRs and the number of steps"
+            f"{path}: figures are {values}, expected two PSNRs and the number of steps"
         )
-    return FitFigures(float(values[0]), float(values[1]), int(values[2]), printable(source))
+    steps = None if values[2] is None else int(values[2])
+    texts = (printable(str(members[name])) for name in ("source", "options") if name in members)
+    return FitFigures(values[0], values[1], steps, *texts)
 
 
 def read_set(path: Path, sections: int | None = None) -> SetData:

@@ -4,7 +4,6 @@
 - ``formats``: who reads and writes which files
 - ``read``: headers and pixels of files, by OpenImageIO and Pillow; windows of large files
 - ``notes``: warnings about what is not applied, such as colour profiles
-- ``remote``: images behind URLs
 - ``pixels``: the encoding of pixels, sRGB or linear light, and the checks of an image
 - ``folder``: many images, in blocks
 - ``color``: colour spaces: YCbCr, linear light, sRGB, encodings of light above 1, normals

@@ -21,8 +21,7 @@ from ..backend.types import PathLike, Record, Values
 from .formats import READ_SUFFIXES, UNREAD_SUFFIXES
 from .io import check_member
 from .notes import NotedImages, kept_notes, tell_all
-from .pixels import ImageError, check_size, is_bitmap, is_drjit
-from .remote import is_url, list_urls
+from .pixels import ImageError, check_size, is_bitmap, is_drjit, local_path
 from .resize import center_crop
 from .space import FAMILY_SPACES, space_of, to_planes
 from .strips import available_cores
@@ -40,7 +39,7 @@ MAX_NAMED = 3
 FileOrImage = PathLike | Values
 
 TrainingImages = FileOrImage | Iterable[FileOrImage]
-"""A folder or its URL, an array of images, or an iterable of files, URLs and such arrays."""
+"""A folder, an array of images, or an iterable of files and such arrays."""
 
 ReadProgress = Callable[[int, int | None, Record], None]
 """``progress(done, total, row)``; the total is None if it is unknown."""
@@ -128,8 +127,8 @@ def _names(names: list[str]) -> str:
     return ", ".join(names[:MAX_NAMED]) + (", ..." if len(names) > MAX_NAMED else "")
 
 
-def list_images(images: str | os.PathLike[str], recursive: bool = False) -> Sequence[str | Path]:
-    """List the images of a folder, a glob, or a URL of one of them or of a file.
+def list_images(images: str | os.PathLike[str], recursive: bool = False) -> list[Path]:
+    """List the images of a folder or a glob.
 
     Parameters
     ----------
@@ -139,16 +138,17 @@ def list_images(images: str | os.PathLike[str], recursive: bool = False) -> Sequ
 
     Returns
     -------
-    sequence of Path or str
-        Files or URLs, sorted by name.
+    list of Path
+        Sorted by name.
 
     Raises
     ------
     ImageError
         If there are no images, or a pattern is given that should be recursive.
+    OSError
+        If a URL is given.
     """
-    if is_url(images):
-        return list_urls(str(images), recursive)
+    folder = local_path(images)
     if glob.has_magic(os.fspath(images)) and not os.path.exists(images):
         if recursive:
             raise ImageError(f"{images}: recursive is for a folder; write ** into the pattern")
@@ -156,7 +156,7 @@ def list_images(images: str | os.PathLike[str], recursive: bool = False) -> Sequ
         if not files:
             raise ImageError(f"{images}: no file matches; check the pattern")
         return files
-    return image_files(Path(images), recursive)
+    return image_files(folder, recursive)
 
 
 def find_lists(folder: PathLike) -> list[Path]:
@@ -182,8 +182,8 @@ def read_blocks(
     Parameters
     ----------
     source : path, array or iterable
-        A folder or its URL, an array of images (n, H, W, 3) or (n, H, W), or an iterable of files,
-        URLs, arrays of images, RGB images (H, W, 3), or ``mitsuba.Bitmap``. Pixels as for
+        A folder, an array of images (n, H, W, 3) or (n, H, W), or an iterable of files,
+        arrays of images, RGB images (H, W, 3), or ``mitsuba.Bitmap``. Pixels as for
         `eigengs_dr.image.io.check_member`. An iterator may overwrite an array when the next one is
         requested.
     size : (int, int)
@@ -340,7 +340,7 @@ def _singles(source: Iterable[FileOrImage]) -> Iterator[FileOrImage]:
     """Yield files and single images; arrays of images are split."""
     for item in source:
         if isinstance(item, str | os.PathLike):
-            yield item if is_url(item) else Path(item)
+            yield local_path(item)
         else:
             yield from _images(item)
 

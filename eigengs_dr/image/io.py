@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +17,7 @@ from ..backend.doors import checks_types
 from ..backend.messages import printable
 from ..backend.types import ArrayLike, PathLike
 from ..storage.atomic import atomic_write, refuse_url
+from ..storage.memory import SETTING, stream_limit
 from .color import to_coded, to_linear
 from .formats import BITS, SUFFIXES, write_file
 from .notes import ABOVE_WHITE, tell
@@ -27,6 +31,7 @@ from .pixels import (
     encoding_of,
     is_bitmap,
     is_drjit,
+    local_path,
     peak_of,
     reason_of,
     to_floats,
@@ -39,7 +44,6 @@ from .read import (
     read_header,
     transparency_note,
 )
-from .remote import is_copied, local_copy
 from .space import Space
 from .strips import Pixels, by_strips
 
@@ -58,9 +62,8 @@ def load_image(
     Parameters
     ----------
     path : str or Path
-        TIFF, EXR, Radiance HDR, PNG, JPEG, PGM, PPM, PFM, and files that Pillow reads. A pipe, or
-        the URL of such a file, of up to 1 GB is accepted too; URLs need fsspec, from the extra
-        ``cluster``.
+        TIFF, EXR, Radiance HDR, PNG, JPEG, PGM, PPM, PFM, and files that Pillow reads. A pipe
+        or a socket of up to 1 GB is accepted too.
     keep_grey : bool, optional
         Return one channel if the file is grey and opaque.
     upright : bool, optional
@@ -88,7 +91,7 @@ def load_image(
         would take implausibly much memory for its size; a pixel is not finite; or an EXR file holds
         one channel without `keep_grey`, or several layers.
     OSError
-        If a URL cannot be read.
+        If a pipe cannot be read, or the name is a URL, which nothing here fetches.
     """
     return read_file(path, keep_grey, upright=upright).pixels
 
@@ -104,9 +107,9 @@ def read_file(
     `encoding` overrides the default: files of floats hold linear light, others sRGB.
     """
     check_encoding(encoding)
-    if not is_copied(path):
-        return _read_local(Path(path), str(path), keep_grey, encoding, upright)
-    with local_copy(str(path)) as file:
+    if not is_pipe(path):
+        return _read_local(local_path(path), str(path), keep_grey, encoding, upright)
+    with _copy_of(path) as file:
         try:
             return _read_local(file, str(path), keep_grey, encoding, upright)
         except ImageError as error:
@@ -125,8 +128,42 @@ def _read_local(
     return EncodedImage(pixels, encoding)
 
 
+def is_pipe(name: object) -> bool:
+    """Return whether a source can be read only once: a pipe or a socket."""
+    path = Path(str(name))
+    return path.is_fifo() or path.is_socket()
+
+
+@contextmanager
+def _copy_of(name: PathLike) -> Iterator[Path]:
+    """Copy a pipe to a temporary file, which exists during the block.
+
+    Raises
+    ------
+    ImageError
+        If there are more bytes than `stream_limit`.
+    OSError
+        If it cannot be read; the message has the name.
+    """
+    limit = stream_limit()
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "image"
+        try:
+            with open(name, "rb") as pipe, file.open("wb") as copy:
+                while part := pipe.read(1 << 20):
+                    if copy.tell() + len(part) > limit:
+                        raise ImageError(
+                            f"{name}: has more than {limit / 1e6:,.0f} MB; if you trust it, set "
+                            f"{SETTING} to as many MB as it has"
+                        )
+                    copy.write(part)
+        except OSError as error:
+            raise OSError(f"{name}: cannot be read ({reason_of(error)})") from error
+        yield file
+
+
 def read_image(image: object, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
-    """Read an image from a file or a URL; add the encoding to any other image.
+    """Read an image from a file; add the encoding to any other image.
 
     For parameters and errors see `read_file` and `eigengs_dr.image.pixels.encoding_of`. Pixels
     without a known encoding count as sRGB.
@@ -178,7 +215,7 @@ def check_image(
 
     Parameters
     ----------
-    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3); or path-like or URL; or PIL image
+    image : array_like, shape (H, W), (H, W, 1) or (H, W, 3); or path-like; or PIL image
         Grey or RGB: uint8 or uint16 (scaled to [0, 1]), bool, or floats with 1 as white. sRGB may
         overshoot [0, 1] by 0.5, as in resampled images; it is not clamped. Light may have any
         finite value. The encoding of a file or a ``mitsuba.Bitmap`` is known.

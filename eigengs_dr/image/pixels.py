@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable
 from functools import partial
 from operator import index
+from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 
 from ..backend.doors import check_types
 from ..backend.messages import printable, shown, warn
-from ..backend.types import ArrayLike, Singles, Tensor
+from ..backend.types import ArrayLike, PathLike, Singles, Tensor
+from ..storage.atomic import is_url
 from ..storage.memory import ALWAYS, check_usable
 from .strips import Pixels, by_strips
 
@@ -46,6 +48,17 @@ class ImageError(ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(message))  # names in a file may hold control characters
+
+
+URL_NOTE = "is a URL; download it first, and give the file"
+"""What a user is told who gives a URL where the path of an image is expected."""
+
+
+def local_path(name: PathLike) -> Path:
+    """Return the path of an image; raise OSError for a URL, which nothing here fetches."""
+    if is_url(name):
+        raise OSError(f"{name}: {URL_NOTE}")
+    return Path(name)
 
 
 def reason_of(error: BaseException) -> str:

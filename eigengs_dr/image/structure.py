@@ -28,10 +28,12 @@ from ..backend.arrays import (
     gather_run,
     make_divisor,
     rcp,
+    types_in,
     types_of,
     upload,
 )
 from ..backend.doors import door
+from ..backend.selection import select
 from ..backend.types import Bool, Doubles, Float, Tensor, UInt, Values
 from .pixels import C1, C2, is_tensor
 
@@ -61,7 +63,7 @@ def similarity(
     weight : Dr.Jit tensor or ndarray, shape (H, W), (H, W, 1) or (H, W, C), optional
         Factors w of the SSIM of windows, at their centres; they get no derivatives.
     taps : ndarray of float64, shape (radius + 1,)
-        Half of the window along an axis, see `eigengs_dr.image.metrics.gaussian_taps`.
+        Half of the window along an axis, see `eigengs_dr.image.metrics.ssim`.
 
     Returns
     -------
@@ -86,6 +88,32 @@ def similarity(
     size = Size(height, width, channels, tuple(taps.tolist()))
     wanted = "".join(name for name, v in (("x", x), ("y", y)) if dr.grad_enabled(v))
     return dr.custom(_Similarity, x, y, factors, size, wanted)
+
+
+@door
+def plane_sums(a: Values, b: Values, weight: Values | None, taps: Doubles) -> tuple[float, float]:
+    """Sum SSIM and its contrast-structure term over all windows of two planes.
+
+    Parameters
+    ----------
+    a, b : ndarray of floats, shape (H, W)
+    weight : ndarray, shape (H, W), optional
+        Factors of both terms of windows, at their centres.
+    taps : ndarray of float64, shape (radius + 1,)
+        See `similarity`.
+
+    Returns
+    -------
+    float, float
+        Computed in double precision.
+    """
+    types = types_in(select(), 64)
+    size = Size(a.shape[0], a.shape[1], 1, tuple(taps.tolist()))
+    x, y = (_flat(types, v) for v in (a, b))
+    factors = None if weight is None else _flat(types, weight)
+    terms = compare_runs(blur_columns(x, y, size), factors, size, "")
+    similar, structure = _totals([terms.similar, terms.structure])
+    return float(similar[0]), float(structure[0])
 
 
 def _flat(types: ArrayTypes, picture: Tensor | Values) -> Float:
@@ -125,8 +153,9 @@ class _Similarity(dr.CustomOp):
     def eval(self, x: Float, y: Float, weight: Float | None, size: Size, wanted: str) -> Float:
         self.pictures, self.size, self.wanted = {"x": x, "y": y}, size, wanted
         means = blur_columns(x, y, size)
-        similar, area, self.slopes = compare_runs(means, weight, size, wanted)
-        total, area = _totals([similar, area])
+        terms = compare_runs(means, weight, size, wanted)
+        self.slopes = terms.slopes
+        total, area = _totals([terms.similar, terms.area])
         self.share = rcp(area)
         return total * self.share
 
@@ -317,9 +346,26 @@ def blur_columns(x: Float, y: Float, size: Size) -> Runs:
     return write_runs([blur_plane(plane, size.taps) for plane in (a, b, squares, products)], lanes)
 
 
-def compare_runs(
-    columns: Runs, weight: Float | None, size: Size, wanted: str
-) -> tuple[Float, Float, Runs | None]:
+class Terms(NamedTuple):
+    """What `compare_runs` finds.
+
+    Attributes
+    ----------
+    similar, structure, area : Float
+        For each lane, the sums of ``w s``, of w times the contrast-structure term of s, and of w.
+        What is not read is not computed.
+    slopes : Runs or None
+        The derivatives of the sum of ``w s`` with respect to the local means of the squares, of the
+        products, and of each wanted picture.
+    """
+
+    similar: Float
+    structure: Float
+    area: Float
+    slopes: Runs | None
+
+
+def compare_runs(columns: Runs, weight: Float | None, size: Size, wanted: str) -> Terms:
     """Blur along rows, and compute SSIM from the local means of all windows.
 
     Cost per value: 9 reads, 44 operations for the window, 40 for SSIM and its derivatives.
@@ -334,17 +380,13 @@ def compare_runs(
 
     Returns
     -------
-    similar, area : Float
-        For each lane, the sums of ``w s`` and of w.
-    slopes : Runs or None
-        The derivatives of the sum of ``w s`` with respect to the local means of the squares, of the
-        products, and of each picture in `wanted`.
+    Terms
     """
     types = types_of(columns.values)
     lanes = lanes_of(types, size.rows, size.channels, size.columns, "place channel block")
     read = columns.across(lanes, 0, BLOCK + size.reach)
     means = zip(*(blur_plane(plane, size.taps) for plane in read), strict=True)
-    similar, area = types.Float(0), types.Float(0)
+    similar, structure, area = types.Float(0), types.Float(0), types.Float(0)
     slopes = []
     for w, (x, y, squares, product) in zip(
         weights_of(types, weight, lanes, size), means, strict=True
@@ -355,6 +397,7 @@ def compare_runs(
         share = rcp(lower[0] * lower[1])
         s = upper[0] * upper[1] * share
         similar += dr.select(w > 0, w * s, 0)
+        structure += dr.select(w > 0, w * upper[1] * lower[0] * share, 0)
         area += w
         by_both = 2 * (upper[1] - upper[0]) * share
         by_energy = 2 * s * (lower[0] - lower[1]) * share
@@ -362,7 +405,7 @@ def compare_runs(
         slope = [-s * lower[0] * share, 2 * upper[0] * share, *(by_mean[n] for n in wanted)]
         slopes.append([dr.select(w > 0, w * d, 0) for d in slope])
     planes = [list(plane) for plane in zip(*slopes, strict=True)]
-    return similar, area, write_runs(planes, lanes) if wanted else None
+    return Terms(similar, structure, area, write_runs(planes, lanes) if wanted else None)
 
 
 def weights_of(types: ArrayTypes, weight: Float | None, lanes: Lanes, size: Size) -> list[Float]:

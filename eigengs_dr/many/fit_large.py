@@ -44,7 +44,7 @@ from .block import (
 )
 from .draw import block_errors
 from .grid import Block, BlockSets, allocate, choose_halo, divide
-from .manifest import ImageRow, RowProgress, described, list_sources
+from .images import ImageRow, RowProgress, described, list_sources
 from .run import figures_of, run_pieces
 from .windows import Source, open_source
 

@@ -16,7 +16,7 @@ from ..fitting.start import load_start, set_in
 from ..image.io import check_data, read_floats
 from ..image.pixels import EncodedImage
 from ..image.space import YCBCR
-from .manifest import ImageRow, Images, described, fingerprint
+from .images import ImageRow, Images, digest, fingerprint
 from .run import Job, run_images
 
 MAX_SIDE = 256
@@ -56,22 +56,19 @@ def fit_many(
     Parameters
     ----------
     images : path-like or iterable
-        A folder, a glob such as ``"photos/**/*.jpg"``, or a URL of one of them; or an iterable of
-        files, URLs and arrays (H, W, 3), (H, W, 1) or (H, W). The name of an image is the stem of
-        its file; arrays are named by their index, such as "000012". URLs need fsspec, from the
-        extra ``cluster``.
+        A folder, a glob such as ``"photos/**/*.jpg"``, or an iterable of files and arrays
+        (H, W, 3), (H, W, 1) or (H, W). The name of an image is the stem of its file; arrays are
+        named by their index, such as "000012".
     output : path-like, optional
         Folder of the results, ``NAME.npz`` for each image; it is created if it is missing. Each
-        file is written atomically. ``manifest.jsonl`` has a row for each image. By default the
-        results stay in memory.
+        file is written atomically. By default the results stay in memory.
     recursive : bool, optional
         Take images in the subfolders of a folder too; otherwise a warning names one. All images
         need names of their own.
     overwrite : bool, optional
         Fit images again whose output exists. By default these are skipped, so that repeating an
-        interrupted run continues it. Options that differ from those of existing results are an
-        error if they are given explicitly or there is work to do, otherwise a warning. A file that
-        is not a set of Gaussians is never replaced.
+        interrupted run continues it; results of other options are an error. A file that is not a
+        set of Gaussians is never replaced.
     progress : bool or callable, optional
         By default a bar, in a terminal or a notebook, after two seconds; False shows none. A
         function is called as ``progress(done, total, row)`` after every image, with its
@@ -79,7 +76,7 @@ def fit_many(
         raise `KeyboardInterrupt` to end the run.
     client : distributed.Client, optional
         Fit on the workers of this Dask cluster; None is this process. Workers read the files and
-        write the results, so they need the same file system, or URLs. On llvm the results are
+        write the results, so they need the same file system. On llvm the results are
         bit-identical for any number of workers.
     options : Any
         Keyword arguments, the options of `eigengs_dr.fit`: gaussians, iterations, target_psnr,
@@ -139,8 +136,7 @@ def fit_many(
         partial(_may_join, options=settings),
         partial(_read, options=settings),
         settings.iterations,
-        _settings_of(settings),
-        list(options),
+        _digest_of(settings),
     )
     return run_images(images, output, overwrite, job, progress, client, recursive)
 
@@ -152,18 +148,13 @@ def _read(image: Any, name: str, options: FitOptions) -> EncodedImage:
     return read_floats(image, encoding=options.encoding)
 
 
-def _settings_of(settings: FitOptions) -> dict[str, Any]:
-    """Return the options on which results depend; a start is replaced by its fingerprint."""
-    options = {name: value for name, value in vars(settings).items() if name != "backend"}
-    options |= {"method": described(settings.method), "space": settings.space or YCBCR}
-    if settings.goal:
-        options["target_psnr"] = vars(settings.goal)
-    if isinstance(settings.gaussians, tuple):
-        options["gaussians"] = list(settings.gaussians)
+def _digest_of(settings: FitOptions) -> str:
+    """Return a digest of the options on which results depend; a start counts by what it holds."""
+    options = vars(settings) | {"backend": None, "space": settings.space or YCBCR}
     if settings.start is not None:
         start: Any = settings.start
         options["start"] = fingerprint(start)
-    return options
+    return digest(options)
 
 
 def _may_join(group: list[EncodedImage], added: EncodedImage, options: FitOptions) -> bool:

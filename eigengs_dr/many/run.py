@@ -2,8 +2,8 @@
 
 `run_pieces` is the one run: pieces that an earlier call has done are not done again, the others are
 worked on, and every piece ends with its result kept. The pieces of `eigengs_dr.fit_many` are
-images, and the manifest of the folder keeps their rows; those of `eigengs_dr.fit_large` are blocks,
-whose Gaussians a checkpoint keeps.
+images, whose results are files of a folder; those of `eigengs_dr.fit_large` are blocks, whose
+Gaussians a checkpoint keeps.
 
 In this process, a run over images reads ahead and writes results in the background. On a cluster,
 each task is such a run over a chunk of images. Chunks depend on the images only, never on timings,
@@ -17,7 +17,7 @@ import os
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -31,7 +31,6 @@ from ..backend.executor import Executor
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import warn
 from ..backend.recording import exclusive
-from ..backend.types import Record
 from ..cluster import executor_for
 from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write_set
@@ -42,8 +41,8 @@ from ..image.metrics import psnr
 from ..image.notes import NotedImages, kept_notes, series, tell_all
 from ..image.pixels import EncodedImage
 from ..raster.render import render
-from ..storage.atomic import lock_folder, refuse_url
-from .manifest import ImageRow, Images, Manifest, RowProgress, RunImage, list_sources, open_manifest
+from ..storage.atomic import lock_folder, refuse_url, remove_stale
+from .images import ImageRow, Images, RowProgress, RunImage, find_result, list_sources
 
 WRITERS = 2
 """Number of threads that compress and write results: 5,000 Gaussians take 6 ms."""
@@ -109,10 +108,8 @@ class Job(NamedTuple):
         ``read(image, name)`` reads an image, whose warnings name it so if it is no file.
     steps : int
         Number of descent steps per image, as a measure of the work.
-    options : dict or None
-        Options on which the results depend, with values that JSON can hold.
-    given : collection of str
-        Names of the options that the caller gave explicitly.
+    options : str
+        Digest of the options on which the results depend.
     measures : bool
         Whether results are sets without figures, whose pictures are compared with the images.
     """
@@ -121,8 +118,7 @@ class Job(NamedTuple):
     may_join: Callable[[list[EncodedImage], EncodedImage], bool] | None = None
     read: Callable[[Any, str], EncodedImage] = lambda image, name: read_floats(image)
     steps: int = 0
-    options: Record | None = None
-    given: Collection[str] = ()
+    options: str = ""
     measures: bool = False
 
 
@@ -143,18 +139,19 @@ def run_images(
     total = len(sources) if isinstance(sources, list) else None
     executor = None if client is None else executor_for(client)
     rows: dict[int, ImageRow] = {}
+    earlier: dict[int, ImageRow | None] = {}
 
     def find(source: RunImage) -> ImageRow | None:
+        if source.place in earlier:
+            return earlier[source.place]
         if source.error:
             return source._replace(output=None).row("failed", error=source.error)
-        return manifest.find(source) if manifest else None
+        return find_result(source, job.options, overwrite)
 
     def end(source: RunImage, row: ImageRow) -> None:
         if row.error:
             row = replace(row, result=None)
-        if manifest:
-            manifest.add(row)
-        rows[source.place] = replace(row, result=None) if manifest else row
+        rows[source.place] = row if output is None else replace(row, result=None)
         if progress:
             progress(len(rows), total, row)
 
@@ -164,10 +161,12 @@ def run_images(
         return run_on_workers(unfinished, job, executor, total, keep=output is None)
 
     with ExitStack() as stack:
-        manifest: Manifest | None = None
         if output is not None:
-            opened = open_manifest(make_folder(output), job.options, job.given, overwrite)
-            manifest = stack.enter_context(opened)
+            folder = make_folder(output)
+            stack.enter_context(lock_folder(folder))
+            remove_stale(folder)
+            if isinstance(sources, list):  # results of other options are refused before any work
+                earlier = {source.place: find(source) for source in sources}
         stack.enter_context(series())
         try:
             run_pieces(sources, find, work, end)
@@ -175,8 +174,6 @@ def run_images(
             done = [rows[place] for place in sorted(rows)]
             message = f"interrupted after {len(done)} images; .result holds their rows"
             raise Interrupted(done, message) from None
-    if manifest and manifest.conflict:
-        warn(manifest.conflict)
     return [rows[place] for place in sorted(rows)]
 
 
@@ -246,7 +243,8 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
                     file = None
                     if gaussians is not None and row.output:
                         # Only this thread uses Dr.Jit: the writers get NumPy arrays.
-                        file = pool.submit(write_set, row.output, gaussians.data(), figures_of(row))
+                        figures = figures_of(row, job.options)
+                        file = pool.submit(write_set, row.output, gaussians.data(), figures)
                     writing.append((source, row, file))
                     while writing and (len(writing) > MAX_WRITING or is_written()):
                         yield _finish(*writing.popleft())
@@ -315,12 +313,10 @@ def _work_on(
         yield source, source.row("done", seconds=seconds, result=result, **figures), gaussians
 
 
-def figures_of(row: ImageRow) -> FitFigures | None:
-    """Return the figures that are stored in the file of a fit."""
-    if row.psnr_ycbcr is None or row.psnr_rgb is None or row.iterations is None:
-        return None
+def figures_of(row: ImageRow, options: str = "") -> FitFigures:
+    """Return the figures that are stored in the file of a result."""
     name = "" if row.input is None else Path(row.input).name
-    return FitFigures(row.psnr_ycbcr, row.psnr_rgb, row.iterations, name)
+    return FitFigures(row.psnr_ycbcr, row.psnr_rgb, row.iterations, name, options)
 
 
 def _results(images: list, job: Job) -> list:
@@ -368,9 +364,6 @@ MAX_CHUNK_IMAGES = 256
 
 SETUP_STEPS = 10
 """Number of descent steps that take as long as the work before the first step."""
-
-URL_PIXELS = 1 << 16
-"""Assumed number of pixels of an image at a URL, whose size is unknown."""
 
 WORK_PER_BYTE = 8
 """Minimum work per byte of an array: the scheduler keeps a copy of at most 16 MB until the chunk is
@@ -486,7 +479,5 @@ def _work_of(source: RunImage, steps: int) -> int:
     if source.path is None:
         pixels = math.prod(source.image.shape[:2])
         return max(pixels * steps, WORK_PER_BYTE * source.image.nbytes)
-    if isinstance(source.path, str):
-        return URL_PIXELS * steps
     # Errors of a file are left to the worker.
     return source.path.stat().st_size * steps if source.path.is_file() else 0

@@ -18,11 +18,10 @@ from numpy.typing import DTypeLike, NDArray
 from ..backend.types import Record, Values
 from ..gaussian.file import MAX_SET_SIDE
 from ..image.formats import check_room, raise_reason
-from ..image.io import ImageError, check_data, check_image, pixels_of, read_file
+from ..image.io import ImageError, check_data, check_image, is_pipe, pixels_of, read_file
 from ..image.notes import tell
-from ..image.pixels import encoding_of
+from ..image.pixels import encoding_of, local_path
 from ..image.read import decode, has_windows, read_header, read_window, transparency_note
-from ..image.remote import is_copied
 
 Pixels = Values
 """Pixels (h, w) or (h, w, channels) of any dtype."""
@@ -130,11 +129,12 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
         If there is no such file, it is not an image, or the shape or the size is wrong.
     """
     source = pixels_of(source)
-    if isinstance(source, (str, os.PathLike)) and is_copied(source):
-        source, encoding = read_file(str(source), keep_grey, encoding)
+    if isinstance(source, (str, os.PathLike)) and is_pipe(source):
+        source, encoding = read_file(source, keep_grey, encoding)
     if isinstance(source, (str, os.PathLike)):
-        name, identity = str(source), _identity(Path(source))
-        shape, pixels, file_encoding = _open_file(Path(source), keep_grey)
+        name, file = str(source), local_path(source)
+        identity = _identity(file)
+        shape, pixels, file_encoding = _open_file(file, keep_grey)
         encoding = encoding or file_encoding
     elif hasattr(source, "shape") and hasattr(source, "dtype"):
         name, shape, pixels = "image", tuple(int(side) for side in source.shape), source
@@ -205,12 +205,12 @@ TILE_SIDE = 256
 """Side of the tiles of files that `write_tiles` writes, in pixels."""
 
 
-def image_size(path: Path | str) -> tuple[int, int, int] | None:
+def image_size(path: Path) -> tuple[int, int, int] | None:
     """Return height, width and channels (1 or 3) from the header of an image file.
 
-    None for a URL or a pipe, which can be read only once, and for a file that is not an image.
+    None for a pipe, which can be read only once, and for a file that is not an image.
     """
-    if is_copied(path):
+    if is_pipe(path):
         return None
     try:
         header = read_header(Path(path))

@@ -239,7 +239,9 @@ def residual(
 def difference(
     image: Float, lists: TileLists, target: Float | None, curvature: Float | None = None
 ) -> tuple[Float, list]:
-    """Compare an image from `image_of` with another one, as `residual` does; a lane owns a pixel.
+    """Compare an image from `image_of` with another one, as `residual` does.
+
+    A lane owns a row of pixels of a tile, whose values it reads and writes in packets.
 
     Returns
     -------
@@ -248,25 +250,29 @@ def difference(
         For each channel, the sums of ``h e^2`` over the pixels of each image.
     """
     types, grid = types_of(image), lists.grid
-    number = grid.tiles * grid.pixels
-    pixel, channels = dr.arange(types.UInt, number), dr.width(image) // number
+    (length, height), number = grid.tile, grid.tiles * grid.pixels
+    row, channels = dr.arange(types.UInt, grid.tiles * height), dr.width(image) // number
 
     def load(values: Float) -> list:
-        return gather_run(types, values, pixel, dr.width(values) // number, True)
+        return gather_run(types, values, row, length * (dr.width(values) // number), True)
 
     errors = load(image)
     if target is not None:
         errors = [s - t for s, t in zip(errors, load(target), strict=True)]
     if grid.overhangs:
-        inside = pixels_inside(types, grid) > 0
-        errors = [dr.select(inside, e, 0) for e in errors]
+        column, first = lists.sizes.first_pixel(row // height)
+        is_inside = first + row % height < lists.sizes.height
+        for k in range(length * channels):
+            inside = is_inside & (column + k // channels < lists.sizes.width)
+            errors[k] = dr.select(inside, errors[k], 0)
     deltas = errors
     if curvature is not None:
         factors = load(curvature)
-        deltas = [e * factors[k * len(factors) // channels] for k, e in enumerate(errors)]
+        share = len(errors) // len(factors)
+        deltas = [e * factors[k // share] for k, e in enumerate(errors)]
     delta = dr.empty(types.Float, number * channels)
-    dr.scatter(delta, types.FloatX(deltas), pixel)
-    squares = [e * d for e, d in zip(errors, deltas, strict=True)]
+    dr.scatter(delta, types.FloatX(deltas), row)
+    squares = sum_channels([e * d for e, d in zip(errors, deltas, strict=True)], channels)
     dr.eval(delta, squares)  # together: later, the sums would read all again
     return delta, [sum_by_image(s, grid) for s in squares]
 

@@ -33,12 +33,11 @@ from ..fitting.objective import Channels, Target
 from ..fitting.options import FitOptions
 from ..fitting.problem import Problem
 from ..image.color import MAX_CHANNELS
-from ..image.io import codes_of, read_file, read_photo
+from ..image.io import codes_of, is_pipe, read_file, read_photo
 from ..image.metrics import psnr_from_mse
 from ..image.notes import series
 from ..image.pixels import ImageError, check_encoding
 from ..image.read import read_header
-from ..image.remote import is_copied
 from ..image.space import DATA
 from ..storage.memory import check_usable
 from .lights import (
@@ -177,7 +176,7 @@ def _stacked(photos: Sequence[object], lights: Doubles, encoding: str | None) ->
 
 def _is_turned(photo: object) -> bool:
     """Return whether a photo is a file whose EXIF orientation turns it."""
-    if not isinstance(photo, (str, os.PathLike)) or is_copied(photo):
+    if not isinstance(photo, (str, os.PathLike)) or is_pipe(photo):
         return False
     header = read_header(Path(photo), upright=False)
     return header.orientation != 1 and not header.upright

@@ -23,7 +23,6 @@ from ..backend.messages import printable, warn
 from ..backend.types import ArrayLike, Doubles, Float, PathLike
 from ..image.folder import find_lists as find_lists
 from ..image.pixels import ImageError
-from ..image.remote import is_url
 from ..storage.memory import open_regular
 from ..storage.npz import BadValue
 
@@ -140,10 +139,11 @@ def _lines(path: PathLike) -> list[str]:
 
 def _parts(name: PathLike) -> list[str]:
     """Return the folders and the name of a path of any system; those above it are left out."""
-    text = os.fspath(name)
-    if is_url(text):
-        text = text.partition("::")[0].partition("?")[0]
-    return [part for part in text.replace("\\", "/").split("/") if part not in ("", ".", "..")]
+    return [
+        part
+        for part in os.fspath(name).replace("\\", "/").split("/")
+        if part not in ("", ".", "..")
+    ]
 
 
 def _in_folder(folder: Path, names: list[list[str]], path: PathLike) -> list[Path]:

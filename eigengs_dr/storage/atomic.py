@@ -143,13 +143,18 @@ def require_writable(path: str | os.PathLike[str]) -> None:
         pass
 
 
+def is_url(name: object) -> bool:
+    """Return whether a name is a URL, such as ``s3://bucket/a.png``."""
+    return isinstance(name, str) and "://" in name
+
+
 def refuse_url(path: str | os.PathLike[str]) -> None:
     """Raise OSError if a file or a folder to write is a URL.
 
     Object stores can neither rename a file in one step nor lock a folder, so that writes would not
     be atomic.
     """
-    if isinstance(path, str) and "://" in path:
+    if is_url(path):
         raise OSError(f"{path}: results cannot be written to URLs; write to a folder and copy it")
 
 

@@ -18,8 +18,8 @@ As floats, an 8-bit photo takes 8 times the size of its PNG and up to 60 times t
 TIFF of 2 MB can claim 8 GB."""
 
 
-MAX_DOWNLOAD = 1 << 30
-"""Largest number of bytes of a download or of a pipe, which are copied to disk."""
+MAX_STREAM = 1 << 30
+"""Largest number of bytes of a pipe, which is copied to disk."""
 
 
 def usable_memory(root: Path = Path("/")) -> int | None:
@@ -132,9 +132,9 @@ def open_regular(path: str | os.PathLike[str], once: bool = False) -> BinaryIO:
     return open(path, "rb")
 
 
-def download_limit() -> int:
-    """Return the largest size of a download or a pipe in bytes: `SETTING`, or `MAX_DOWNLOAD`."""
-    return _setting() or MAX_DOWNLOAD
+def stream_limit() -> int:
+    """Return the largest size of a pipe in bytes: `SETTING`, or `MAX_STREAM`."""
+    return _setting() or MAX_STREAM
 
 
 def _setting() -> int | None:

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import eigengs_dr as eg
 from _helpers.families import family
 
 pytest.importorskip("eigengs_bench", reason="pip install ./benchmarks")
 
 from eigengs_bench.names import SETS, ImageSet
 from eigengs_bench.rows import Task
-from eigengs_dr.image.io import save_image
 
 RUN = {
     "command": "eigengs-dr bench tables",
@@ -38,7 +38,7 @@ def data(tmp_path, monkeypatch):
         for k, image in enumerate(family(16, seed=seed)):
             path = folder / name / ("test" if k < 2 else "train")
             path.mkdir(parents=True, exist_ok=True)
-            save_image(path / f"{k:02}.png", image)
+            eg.save_image(path / f"{k:02}.png", image)
         monkeypatch.setitem(SETS, name, ImageSet(name, 32, 32, 60))
     return folder
 
@@ -63,3 +63,10 @@ def lines_of(table):
 def one_image(seed=5):
     """An image of 32x32 pixels."""
     return np.asarray(family(1, side=32, seed=seed)[0])
+
+
+def smaller(monkeypatch, *modules, **values):
+    """Give the numbers of a benchmark, which are those of a measurement, the size of a test."""
+    for module in modules:
+        for name in vars(module).keys() & values.keys():
+            monkeypatch.setattr(module, name, values[name])

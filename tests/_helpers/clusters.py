@@ -1,19 +1,18 @@
-"""Tasks for workers, which import this module by its name, and pictures for them."""
+"""Placements that act on workers, which import this module by its name, and pictures for them."""
 
 import os
+import resource
 import signal
 import sys
 import threading
-import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-try:
-    from distributed import WorkerPlugin
-except ImportError:
-    WorkerPlugin = object
+import eigengs_dr as eg
 
 from .command import smooth_pixels
 
@@ -32,64 +31,95 @@ def folder_of_photos(folder, count, width=32, height=24):
 
 def files_of(folder):
     """The bytes of the arrays of every result, by name."""
-    found = {}
-    for path in sorted(Path(folder).glob("*.npz")):
+    contents = {}
+    for path in sorted(Path(folder).glob("[!.]*.npz")):
         with np.load(path) as arrays:
-            found[path.name] = {key: arrays[key].tobytes() for key in arrays}
-    return found
+            contents[path.name] = {key: arrays[key].tobytes() for key in arrays}
+    return contents
 
 
-def add(task, shared):
-    """A task that needs nothing."""
-    return task + shared
+@dataclass(frozen=True)
+class FirstCall:
+    """A placement that begins by a call, with a path, in the process that fits."""
+
+    function: Callable
+    path: Path | None = None
+    has_colors = False
+
+    def __call__(self, objective, count, cutoff, seed):
+        self.function(self.path)
+        return eg.DEFAULT.place(objective, count, cutoff, seed)
 
 
-def process_of(task, shared):
-    return os.getpid()
+def die(path):
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
-def fail(task, shared):
-    raise ValueError(f"task {task}")
+class Deadly(np.ndarray):
+    """An image that ends every process that it is sent to."""
+
+    def __reduce__(self):
+        return die, (None,)
 
 
-def die_once(task, shared):
-    """End the process at the first try of one task; `shared` names a folder."""
-    mark = Path(shared) / "died"
-    if task == 1 and not mark.exists():
-        mark.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return task
+def fill_disk(mark):
+    """Let this process write no more than some bytes to a file, at the first try alone."""
+    size = resource.RLIM_INFINITY if mark.exists() else 100
+    mark.touch()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 
-def state(task=None, shared=None):
-    """What belongs to this process: as a task, what it is meanwhile."""
-    import multiprocessing
-
+def note_task(path):
+    """Write down what a task has of its process."""
     import drjit as dr
+    from distributed import get_worker
     from threadpoolctl import threadpool_info
 
-    return {
-        "threads": dr.thread_count(),
-        "blas": {pool["num_threads"] for pool in threadpool_info()},
-        "interrupt": signal.getsignal(signal.SIGINT) == signal.SIG_IGN,
-        "start": multiprocessing.get_start_method(),
-        "malloc": os.environ.get("MALLOC_TRIM_THRESHOLD_"),
-        "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"),
-    }
+    watched = threading.get_ident() in get_worker().active_threads
+    blas = max(pool["num_threads"] for pool in threadpool_info())
+    path.write_text(f"{dr.thread_count()} thread of Dr.Jit, {blas} of BLAS, watched: {watched}")
+
+
+class Witness:
+    """A value that writes down whether it was freed by the thread that made it."""
+
+    def __init__(self, path):
+        self.path, self.thread = path, threading.get_ident()
+
+    def __del__(self):
+        same = threading.get_ident() == self.thread
+        self.path.write_text(f"by {'the thread of the task' if same else 'another thread'}")
+
+
+def fail_with(path):
+    """Fail while a variable, and one of the cause, hold something."""
+    witness = Witness(path)
+    try:
+        int("a")
+    except ValueError as error:
+        raise RuntimeError("failed on purpose") from error
+    return witness
 
 
 def worker_state(dask_worker):
     """What belongs to this worker, and to its process."""
     import dask
+    import drjit as dr
+    from threadpoolctl import threadpool_info
 
     memory = dask_worker.memory_manager
-    return state() | {
+    return {
+        "threads": dr.thread_count(),
+        "blas": {pool["num_threads"] for pool in threadpool_info()},
+        "interrupt": signal.getsignal(signal.SIGINT),
         "plugins": sorted(dask_worker.plugins),
         "config": repr(dask.config.config),
-        "pause": memory.memory_pause_fraction,
-        "spill": memory.memory_spill_fraction,
-        "target": memory.memory_target_fraction,
-        "limit": memory.memory_limit,
+        "limits": [
+            memory.memory_limit,
+            memory.memory_pause_fraction,
+            memory.memory_spill_fraction,
+            memory.memory_target_fraction,
+        ],
     }
 
 
@@ -98,119 +128,19 @@ def held_types(dask_worker):
     return {type(value).__name__ for value in dask_worker.data.values()}
 
 
-class Traveller:
-    """A value that notes where it was pickled: processes, and whether in their main threads."""
+def claim_version(folder, name, version):
+    """Let this process say that a package has another version."""
+    from distributed import versions
 
-    def __init__(self, *places):
-        self.places = places
-
-    def __reduce__(self):
-        here = os.getpid(), threading.current_thread() is threading.main_thread()
-        return Traveller, (*self.places, here)
-
-
-def is_watched(task, shared):
-    """Whether Dask's profiler takes the frames of this task."""
-    from distributed import get_worker
-
-    return threading.get_ident() in get_worker().active_threads
+    metadata = Path(folder) / f"{name}-{version}.dist-info" / "METADATA"
+    metadata.parent.mkdir(exist_ok=True)
+    metadata.write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    sys.path.insert(0, folder)
+    versions._version_cached.cache_clear()
 
 
-def travel(task, shared):
-    return shared
+def leave_version(folder):
+    from distributed import versions
 
-
-class Witness:
-    """A value that writes down whether it was freed in the main thread."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __del__(self):
-        Path(self.path).write_text(str(threading.current_thread() is threading.main_thread()))
-
-
-def fail_with(task, shared):
-    """Fail while a variable, and one of the cause, hold something."""
-    witness = Witness(shared)
-    try:
-        int(task)
-    except ValueError as error:
-        raise OSError(f"task {task}") from error
-    return witness
-
-
-def replace_package(package):
-    """Let this process have another package of this name, or none."""
-    sys.kept_package, sys.modules["eigengs_dr"] = sys.modules["eigengs_dr"], package
-
-
-def restore_package():
-    sys.modules["eigengs_dr"] = sys.kept_package
-
-
-def patch_write(replacement):
-    """Replace the function that writes results, in this process."""
-    from eigengs_dr.gaussian.file import write_set
-    from eigengs_dr.many import run
-
-    run.write_set = lambda *arguments: replacement(write_set, *arguments)
-
-
-def mend_writes():
-    """Write results again, in this process."""
-    from eigengs_dr.gaussian.file import write_set
-    from eigengs_dr.many import run
-
-    run.write_set = write_set
-
-
-def slow_writes():
-    """Let every write of a result take long, in this process."""
-
-    def slow(write_set, *arguments):
-        time.sleep(0.5)
-        write_set(*arguments)
-
-    patch_write(slow)
-
-
-class DieInWrite(WorkerPlugin):
-    """Let a worker end while it writes one result, with half a file."""
-
-    def __init__(self, name):
-        self.file = name
-
-    def setup(self, worker):
-        def die(write_set, path, *arguments):
-            if path.name == self.file:
-                path.with_name(".eigengs_dr-0123456789abcdef.npz").write_bytes(b"half")
-                os.kill(os.getpid(), signal.SIGKILL)
-            write_set(path, *arguments)
-
-        patch_write(die)
-
-
-class Here:
-    """An executor that runs tasks in this process, in an order as bad as a cluster's."""
-
-    workers = 2
-
-    def __init__(self, lost=()):
-        self.lost = set(lost)
-        self.tasks = []
-
-    @property
-    def names(self):
-        """Names of the images of each task."""
-        return [[source.name for source in task] for task in self.tasks]
-
-    def map(self, function, tasks, shared=None):
-        from eigengs_dr.backend.executor import Done
-
-        for task in reversed(list(tasks)):
-            self.tasks.append(task)
-            if self.lost and self.lost & set(self.names[-1]):
-                yield Done(task, None, "its worker ended 2 times")
-            else:
-                yield Done(task, function(task, shared))
+    sys.path.remove(folder)
+    versions._version_cached.cache_clear()

@@ -39,19 +39,22 @@ def exact_at(scene, points, cutoff, margin=1e-4):
     return weight @ scene.color, off_edge
 
 
-def check_gradient(loss, scene, name, backend):
-    """Check the gradient of ``loss(gaussians)`` in float64 along a random direction."""
-    gaussians = scene.on(backend, bits=64)
-    field = getattr(gaussians, name)
-    dr.enable_grad(field)
+def check_gradient(loss, scene, backend):
+    """Check the gradient of ``loss(gaussians)`` in float64 along random directions."""
+    gaussians, names = scene.on(backend, bits=64), ("mean", "factor", "color")
+    for name in names:
+        dr.enable_grad(getattr(gaussians, name))
     dr.backward(loss(gaussians))
-    found = np.array(dr.grad(field)).T
-    direction = np.random.default_rng(1).normal(size=found.shape)
-    moved = [scene._replace(**{name: getattr(scene, name) + s * 1e-5 * direction}) for s in (1, -1)]
-    up, down = (np.array(loss(m.on(backend, bits=64))).item() for m in moved)
-    expected = (up - down) / 2e-5
-    assert abs(expected) > 1e-3
-    assert (found * direction).sum() == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    for name in names:
+        found = np.array(dr.grad(getattr(gaussians, name))).T
+        direction = np.random.default_rng(1).normal(size=found.shape)
+        up, down = (
+            np.array(loss(scene._replace(**{name: moved}).on(backend, bits=64))).item()
+            for moved in (getattr(scene, name) + step * direction for step in (1e-5, -1e-5))
+        )
+        expected = (up - down) / 2e-5
+        assert abs(expected) > 1e-3, name
+        assert (found * direction).sum() == pytest.approx(expected, rel=1e-4, abs=1e-6), name
 
 
 def tiled(scene, wrap, copies=3):

@@ -3,10 +3,9 @@
 from functools import cache
 
 import numpy as np
+from skimage.color import rgb2ycbcr
 
-from eigengs_dr.eigenbasis.basis import Eigenbasis
-from eigengs_dr.image.io import check_image
-from eigengs_dr.image.space import to_planes
+import eigengs_dr as eg
 
 WIDTH, HEIGHT = SIZE = (14, 11)
 PIXELS = WIDTH * HEIGHT
@@ -24,8 +23,10 @@ def family(count=60, directions=20, noise=0.004, seed=0, size=SIZE):
 
 
 def planes(images, space="ycbcr"):
-    """Images as planes of their channels, shape (count, 3, pixels)."""
-    return np.stack([to_planes(check_image(image), space) for image in images])
+    """Images as planes of their channels in float64, shape (count, 3, pixels)."""
+    images = images.astype(np.float64)
+    values = rgb2ycbcr(images) / 255 if space == "ycbcr" else images
+    return np.moveaxis(values, 3, 1).reshape(len(images), 3, -1)
 
 
 def assert_same(a, b):
@@ -41,4 +42,4 @@ def assert_same(a, b):
 @cache
 def basis_of(space):
     """Components of `family`: 12 of the first channel, 5 of the others."""
-    return Eigenbasis.from_images(family(), SIZE, (12, 5, 5), space=space)
+    return eg.Eigenbasis.from_images(family(), SIZE, (12, 5, 5), space=space)

@@ -8,11 +8,6 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.families import family
-from eigengs_dr.codec.quantization import Steps
-
-STEPS = Steps(0.03125, 0.25)
-SPACES = [("ycbcr", 3), ("rgb", 1), ("rgb", 4), ("linear", 3), ("data", 2)]
-"""Spaces of colours, and numbers of channels."""
 
 
 @cache

@@ -1,6 +1,10 @@
-"""The sum of Gaussians in float64."""
+"""The sum of Gaussians in float64, and what YCbCr stands for."""
 
 import numpy as np
+
+FROM_YCBCR = np.array([[255, 0, 349.53], [255, -85.796, -178.04], [255, 441.774, 0]]) / 219
+BLACK = np.array([16, 128, 128]) / 255
+"""YCbCr of BT.601: Y from 16 to 235, Cb and Cr from 16 to 240."""
 
 
 def render_exact(

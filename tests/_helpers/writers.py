@@ -78,6 +78,13 @@ def shortened(limit):
         resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
 
 
+def write_sets(photos, out):
+    """Fit a folder of one image, and raise what its row says."""
+    [row] = eg.fit_many(photos, out, gaussians=4, iterations=1, progress=False)
+    if row.error:
+        raise OSError(row.error)
+
+
 def fill(folder, limit):
     """What writers say where no file may be longer than a limit in bytes, and what they leave.
 
@@ -86,9 +93,7 @@ def fill(folder, limit):
     (folder / "photos").mkdir(parents=True)
     functions, said = writers(folder), {}
     eg.save_image(folder / "photos" / "a.png", eg.sample("chelsea")[100:132, 150:182])
-    functions["sets"] = lambda out: eg.fit_many(
-        folder / "photos", out, gaussians=4, iterations=1, progress=False
-    )
+    functions["sets"] = lambda out: write_sets(folder / "photos", out)
     for name, write in functions.items():
         out, longest = folder / name, limit
         if limit < 0:

@@ -1,23 +1,14 @@
-"""Rows of benchmarks, of which code they are, and the report; programs in turns, images, models."""
+"""Rows of benchmarks, of which code they are, and the images that are measured."""
 
-import os
 import subprocess
-import sys
-from functools import partial
 
 import numpy as np
 import pytest
 
-from _helpers.benchmarks import RUN, data, one_image, row, task_in  # noqa: F401  data is a fixture
-from _helpers.command import assert_refused, run, succeeded
-from _helpers.families import family
-from eigengs_bench import clock, images, rows
-from eigengs_bench import report as fr
-from eigengs_bench.names import PRESETS as NAMES
+import eigengs_dr as eg
+from _helpers.benchmarks import RUN, data, row, task_in  # noqa: F401  data is a fixture
+from eigengs_bench import images, report, rows
 from eigengs_bench.names import SETS, ImageSet
-from eigengs_bench.pictures import _curves_chart
-from eigengs_dr.cli.fit import PRESETS as COMMANDS
-from eigengs_dr.image.io import ImageError, save_image
 
 OTHER = {**RUN, "commit": "b" * 40}
 DIRTY = {**RUN, "clean": False}
@@ -82,7 +73,7 @@ def test_a_damaged_line_is_named(tmp_path, line):
 
 def test_sources_name_every_command_and_its_code():
     runs = [RUN, OTHER, DIRTY, {**RUN, "commit": None}]
-    lines = fr.sources_of([row({}, run) for run in runs])
+    lines = report.sources_of([row({}, run) for run in runs])
     codes = [
         "commit aaaaaaaaa",
         "commit bbbbbbbbb",
@@ -114,92 +105,14 @@ def test_the_commit_is_that_of_the_package(tmp_path):
     assert rows.code_state(package) == {"commit": state["commit"], "clean": False}
 
 
-def test_memory_is_that_of_a_process_alone():
-    assert 0.02 < rows.alone("it", rows.peak_gib)() < rows.peak_gib() + 1
-    with pytest.raises(ValueError, match="it: its process was killed"):
-        rows.alone("it", sys.modules["os"]._exit, 9)()
-
-
-def test_the_report_has_what_rows_answer(tmp_path):
-    report = ("bench", "report", tmp_path, "-o", tmp_path / "out")
-    assert_refused(run(*report), "holds no rows")
-    job = {"image": "a", "gaussians": 5000, "iterations": 1000, "timed": True}
-    figures = {"psnr_float": 33.0, "psnr_rgb": 32.9, "ms_ssim": 0.9, "seconds": 9.0}
-    task_in(tmp_path).measure("kodak", [(job, lambda: figures)])
-    succeeded(run(*report))
-    text = (tmp_path / "out" / "README.md").read_text()
-    assert "| 5,000" in text and "33.00" in text and "GaussianImage" in text
-    assert "commit aaaaaaaaa" in text and "a CPU" in text
-    assert (tmp_path / "out" / "kodak-gaussians.svg").read_bytes()[:5] == b"<?xml"
-
-
-def test_mistakes_are_told_before_the_work(tmp_path):
-    (tmp_path / "file").touch()
-    for command in ("pareto", "rate", "number", "stability", "pictures", "tables"):
-        assert_refused(run("bench", command, "-o", tmp_path / "file"), "File exists")
-    output = ["-o", tmp_path / "out"]
-    assert_refused(run("bench", "pareto", *output, "--set", "kodak"), "needs DATA")
-    said = "case 'nothing' is unknown; use one of photo, constant"
-    assert_refused(run("bench", "stability", *output, "--case", "nothing"), said)
-
-
-# --- Programs in turns, sets of images and their models ---
-
-
-def test_nothing_to_measure_is_told(tmp_path):
-    ended = run("bench", "tables", "-o", tmp_path, "--table", "ablation")
-    assert_refused(ended, "leave nothing to measure")
-
-
-def test_curves_are_those_of_the_longest_fits():
-    fits = []
-    for preset, count in zip((*NAMES, NAMES[0]), (3, 3, 3, 2), strict=True):
-        job = {"set": "samples", "preset": preset, "iterations": count}
-        fits.append({"job": job, "marks": [*range(count)], "psnr_ycbcr": [20.0] * count})
-    lines = _curves_chart(fits).axes[0].lines
-    assert [len(line.get_xdata()) for line in lines] == [3, 3, 3]
-
-
-def test_methods_have_the_names_of_the_command_line():
-    assert tuple(clock.METHODS) == NAMES == COMMANDS
-
-
-def test_programs_take_turns():
-    order, seen = [], []
-    programs = {name: partial(order.append, name) for name in "ab"}
-    ms = clock.interleaved(programs, 1, 2, lambda *step: seen.append(step))
-    assert "".join(order) == "ababab" and seen == [(1, 3), (2, 3), (3, 3)]
-    assert set(ms) == {"a", "b"} and all(value >= 0 for value in ms.values())
-
-
-def test_programs_apart_have_a_process_each():
-    makers = {"a": partial(partial, os.getpid)}
-    ms = clock.interleaved_apart(makers, 0, 1)
-    assert ms.keys() == {"a"} and ms["a"] >= 0
-    assert clock.KEPT == []  # the programs are in other processes
-
-
 def test_images_are_the_first_ones_at_the_size_of_their_set(tmp_path, monkeypatch):
     monkeypatch.setitem(SETS, "kodak", ImageSet("photos", 30, 20, 50))
     (tmp_path / "photos").mkdir()
     for name, shape in (("b", (40, 20, 3)), ("a", (40, 60, 3)), ("c", (9, 9, 3))):
-        save_image(tmp_path / "photos" / f"{name}.png", np.full(shape, 0.5))
+        eg.save_image(tmp_path / "photos" / f"{name}.png", np.full(shape, 0.5))
     task = task_in(tmp_path, data=tmp_path, images=2)
     shapes = {name: image.shape for name, image in images.images_of(task, "kodak")}
     assert shapes == {"a.png": (20, 30, 3), "b.png": (30, 20, 3)}
     assert [name for name, _ in images.images_of(task, "samples", 1)] == ["chelsea"]
-    with pytest.raises(ImageError, match="cars256"):
+    with pytest.raises(eg.ImageError, match="cars256"):
         images.images_of(task, "cars256")
-
-
-def test_models_are_trained_once_on_the_training_images(tmp_path, backend, data):  # noqa: F811
-    arguments = (task_in(tmp_path, backend, data), "cats256", "natural256", 4, "rgb")
-    model = images.model_for(*arguments, True)
-    assert model.components == (4, 4, 4)
-    assert len(model.gaussians) == 60 and model.low == 6 and model.gaussians.space == "rgb"
-    expected = family(16, seed=1)[2:].mean(axis=(0, 1, 2))
-    assert np.allclose(model.mean_image.mean(axis=(1, 2)), expected, atol=5e-3)
-    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "models").iterdir()}
-    images.model_for(*arguments, True)
-    images.model_for(*arguments)  # another model of the same basis
-    assert files.items() <= {p: p.stat().st_mtime_ns for p in files}.items() and len(files) == 2

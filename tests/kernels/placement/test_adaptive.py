@@ -5,14 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import eigengs_dr as eg
-from _helpers.halves import objective_of
-from _helpers.placements import check_placement, covariances_of, generator, images_and_counts
 from _helpers.sets import few
-from eigengs_dr.backend.arrays import types_in
-from eigengs_dr.backend.selection import select
+from _oracles.objectives import objective_of
+from _oracles.placements import check_placement, covariances_of, generator, images_and_counts
 from eigengs_dr.codec.range_coder import hilbert_encode
-from eigengs_dr.fitting.objective import Pixels
+from eigengs_dr.fitting.place import Adaptive, Grid, Random
 from eigengs_dr.fitting.placement.adaptive import (
     MAX_STRETCH,
     RELATIVE_SIZE,
@@ -21,19 +18,32 @@ from eigengs_dr.fitting.placement.adaptive import (
     density_from_hessian,
     normalized,
     place_adaptive,
-    planes_of,
     shapes_from_hessian,
-    shrunk,
 )
-from eigengs_dr.fitting.placement.curve import hilbert_curve, order_along_hilbert
-from eigengs_dr.image.space import DATA
+from eigengs_dr.fitting.placement.curve import hilbert_curve
+from eigengs_dr.paper.gaussianimage import RandomColors
 
 
-def placed(image, count, backend="llvm", density=None):
+def placed(image, count):
     """Means (N, 2) and factors (N, 3)."""
-    objective = objective_of(image, backend, "data")
-    arrays = place_adaptive(objective, count, density=density).to_arrays()
+    arrays = place_adaptive(objective_of(image, "llvm", "data"), count).to_arrays()
     return arrays["mean"], arrays["factor"]
+
+
+@few
+@given(drawn=images_and_counts())
+@pytest.mark.parametrize("place", [Adaptive(), Grid(), Random(), RandomColors()], ids=repr)
+def test_every_placement_on_any_image(place, drawn):
+    """A set, its cutoff, and whether it has colours."""
+    image, count = drawn
+    found = place(objective_of(image, "llvm", "data"), count, 4.0, 1)
+    arrays = found.to_arrays()
+    check_placement(arrays["mean"], arrays["factor"], count, image.shape[1::-1])
+    assert (found.cutoff, found.space, found.channels) == (4, "data", image.shape[2])
+    assert arrays["color"].any() == place.has_colors
+
+
+# --- Density ------------------------------------------------------------------------------------
 
 
 def density_of(image, count):
@@ -76,8 +86,13 @@ def test_second_derivatives_of_a_parabola():
     np.testing.assert_allclose(density[inner], trace ** (2 / 3), rtol=1e-3)
 
 
+# --- Pieces of a curve --------------------------------------------------------------------------
+
+sides = {"height": st.integers(1, 90), "width": st.integers(1, 90)}
+
+
 @few
-@given(height=st.integers(1, 90), width=st.integers(1, 90))
+@given(**sides)
 def test_the_curve_is_that_of_the_bits_of_places(height, width):
     x, y = hilbert_curve(width, height)
     assert len({*zip(x.tolist(), y.tolist(), strict=True)}) == height * width
@@ -87,27 +102,7 @@ def test_the_curve_is_that_of_the_bits_of_places(height, width):
 
 
 @few
-@given(height=st.integers(1, 90), width=st.integers(1, 90), images=st.sampled_from([1, 3]))
-def test_sets_are_ordered_along_the_curve_through_tiles(backend, height, width, images):
-    random = np.random.default_rng(height)
-    mean = random.uniform(0, [width, height], (20 * images, 2)).astype(np.float32)
-    rows, size = ([[1, 0, 1]] * len(mean), [[0]] * len(mean)), (width, height)
-    gaussians = eg.Gaussians.from_arrays(mean, *rows, size=size, space="data", backend=backend)
-    column, row = hilbert_curve(-(-width // 4), -(-height // 4))
-    place = {tile: k for k, tile in enumerate(zip(column.tolist(), row.tolist(), strict=True))}
-    tiles = np.minimum(mean, [width - 1, height - 1]).astype(int) // 4
-    keys = [(k // 20, place[tuple(tile)]) for k, tile in enumerate(tiles.tolist())]
-    expected = sorted(range(len(mean)), key=keys.__getitem__)
-    np.testing.assert_array_equal(order_along_hilbert(gaussians, images).numpy(), expected)
-
-
-@few
-@given(
-    height=st.integers(1, 40),
-    width=st.integers(1, 40),
-    part=st.floats(0, 1),
-    shift=st.sampled_from([0, 0.3]),
-)
+@given(**sides, part=st.floats(0, 1), shift=st.sampled_from([0, 0.3]))
 def test_pieces_have_equal_mass(height, width, part, shift):
     """Also where a pixel holds several of them; with all cuts but the ends moved back."""
     density = np.random.default_rng(height).uniform(0, 1, (height, width)) ** 4
@@ -123,18 +118,7 @@ def test_pieces_have_equal_mass(height, width, part, shift):
     np.testing.assert_allclose(share @ mean, center, rtol=1e-5)
 
 
-def test_pieces_of_an_even_density_are_squares():
-    """64 centres on 32 x 32 pixels: pieces of the curve are blocks of 4 x 4."""
-    mean = centroids_along_curve(np.full((32, 32), 64 / 1024, np.float32), 64, 0.0)
-    expected = {(4 * i + 2.0, 4 * j + 2.0) for i in range(8) for j in range(8)}
-    assert {tuple(m) for m in np.round(mean, 5).tolist()} == expected
-
-
-def test_places_without_mass_get_no_piece():
-    density = np.zeros((40, 52), np.float32)
-    density[10:20, 30:41] = 0.4
-    mean = centroids_along_curve(density, 44, 0.2)
-    assert ((mean > [30, 10]) & (mean < [41, 20])).all()
+# --- Shapes -------------------------------------------------------------------------------------
 
 
 def test_shapes_are_those_of_eigenvectors():
@@ -155,38 +139,6 @@ def test_shapes_are_those_of_eigenvectors():
     np.testing.assert_allclose(covariances_of(factor), sigma, rtol=1e-4, atol=1e-4 * sigma.max())
 
 
-@few
-@given(
-    shape=st.tuples(st.integers(1, 3), st.integers(1, 30), st.integers(1, 30)),
-    times=st.integers(1, 5),
-)
-def test_images_are_shrunk_to_means(shape, times):
-    image = generator(1).uniform(0, 1, shape).astype(np.float32)
-    small = shrunk(image, times)
-    for c, y, x in np.ndindex(*small.shape):
-        square = image[c, y * times : (y + 1) * times, x * times : (x + 1) * times]
-        np.testing.assert_allclose(small[c, y, x], square.mean(dtype=float), rtol=1e-5)
-
-
-def test_planes_are_those_of_the_images(backend):
-    """Of sizes that whole tiles do not fill."""
-    batch = generator(7).uniform(0, 1, (3, 30, 33, 2)).astype(np.float32)
-    objective = Pixels.of(batch, DATA, types_in(select(backend)))
-    planes = planes_of(objective.placement_image, objective.grid)
-    np.testing.assert_array_equal(planes, np.moveaxis(batch, 3, 1))
-
-
-def test_constant_image_is_covered_evenly(backend):
-    mean, factor = placed(np.full((64, 64, 3), 0.5, np.float32), 256, backend)
-    quarter = (mean // 32).astype(int)
-    numbers = np.bincount(quarter[:, 0] + 2 * quarter[:, 1], minlength=4)
-    assert np.abs(numbers - 64).max() <= 3
-    sigma = covariances_of(factor)
-    np.testing.assert_allclose(
-        sigma, np.tile(sigma[0, 0, 0] * np.eye(2), (256, 1, 1)), rtol=0.1, atol=0.5
-    )
-
-
 def test_splats_lie_along_a_slanted_edge():
     """At 45 degrees, falling to the right: the covariance of x and y is positive along it."""
     y, x = np.indices((64, 64))
@@ -197,36 +149,3 @@ def test_splats_lie_along_a_slanted_edge():
     along = sigma.sum(axis=(1, 2)) / 2  # variance along (1, 1) / sqrt 2
     across = along - 2 * sigma[:, 0, 1]
     assert (along > 2 * across).mean() > 0.9
-
-
-def test_splats_far_apart_are_placed_on_a_smaller_image():
-    """Their means and covariances are those of the small one, enlarged."""
-    small = generator().uniform(0, 1, (33, 53, 3)).astype(np.float32)
-    image = np.kron(small, np.ones((3, 3, 1), np.float32))[:97, :158]  # splats lie 27 pixels apart
-    mean, factor = placed(image, 21)
-    expected_mean, expected_factor = placed(small, 21)
-    np.testing.assert_allclose(mean, 3 * expected_mean, rtol=1e-4)
-    np.testing.assert_allclose(factor, expected_factor / 3, rtol=1e-3, atol=1e-5)
-    check_placement(mean, factor, 21, (158, 97))
-
-
-def test_density_given_to_adaptive_is_followed():
-    def left(default, times):
-        return np.broadcast_to(np.linspace(1, 1e-5, 40, dtype=np.float32), default.shape)
-
-    mean, _ = placed(np.zeros((40, 40, 3), np.float32), 100, density=left)
-    assert (mean[:, 0] < 20).mean() > 0.7
-
-
-def test_sets_of_a_batch_are_those_of_its_images(backend):
-    batch = generator(7).uniform(0, 1, (3, 30, 33, 3)).astype(np.float32)
-
-    def placed_for(*images):
-        objective = Pixels.of(np.stack(images), DATA, types_in(select(backend)))
-        return place_adaptive(objective, 60)
-
-    together = placed_for(*batch)
-    for name in ("mean", "factor"):
-        rows = getattr(together, name).numpy().T
-        for image, part in zip(batch, np.split(rows, 3), strict=True):
-            np.testing.assert_array_equal(part, getattr(placed_for(image), name).numpy().T)

@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.halves import SIDE, fitted, objective_for, objective_of, picture
+from _helpers.halves import SIDE, picture
 from _helpers.sets import SIZE, random_scene
-from _helpers.tiles import to_map, to_tiles
+from _oracles.objectives import objective_of
+from _oracles.tiles import to_map, to_tiles
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.place import Grid
 from eigengs_dr.fitting.placement.redistribution import (
     ERROR_EXPONENT,
     Owners,
-    error_by_pixel,
     redistribute,
     target_density,
 )
-from eigengs_dr.image.color import rgb_to_ycbcr
 from eigengs_dr.raster.render import render
 
 
@@ -65,20 +64,6 @@ def test_parts_are_those_of_the_weights(backend):
     assert (found > 0.99).all()  # also where there is no Gaussian
 
 
-def test_error_is_that_of_the_rendering(backend):
-    scene = random_scene()
-    gaussians = scene.on(backend)
-    target = np.random.default_rng(0).uniform(0, 1, (SIZE[1], SIZE[0], 3)).astype(np.float32)
-    weight = np.random.default_rng(1).uniform(0, 2, target.shape).astype(np.float32)
-    shown = eg.render(gaussians).numpy()
-    for factor in (None, weight, weight[..., 0]):
-        factors = 1.0 if factor is None else np.atleast_3d(factor)
-        expected = (factors * np.square(target - shown)).sum(axis=2)
-        objective = objective_for(gaussians, target, factor)
-        found = to_map(error_by_pixel(gaussians, objective), objective.grid)
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
-
-
 def test_equal_shares_of_error_leave_the_density_as_it_was(backend):
     """Gaussians on a grid, each with the same error: nothing is gained by moving any."""
     density = density_for(rounds(80, backend), np.ones((80, 80)), np.ones((80, 80)), backend)
@@ -107,11 +92,6 @@ def test_in_a_part_density_follows_the_bending(backend):
     np.testing.assert_allclose(density / density[0, 0], bending, rtol=1e-3)
 
 
-def test_nothing_missed_and_nothing_bent_is_still_a_density(backend):
-    density = density_for(rounds(8, backend), np.zeros((8, 8)), np.full((8, 8), 1e-30), backend)
-    assert np.isfinite(density).all() and (density > 0).all()
-
-
 @pytest.mark.parametrize("side", [32, 150])
 def test_rearranged_has_the_count_and_goes_where_the_error_is(side):
     """Also where splats are so far apart that they are placed on a smaller image."""
@@ -123,12 +103,3 @@ def test_rearranged_has_the_count_and_goes_where_the_error_is(side):
     assert len(result) == 50
     assert left.mean() > 0.6  # half of the area, most of the error
     assert np.isfinite(render(result).numpy()).all()
-
-
-def test_weights_draw_splats():
-    gaussians, _ = fitted()
-    weight = np.ones((SIDE, SIDE), np.float32)
-    weight[SIDE // 2 :] = 1e-6
-    objective = objective_for(gaussians, rgb_to_ycbcr(picture()), weight)
-    result = redistribute(gaussians, objective, 60)
-    assert (result.mean.numpy()[1] < SIDE / 2).mean() > 0.7

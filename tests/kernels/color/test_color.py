@@ -1,0 +1,130 @@
+"""Colour spaces against scikit-image, and the same formula on NumPy and Dr.Jit arrays."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from skimage.color import rgb2ycbcr
+
+from eigengs_dr.backend.selection import select
+from eigengs_dr.image.color import (
+    from_log,
+    rgb_to_ycbcr,
+    to_coded,
+    to_linear,
+    to_log,
+)
+from eigengs_dr.image.space import YCBCR
+
+PRECISION = {np.float32: 2e-6, np.float64: 1e-14}
+
+images = hnp.arrays(
+    np.float64,
+    hnp.array_shapes(min_dims=0, max_dims=2, max_side=4).map(lambda shape: (*shape, 3)),
+    elements=st.floats(-2, 2),
+)
+
+
+# --- YCbCr -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", PRECISION)
+def test_equals_scikit_image(dtype):
+    image = np.random.default_rng(0).random((7, 5, 3)).astype(dtype)
+    result = rgb_to_ycbcr(image)
+    assert result.dtype == dtype
+    np.testing.assert_allclose(result, rgb2ycbcr(image) / 255, atol=PRECISION[dtype])
+
+
+@given(images)
+def test_round_trip(image):
+    for dtype, precision in PRECISION.items():
+        result = YCBCR.decode_image(rgb_to_ycbcr(image.astype(dtype)))
+        assert result.dtype == dtype
+        np.testing.assert_allclose(result, image, atol=10 * precision)
+
+
+def test_refuses_what_would_be_misread():
+    for convert in (rgb_to_ycbcr, to_linear, to_coded):
+        with pytest.raises(ValueError, match="uint8; convert to float32"):
+            convert(np.zeros((2, 2, 3), np.uint8))
+    for shape in ((), (2, 2), (2, 2, 4)):
+        with pytest.raises(ValueError, match="shape"):
+            rgb_to_ycbcr(np.zeros(shape))
+
+
+# --- sRGB and linear light ---------------------------------------------------------------------
+
+
+def test_srgb_of_the_standard():
+    """Ends, the grey of half the light, and the powers themselves."""
+    np.testing.assert_allclose(to_linear(np.array([0.0, 0.04045, 1.0])), [0, 0.04045 / 12.92, 1])
+    assert to_coded(0.5) == pytest.approx(0.735357, abs=1e-6)
+    assert to_linear(188 / 255) == pytest.approx(0.50289, abs=1e-5)
+    codes = np.linspace(0.05, 1.5, 30)
+    np.testing.assert_allclose(to_linear(codes), ((codes + 0.055) / 1.055) ** 2.4, rtol=1e-14)
+    np.testing.assert_allclose(to_linear(-codes), -codes / 12.92, rtol=1e-14)
+
+
+@given(hnp.arrays(np.float64, 16, elements=st.floats(-1, 2)))
+def test_srgb_round_trip(values):
+    for dtype, precision in {np.float32: 2e-6, np.float64: 1e-7}.items():
+        for there, back in ((to_linear, to_coded), (to_coded, to_linear)):
+            result = back(there(values.astype(dtype)))
+            assert result.dtype == dtype
+            np.testing.assert_allclose(result, values, atol=precision)
+
+
+@pytest.mark.parametrize("convert", [to_linear, to_coded])
+def test_srgb_in_drjit_equals_numpy(backend, convert):
+    module = select(backend)
+    values = np.linspace(-0.5, 1.5, 24)
+    with np.errstate(invalid="raise"):
+        expected = convert(values)
+    single = values.astype(np.float32)
+    for array, precision in (
+        (module.Float64(values), 1e-12),
+        (module.Float(single), 2e-6),
+        (module.TensorXf(single.reshape(2, 4, 3)), 2e-6),
+    ):
+        result = convert(array)
+        assert type(result) is type(array)
+        np.testing.assert_allclose(np.ravel(result.numpy()), expected, atol=precision)
+
+
+@pytest.mark.parametrize(
+    ("convert", "slopes"),
+    [(to_linear, [1 / 12.92] * 3 + [2.4 / 1.055]), (to_coded, [12.92] * 3 + [1.055 / 2.4])],
+)
+def test_slopes_of_srgb_are_finite_everywhere(backend, convert, slopes):
+    """Also where the power of the other part has none: at -0.055, at 0 and below."""
+    Float = select(backend).Float64
+    for mode in ("backward", "forward"):
+        x = Float(-0.055, -1, 0, 1)
+        dr.enable_grad(x)
+        y = convert(x)
+        if mode == "backward":
+            dr.backward(y)
+            found = dr.grad(x)
+        else:
+            dr.forward(x)
+            found = dr.grad(y)
+        np.testing.assert_allclose(found.numpy(), slopes, rtol=1e-12)
+
+
+# --- Light above 1 ---------------------------------------------------------------------------
+
+
+LIGHT = np.array([-0.005, 0, 1e-4, 0.01, 0.18, 1, 12, 5e3, 1e6])
+
+
+def test_logarithms_come_back(backend):
+    np.testing.assert_allclose(from_log(to_log(LIGHT))[1:], LIGHT[1:], rtol=1e-12, atol=1e-15)
+    codes = select(backend).Float(to_log(LIGHT[1:-1]))
+    np.testing.assert_allclose(from_log(codes).numpy(), LIGHT[1:-1], rtol=1e-5, atol=1e-8)
+    assert to_log(LIGHT)[5] == pytest.approx(1)
+    assert (np.diff(to_log(LIGHT)) > 0).all()
+    assert from_log(np.float32([-50])) > -0.0101  # light below 0 is bounded
+    assert to_log(LIGHT.astype(np.float32)).dtype == np.float32

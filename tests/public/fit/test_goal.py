@@ -1,0 +1,165 @@
+"""A target: the fewest Gaussians that reach a PSNR."""
+
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+from _helpers.families import SPLATS
+from _helpers.halves import SIDE, picture
+from _helpers.photos import coffee
+from _helpers.waves import METHODS
+
+
+def test_two_colours_take_few():
+    image = np.full((SIDE, SIDE, 3), 0.4, np.float32)
+    image[:, SIDE // 2 :] = (0.9, 0.2, 0.1)
+    result = eg.fit(image, target_psnr=32, iterations=300)
+    assert result.stopped == "met"
+    assert len(result.gaussians) <= 12
+    assert eg.psnr(image, result.image) >= 32
+
+
+def test_noise_is_out_of_reach():
+    """With as many parameters as the image has numbers; in at most a quarter more than twice the
+    steps."""
+    noise = np.random.default_rng(0).uniform(0, 1, (SIDE, SIDE, 3))
+    result = eg.fit(noise, target_psnr=45, iterations=100)
+    assert result.stopped == "out of reach"
+    assert len(result.gaussians) <= SIDE * SIDE * 3 // 8
+    assert result.iterations <= 2.25 * 100
+    black = np.zeros((SIDE, SIDE, 3), np.float32)
+    black[8, 8] = 1  # no place is left to grow
+    assert eg.fit(black, target_psnr=99, iterations=40).iterations <= 2.25 * 40
+
+
+@pytest.mark.parametrize("space", ["ycbcr", "rgb"])
+def test_the_target_is_met_in_its_space(space):
+    image = coffee(SIDE)
+    plain = eg.fit(image, SPLATS, iterations=600)
+    reached = plain.trace[-1][f"psnr_{space}"]
+    found = eg.fit(image, target_psnr=eg.Goal(reached, space), iterations=600)
+    assert found.stopped == "met"
+    assert eg.psnr(image, found.image, space=space) >= reached
+    assert len(found.gaussians) <= 1.15 * SPLATS
+    last = [row for row in found.trace if row["gaussians"] == len(found.gaussians)][-1]
+    assert last[f"psnr_{space}"] >= reached
+
+
+PLACES = ((40, 100), (70, 120), (100, 140), (130, 160), (160, 180), (200, 220), (220, 300))
+"""Corners of parts of a photo: counts of single parts depend on the rounding of a processor."""
+
+
+@pytest.mark.slow
+def test_the_search_finds_about_as_few():
+    """Short descents settle less well than one of 200 steps, and single ones by chance."""
+    photo, counts = eg.sample("coffee"), []
+    for row, column in PLACES:
+        image = photo[row : row + SIDE, column : column + SIDE]
+        plain = eg.fit(image, gaussians=100, iterations=200)
+        found = eg.fit(image, target_psnr=plain.psnr_rgb, iterations=200)
+        assert found.stopped == "met"
+        counts.append(len(found.gaussians))
+    assert np.median(counts) <= 140
+
+
+def test_an_image_that_is_fitted_without_error():
+    """The PSNR of a set without error is infinite."""
+    result = eg.fit(np.full((SIDE, SIDE, 3), 0.4, np.float32), target_psnr=40, iterations=40)
+    assert (len(result.gaussians), result.stopped, result.psnr_rgb) == (1, "met", np.inf)
+
+
+def test_an_exact_picture_reaches_each_goal():
+    """127.5 rounds to either side, by errors of floats."""
+    result = eg.fit(np.full((32, 32, 3), 0.5, np.float32), target_psnr=60, iterations=100)
+    assert result.stopped == "met" and result.psnr_ycbcr > 100
+
+
+def test_progress_counts_up_to_its_total():
+    seen = []
+    eg.fit(picture(), target_psnr=30, iterations=50, progress=lambda *row: seen.append(row))
+    steps = [row[0] for row in seen]
+    assert steps == sorted(steps) and len(steps) > 3
+    assert all(step <= total for step, total, _ in seen)
+    assert {"gaussians", "psnr_rgb", "psnr_ycbcr", "seconds"} <= seen[-1][2].keys()
+
+
+def test_interrupted_while_it_settles_it_keeps_the_goal_with_fewer():
+    """Also by an error, as in a thread or at a second Ctrl-C."""
+    whole = eg.fit(picture(), target_psnr=28, iterations=200)
+    assert whole.stopped == "met"
+    best = [row["gaussians"] for row in whole.trace if row["psnr_rgb"] >= 28]
+
+    def press(iteration, iterations, row):
+        if row["psnr_rgb"] >= 28:  # the search has met its goal, and settles
+            raise KeyboardInterrupt
+
+    with pytest.raises(eg.Interrupted) as interruption:
+        eg.fit(picture(), target_psnr=28, iterations=200, progress=press)
+    found = interruption.value.result
+    assert found.stopped == "interrupted"
+    assert found.iterations < whole.iterations
+    assert len(found.gaussians) <= best[0]
+    assert found.psnr_rgb >= 28
+    assert found.psnr_rgb == pytest.approx(eg.psnr(picture(), found.image), abs=1e-3)
+
+
+def interrupted(image, step, **options):
+    """What a search of 200 steps returns after the press of Ctrl-C at a step."""
+
+    def press(iteration, iterations, row):
+        if iteration == step:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(eg.Interrupted) as interruption:
+        eg.fit(image, iterations=200, progress=press, **options)
+    return interruption.value.result
+
+
+@pytest.mark.parametrize("goal", [26, 28, 30])
+def test_interrupted_after_half_its_time_it_is_near_its_goal(goal):
+    """The sets of its estimates may be decibels above."""
+    assert goal <= interrupted(picture(), 200, target_psnr=goal).psnr_rgb < goal + 1
+
+
+def test_interrupted_it_has_no_more_than_it_may():
+    """Although the fit has a surplus."""
+    found = interrupted(coffee(64), 100, target_psnr=eg.Goal(60, max_gaussians=100))
+    assert len(found.gaussians) == max(row["gaussians"] for row in found.trace) == 100
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gaussians": 10}, "exclude each other"),
+        ({"method": METHODS["gaussianimage"]}, "needs a method that places Gaussians by the image"),
+        (
+            {"method": replace(eg.DEFAULT, place=METHODS["gaussianimage"].place)},
+            "places Gaussians by the image",
+        ),
+        ({"method": eg.DEFAULT.without("places")}, "and redistributes them, such as DEFAULT"),
+        ({"target_psnr": 0}, "above 0"),
+        ({"target_psnr": True}, "psnr is True; it must be a number"),
+    ],
+)
+def test_what_cannot_be_searched_for_is_said_in_one_line(settings, message):
+    kind = TypeError if "; it must be a " in message else ValueError
+    with pytest.raises(kind, match=message) as caught:
+        eg.fit(picture(), **{"target_psnr": 30, **settings})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "message"),
+    [
+        ((None,), {}, "psnr is None; it must be a number"),
+        ((30, "lab"), {}, "use one of rgb, ycbcr"),
+        ((30,), {"max_gaussians": 0}, "max_gaussians is 0; it must be at"),
+        ((30,), {"max_gaussians": 50.5}, "50.5; it must be a whole number"),
+    ],
+)
+def test_goals_that_are_refused(arguments, options, message):
+    with pytest.raises(TypeError if "; it must be a " in message else ValueError, match=message):
+        eg.Goal(*arguments, **options)

@@ -1,0 +1,248 @@
+"""What is no input of a function: one line that names it, as TypeError or ValueError."""
+
+import inspect
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+import eigengs_dr as eg
+
+IMAGE = np.random.default_rng(0).random((16, 16, 3), np.float32)
+
+EIGHT = {"size": (8, 8)}
+SET = eg.Gaussians.from_arrays(
+    [[4, 4], [9, 9]],
+    [[0.5, 0, 0.5], [0.4, 0, 0.3]],
+    [[1, 0, 0], [0.5, 0.1, 0.1]],
+    size=(16, 16),
+)
+
+BAD_VALUES = (
+    None,
+    5,
+    1.5,
+    True,
+    object(),
+    [],
+    {},
+    b"x",
+    lambda: 0,
+    3 + 4j,
+    np.zeros(0),
+    np.full((16, 16, 3), np.nan),
+)
+"""Values that are neither a string, a path nor a set."""
+
+
+def complaint(kind, function, *arguments, **options):
+    """The message of an error of exactly this type, checked to be one short line."""
+    with pytest.raises((TypeError, ValueError)) as error:
+        function(*arguments, **options)
+    message = str(error.value)
+    assert type(error.value) is kind or (kind is ValueError and type(error.value) is eg.ImageError)
+    assert message.isprintable() and 10 < len(message) < 300
+    return message
+
+
+def functions():
+    """The public functions and methods, by their names."""
+    for name in eg.__all__:
+        thing = getattr(eg, name)
+        if inspect.isfunction(thing):
+            yield name, thing
+        for method in vars(thing) if inspect.isclass(thing) else ():
+            if not method.startswith("_") and callable(getattr(thing, method)):
+                yield f"{name}.{method}", getattr(thing, method)
+
+
+KINDS = {
+    "str": "a string",
+    "bool": "True or False",
+    "str | os.PathLike[str]": "a path",
+    "PathLike": "a path",
+    "Gaussians": "a set of Gaussians",
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_argument_of_another_type_is_named_in_a_type_error(kind):
+    checked = 0
+    for name, function in functions():
+        parameters = inspect.signature(function).parameters.values()
+        required = {
+            p.name: "x" for p in parameters if p.default is p.empty and p.kind < p.VAR_KEYWORD
+        }
+        required |= {"tensors": {}} if "tensors" in required else {}
+        required |= {p.name: 1 for p in parameters if p.annotation in ("int", "float")}
+        for argument in [p.name for p in parameters if p.annotation in (kind, f"{kind} | None")]:
+            if name in (
+                "view",
+                "Eigenbasis.project",
+                "Eigenbasis.truncation_curve",
+            ) or name.startswith("Method."):
+                continue
+            optional = str(inspect.signature(function).parameters[argument].annotation) != kind
+            for bad in BAD_VALUES[optional:]:
+                if kind == "bool" and bad is True:
+                    continue
+                message = complaint(TypeError, function, **(required | {argument: bad}))
+                assert message.startswith(f"{argument} is "), name
+                assert message.endswith(f"; it must be {KINDS[kind]}"), name
+            checked += 1
+    assert checked
+
+
+TYPES = {
+    "sets is ": (eg.concatenate, [None, 5, "x", [None], ["x"], {"a": 1}, object(), np.ones(3)]),
+    "list of sets": (lambda wrong: eg.concatenate([SET, wrong]), [None, "x", [], {}]),
+    "maps": (
+        lambda wrong: eg.Gaussians.from_arrays([[4, 4]], [[1, 0, 1]], [[1]], maps=wrong, **EIGHT),
+        [None, 5, "x", [None], np.ones(3)],
+    ),
+    "tensors is ": (lambda wrong: eg.from_tensors(wrong, SET), [None, 5, "x", [SET]]),
+    "Dr.Jit tensor": (
+        lambda wrong: eg.from_tensors({"mean": wrong}, SET),
+        [None, 5, np.ones((2, 2)), SET.mean],
+    ),
+    "region is ": (
+        lambda wrong: eg.render(SET, region=wrong),
+        [5, "abc", (1.5, 2, 3, 4), [True, 0, 4, 4], object()],
+    ),
+    "tile_lists": (lambda wrong: eg.render(SET, lists=wrong), [[SET]]),
+    "sections": (
+        lambda wrong: eg.pack(SET, "never.egs", sections=wrong),
+        [5, [1.5, 1], ["1", "1"], [True, True]],
+    ),
+    "images is ": (eg.Eigenbasis.from_images, [None, 5, object()]),
+    " images is ": (eg.fit_many, [None, 5, object()]),
+    "judge is 'x'": (lambda wrong: eg.Loss(lambda picture, step: 0, judge=wrong), ["x"]),
+}
+"""What the error of a call says, the call, and values of another type."""
+
+
+@pytest.mark.parametrize("words", TYPES)
+def test_values_of_another_type(words):
+    call, values = TYPES[words]
+    for wrong in values:
+        assert words.strip() in complaint(TypeError, call, wrong)
+
+
+def test_values_that_do_not_do():
+    assert "no sets" in complaint(ValueError, eg.concatenate, [])
+    assert "'shake' is unknown" in complaint(ValueError, eg.DEFAULT.without, "shake")
+    complaint(ValueError, eg.DEFAULT.without, np.ones(3))
+
+
+@pytest.mark.parametrize("name", ["mean", "factor", "color", "background"])
+def test_arrays_of_a_set(name):
+    good = {"mean": [[4, 4]], "factor": [[1, 0, 1]], "color": [[1]], "background": [0]}
+    options = {"size": (8, 8), "space": "data"}
+    for wrong in (None, "x", {}, object(), iter([]), ["a"], [None], np.datetime64("2020")):
+        if wrong is None and name == "background":
+            continue
+        message = complaint(
+            TypeError, eg.Gaussians.from_arrays, **(good | {name: wrong}), **options
+        )
+        assert message.startswith(f"Gaussians: {name} is ")
+    for wrong in ([[1], [1, 2]], [], [[np.nan]], [np.inf]):
+        complaint(ValueError, eg.Gaussians.from_arrays, **(good | {name: wrong}), **options)
+
+
+@pytest.mark.parametrize("channels", [2, 4])
+def test_images_of_too_many_channels_are_refused_in_a_list_as_alone(channels):
+    """They are not taken for as many grey images as they have rows."""
+    wrong = np.ones((16, 16, channels), np.float32) / 2
+    basis = eg.Eigenbasis.from_images([IMAGE, IMAGE[::-1]], size=(16, 16), components=1)
+    for function in (basis.project, eg.fit, lambda one: eg.Eigenbasis.from_images([IMAGE, one])):
+        assert f"shape (16, 16, {channels})" in complaint(ValueError, function, wrong)
+
+
+@pytest.mark.parametrize("text", ["1GB", "-5", "0", "1.5", "x"])
+def test_a_limit_in_the_environment_that_is_no_number(text, tmp_path, monkeypatch):
+    eg.save_image(tmp_path / "a.png", IMAGE)
+    monkeypatch.setenv("EIGENGS_DR_MAX_FILE_MB", text)
+    message = complaint(ValueError, eg.load_image, tmp_path / "a.png")
+    assert f"EIGENGS_DR_MAX_FILE_MB is {text!r}; set a whole number" in message
+    monkeypatch.setenv("EIGENGS_DR_MAX_FILE_MB", "50")
+    assert eg.load_image(tmp_path / "a.png").shape == (16, 16, 3)
+
+
+def test_arrays_in_place_of_options_give_one_line():
+    """NumPy prints them in many."""
+    wrong = np.ones((16, 16, 3))
+    for name in ("method", "encoding", "backend"):
+        complaint(TypeError, eg.fit, IMAGE, 5, iterations=1, **{name: wrong})
+    for name in ("gaussians", "space"):
+        complaint(ValueError, eg.fit, IMAGE, **{"gaussians": 5, name: wrong})
+    complaint(ValueError, eg.Eigenbasis.from_images, [IMAGE], components=wrong)
+
+
+def test_steps_without_end_are_refused():
+    """Their lists would fill the memory."""
+    assert "iterations" in complaint(ValueError, eg.fit, IMAGE, 5, iterations=10**12)
+
+
+def test_what_is_no_plugin_of_mitsuba():
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    eg.register_plugins()
+    plugins = eg.plugins
+    for wrong in (None, "x", 5, [], object(), np.ones(3)):
+        assert "sensor is " in complaint(TypeError, plugins.pixel_angle, wrong)
+        assert "texture is " in complaint(TypeError, plugins.resident_bytes, wrong)
+        for function in (plugins.gaussians_of, plugins.keep_in_bounds):
+            assert "parameters is " in complaint(TypeError, function, wrong, "a", SET)
+            assert "like is " in complaint(TypeError, function, {}, "a", wrong)
+        for function in (plugins.texture_of, plugins.bake_environment):
+            complaint(TypeError, function, wrong)
+    assert plugins.resident_bytes(mi.load_dict(plugins.texture_of(SET))) > 0
+
+
+ESCAPE = "a\x1b[31m\nb\u202e"
+"""A name that would colour a terminal, break a line and turn what follows."""
+
+
+def test_control_characters_of_names_are_escaped(tmp_path):
+    image, damaged = tmp_path / f"{ESCAPE}.png", tmp_path / f"{ESCAPE}.npz"
+    message = complaint(ValueError, eg.load_image, image)
+    assert r"a\x1b[31m\nb\u202e.png: no such file" in message
+    image.write_bytes(b"none")
+    assert complaint(ValueError, eg.load_image, image).count(".png: ") == 1
+    damaged.write_bytes(b"PK\3\4")
+    complaint(ValueError, eg.Gaussians.load, damaged)
+    eg.save_image(tmp_path / "rgb.png", np.ones((4, 4, 3), np.float32))
+    transparent = tmp_path / f"{ESCAPE}2.png"
+    from PIL import Image
+
+    Image.new("RGBA", (4, 4)).save(transparent)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        eg.load_image(transparent)
+    assert all(str(one.message).isprintable() for one in told) and told
+
+
+def test_libraries_print_nothing_of_damaged_files(tmp_path):
+    """A PNG file cut in its header or its pixels, or with a flipped byte in each chunk."""
+    path = tmp_path / "a.png"
+    eg.save_image(path, IMAGE)
+    content = path.read_bytes()
+    bad = [content[:40], content[:100], content[:-20]]
+    bad += [content[:k] + bytes([content[k] ^ 255]) + content[k + 1 :] for k in (9, 13, 20, 30, 99)]
+    for number, damaged in enumerate(bad):
+        (tmp_path / f"{number}.png").write_bytes(damaged)
+    code = (
+        "import sys, eigengs_dr as eg\n"
+        "for path in sys.argv[1:]:\n"
+        "    try: eg.load_image(path)\n"
+        "    except eg.ImageError as error: print(error)\n"
+    )
+    paths = [str(tmp_path / f"{number}.png") for number in range(len(bad))]
+    run = subprocess.run(
+        [sys.executable, "-c", code, *paths], capture_output=True, text=True, check=True
+    )
+    lines = run.stdout.splitlines()
+    assert len(lines) >= len(bad) - 1 and all(".png: damaged" in line for line in lines)
+    assert "libpng" not in run.stderr
