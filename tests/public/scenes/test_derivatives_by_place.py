@@ -138,6 +138,7 @@ class TestTexture:
         scene = scene_of(square, painted(prefilter=0.05, **properties), integrator)
         assert_close(ratios(scene, *MOVES["uv"]))
 
+    @pytest.mark.slow
     def test_file_of_words(self, square, tmp_path):
         gaussians().save(tmp_path / "set.npz")
         texture = {"type": "gaussian_texture", "filename": str(tmp_path / "set.npz")}

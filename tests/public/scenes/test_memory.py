@@ -47,6 +47,7 @@ def seen(tex):
 
 
 class TestBytes:
+    @pytest.mark.slow
     def test_of_a_gaussian(self, tmp_path):
         """Of a photo of 32 pixels for each, as it is placed."""
         image = eg.sample("coffee")[100:260, 200:360]
@@ -121,6 +122,7 @@ class TestLoss:
         coded = seen(mi.load_dict(in_a_file(tmp_path, g, **whole)))
         np.testing.assert_allclose(coded, exact, rtol=0.02, atol=LOSS)
 
+    @pytest.mark.slow
     def test_an_environment_loses_little(self, tmp_path):
         sky().save(tmp_path / "sky.npz")
         file = {"type": "gaussian_environment", "filename": str(tmp_path / "sky.npz")}

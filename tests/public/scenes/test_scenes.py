@@ -105,6 +105,7 @@ def test_assets_are_what_scenes_name(tmp_path):
     assert np.allclose(np.linalg.norm(2 * normals - 1, axis=2), 1) and roughness.ndim == 2
 
 
+@pytest.mark.slow
 def test_measurement_of_the_plane(folder, monkeypatch, tmp_path):
     plane = importlib.import_module("plane")
     monkeypatch.setattr(plane, "FOLDER", folder)
@@ -128,6 +129,7 @@ for path in {paths!r}:
 """
 
 
+@pytest.mark.slow
 def test_bitmaps_of_the_scenes_are_converted_by_the_example(folder, tmp_path):
     """Where there are none, a scene is only written anew; a bitmap that nobody sees stays."""
     eg.save_image(tmp_path / "floor.png", eg.sample("coffee")[:128:4, :128:4])
