@@ -17,7 +17,7 @@ def backend():
     return mi.variant().split("_")[0]
 
 
-def gaussians(space="rgb", channels=3, seed=0, quiet=True):
+def gaussians(space="linear", channels=3, seed=0, quiet=True):
     """A small set; a quiet one stays inside [0, 1], so that no value is clamped."""
     scene = random_scene(seed, channels=channels)
     if quiet:

@@ -11,17 +11,8 @@ from eigengs_dr.backend.arrays import (
     make_divisor,
     rcp,
     rsqrt,
-    types_of,
     upload,
 )
-from eigengs_dr.backend.selection import select
-
-
-def test_types_of_refuses_what_has_no_backend_or_no_derivatives(backend):
-    others = dr.scalar.ArrayXf([1.0]), 1.0, np.ones(3)
-    for array in (*others, select(backend).UInt32(1), getattr(dr, backend).Float(1)):
-        with pytest.raises(TypeError, match="expected float arrays"):
-            types_of(array)
 
 
 @pytest.mark.parametrize("offset", [0, 1, 3])
@@ -63,14 +54,6 @@ def test_values_and_derivatives_are_those_of_numpy(types, function, points, valu
     found, derivative, x = value_and_slope(types, function, points)
     np.testing.assert_allclose(found, value(x), rtol=tolerance)
     np.testing.assert_allclose(derivative, slope(x), rtol=tolerance)
-
-
-def test_arrays_of_several(types):
-    pair = types.Float2([1, 2], [4, 5])
-    for function in (rcp, rsqrt):
-        found = function(pair)
-        assert type(found) is type(pair)
-        assert dr.all(found.y == function(pair.y))
 
 
 @few

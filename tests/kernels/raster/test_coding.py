@@ -8,7 +8,7 @@ from _helpers.sets import SIZE, random_scene
 from _oracles.lookups import cells_of, classes_of, filtered, footprint_of, sums_at
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.evaluate import inverted
-from eigengs_dr.raster.lookup.coding import MEAN_BITS, encode_rows
+from eigengs_dr.raster.lookup.coding import encode_rows
 from eigengs_dr.raster.lookup.points import Packed, sum_at_points, value_terms
 from eigengs_dr.raster.lookup.prefilter import sum_prefiltered
 from eigengs_dr.raster.parameters import KernelParameters
@@ -70,42 +70,14 @@ def coded_lookup(gaussians, is_filtered, points=POINTS):
     return stacked(sum_prefiltered(sizes, packed, x, y, footprint, types.Bool(True)))
 
 
-def bound(scene, points, step, cutoff=3.0):
-    """The largest error of sums at points from the rounding of rows.
-
-    With u = a dx + b dy and v = c dy, a weight w = exp(-(u^2 + v^2) / 2) changes by at most
-    max |r exp(-r^2 / 2)| = exp(-1/2) times the length of the change of (u, v): rounding of a, b, c
-    changes it by their share of the terms, and half a step of a mean by |a| + |b| and |c| steps.
-    """
-    dx, dy = np.abs(np.moveaxis(points[:, None] - scene.mean, -1, 0))
-    a, b, c = np.abs(scene.factor.T)
-    step = 0.5 * np.array(step) + np.spacing(np.float32(64))
-    du = SHORT * a * dx + HALF * b * dy + a * step[0] + b * step[1]
-    dv = SHORT * c * dy + c * step[1]
-    moved = np.exp(-0.5) * np.hypot(du, dv)
-    weight = np.exp(-0.5 * (np.maximum(a * dx - b * dy, 0) ** 2 + (c * dy) ** 2))
-    near = c * dy <= 1.01 * cutoff
-    return (near * (moved + HALF * weight)) @ np.abs(scene.color)
-
-
 @pytest.mark.parametrize("count", [60, 70_000])
-def test_sums_at_points_lose_what_rounding_explains(backend, count):
+def test_sums_at_points_lose_little(backend, count):
     """Also of more Gaussians than 16 bits number, whose lists go by bands."""
     scene = random_scene(4, count)
     gaussians, points = scene.on(backend), POINTS[: 300 if count == 60 else 20]
     found, exact = coded_lookup(gaussians, False, points), stacked(sums_at(gaussians, points))
-    distance = scene.mean - points[:, None]
-    u = scene.factor[:, 0] * distance[..., 0] + scene.factor[:, 1] * distance[..., 1]
-    edge = np.hypot(u, scene.factor[:, 2] * distance[..., 1])
-    near_edge = np.abs(edge / 3.0 - 1) <= 4 * SHORT  # on either side of the cutoff
-    limit = bound(scene, points, coded(gaussians)[0].step)
-    limit += near_edge @ (np.exp(-4.4) * np.abs(scene.color)) + 1e-5 * np.sqrt(count)
-    error = np.abs(found - exact)
-    assert (error <= limit).all()
-    if count == 60:
-        assert max(coded(gaussians)[0].step) < 2 * max(SIZE) / (2**MEAN_BITS - 1)
-        sure = ~near_edge.any(axis=1)
-        assert np.sqrt(np.mean(error[sure] ** 2)) < 1e-3 * np.abs(scene.color).mean()
+    error = np.abs(found - exact) / np.abs(scene.color).sum(axis=0)
+    assert error.max() < 3e-4 and np.sqrt(np.mean(error**2)) < 5e-5
 
 
 def test_sums_over_footprints_lose_little(backend):

@@ -72,8 +72,9 @@ def test_without_a_footprint_it_is_the_sum(backend, wrap):
     np.testing.assert_allclose(found[sure], exact[sure], atol=1e-5)
 
 
-@wraps
-@pytest.mark.parametrize("count", [400, 70_000])
+@pytest.mark.parametrize(
+    ("wrap", "count"), [("repeat", 400), ("mirror", 400), ("clamp", 400), ("clamp", 70_000)]
+)
 def test_nothing_is_left_out_far_from_borders(backend, wrap, count):
     """Gaussians that differ a thousandfold in size, and long, turned footprints; and more
     Gaussians than 16 bits number, whose lists go by bands."""
@@ -81,7 +82,7 @@ def test_nothing_is_left_out_far_from_borders(backend, wrap, count):
     factor = np.tile([1.2, 0.3, 0.9], (count, 1)) * 1000 ** rng.uniform(-0.1, 0.9, (count, 1))
     mean = rng.uniform(0.3, 0.7, (count, 2)) * size
     scene = random_scene(4, count, size)._replace(mean=mean, factor=factor)
-    points = some_points(60, size) * 0.2 + 0.4 * np.array(size)
+    points = some_points(60 if count == 400 else 10, size) * 0.2 + 0.4 * np.array(size)
     for xx, yy, xy in ((0.3, 0.3, 0.0), (9, 3, 4), (30, 30, 27)):
         covariance = np.array([[xx, xy], [xy, yy]])
         spread = matrices(*scene.factor.T) + covariance

@@ -15,7 +15,6 @@ import drjit as dr
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
-from PIL import Image
 
 import eigengs_dr as eg
 from _helpers import clusters
@@ -49,21 +48,6 @@ def test_an_image_that_ends_its_worker(client, photos, output, expected):
     assert {row.status for row in rows} == {"done"} and files_of(output) == expected
     with pytest.raises(eg.ClusterError, match="cannot be done: its worker ended 2 times"):
         eg.Eigenbasis.from_images([np.zeros((5, 6, 3)).view(Deadly)], (6, 5), 2, client=client)
-
-
-@pytest.mark.slow
-def test_a_worker_without_memory(photos, output, expected, monkeypatch):
-    """An image that no worker can hold fails; the others do not."""
-    monkeypatch.setenv("EIGENGS_DR_MAX_FILE_MB", "1000")  # it is small for what it holds
-    Image.fromarray(np.zeros((9000, 9000, 3), np.uint8)).save(photos / "05.png", compress_level=1)
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
-        Client(n_workers=2, threads_per_worker=1, memory_limit="800MB") as client,
-    ):
-        rows = eg.fit_many(photos, output, client=client, **QUICK)
-    assert [row.name for row in rows if row.status == "failed"] == ["05"]
-    assert "it may need more memory than a worker has" in rows[5].error
-    assert files_of(output) == {name: expected[name] for name in expected if name != "05.npz"}
 
 
 def test_a_full_disk_is_tried_again(client, photos, output, tmp_path):

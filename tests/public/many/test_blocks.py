@@ -70,6 +70,7 @@ def test_no_seam_is_left(iterations):
     )
 
 
+@pytest.mark.slow
 def test_smooth_picture_has_no_seam():
     """Large Gaussians of a flat sky reach over borders."""
     y, x = np.mgrid[:192, :192] / 192
@@ -84,11 +85,9 @@ def test_smooth_picture_has_no_seam():
     assert psnr_in(near, shown, 255 * sky) > min(50, psnr_in(near, whole, 255 * sky) - 1)
 
 
-@pytest.mark.parametrize("color", ["rgb", "linear", "data"])
-def test_spaces(color):
-    result = eg.fit_large(mosaic(96)[..., :1], **FEW | {"space": color, "gaussians": 500})
-    assert result.gaussians.space == color
-    assert result.gaussians.channels == (1 if color == "data" else 3)
+def test_linear_light_of_a_grey_image():
+    result = eg.fit_large(mosaic(96)[..., :1], **FEW | {"space": "linear", "gaussians": 500})
+    assert result.gaussians.space == "linear" and result.gaussians.channels == 3
     assert result.psnr_rgb > 22
 
 
@@ -96,6 +95,7 @@ def test_data_of_any_range():
     """As `fit`: heights of 100 m are fitted in a unit, and measured in it."""
     heights = 200 * mosaic(96)[..., :1].astype(np.float32) / 255 - 100
     result = eg.fit_large(heights, **FEW | {"space": "data", "gaussians": 500})
+    assert result.gaussians.channels == 1
     same = eg.fit_large(heights / 100, **FEW | {"space": "data", "gaussians": 500})
     assert result.psnr_ycbcr == pytest.approx(same.psnr_ycbcr, abs=0.5)
     error = np.square(eg.picture_of(result.gaussians) - heights).mean()
@@ -104,19 +104,13 @@ def test_data_of_any_range():
     )
 
 
-@pytest.mark.parametrize("color", ["log", "radiance"])
-def test_light_that_no_display_shows(color):
+def test_light_that_no_display_shows():
     """As `fit`, whose PSNRs are those of light that is exposed: else all would be equal."""
     light = 200 + 2000 * eg.sample("coffee")[:96, :96]
-    settings = {"gaussians": 500, "iterations": 10, "space": color, "encoding": "linear"}
+    settings = {"gaussians": 500, "iterations": 10, "space": "log", "encoding": "linear"}
     found, whole = eg.fit_large(light, block=48, **settings), eg.fit(light, **settings)
     assert found.psnr_ycbcr == pytest.approx(whole.psnr_ycbcr, abs=1.5)
     assert found.psnr_rgb == pytest.approx(whole.psnr_rgb, abs=1.5)
-
-
-def test_flat_image():
-    result = eg.fit_large(np.full((96, 96), 100, np.uint8), block=48, iterations=10)
-    assert result.psnr_rgb > 60
 
 
 def test_progress():
@@ -266,20 +260,7 @@ def test_interrupted_run_goes_on(tmp_path, stage, act, short, long):
     check_equal(eg.Gaussians.load(output, backend="llvm"), whole.gaussians.to_arrays())
 
 
-def test_a_block_is_kept_before_its_end_is_told(tmp_path):
-    """A callable that raises does not lose the block that has just ended."""
-    stop_after(tmp_path / "a.npz", mosaic(128), "fit", 0)
-    assert eg.fit_large(mosaic(128), tmp_path / "a.npz", **FEW).resumed == 1
-
-
-def test_a_folder_keeps_the_last_rounds_alone(tmp_path):
-    """The Gaussians of an image would else lie on the disk once for every round."""
-    stop_after(tmp_path / "a.npz", mosaic(128), "measure", 0)
-    kept = {path.name for path in (tmp_path / "a.npz.checkpoint").glob("fit*")}
-    assert kept == {f"fit2-{number}.npz" for number in range(4)}
-
-
-@pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
+@pytest.mark.parametrize("part", [0.3, 0.95])
 def test_a_round_with_a_hole_is_taken_again(tmp_path, part, small):
     """In any round, a run goes on from the last one that is complete, with the same bits."""
     output, rows = tmp_path / "a.npz", []

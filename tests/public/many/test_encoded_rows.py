@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.command import run, succeeded
 from _helpers.families import family, small_model
 
 
@@ -38,13 +37,8 @@ def test_a_set_without_the_mean_is_no_picture(model):
     assert (row.status, row.psnr_rgb, row.psnr_ycbcr) == ("done", None, None)
 
 
-def test_a_bound_above_an_image_leaves_it_one_gaussian_per_pixel(tmp_path):
-    photo = eg.sample("chelsea")[100:132, 150:182]
-    eg.save_image(tmp_path / "photo.png", photo)
-    eg.save_image(tmp_path / "thumbnail.png", photo[:6, :6])
-    command = ("fit", tmp_path, "-o", tmp_path / "sets", "--iterations", 5, "--target-psnr", 12)
-    succeeded(run(*command, "--max-gaussians", 500))
-    goal = eg.Goal(99, max_gaussians=500)
-    [row] = eg.fit_many([photo[:6, :6]], target_psnr=goal, iterations=5)
+def test_a_bound_above_an_image_leaves_it_one_gaussian_per_pixel():
+    photo = eg.sample("chelsea")[100:106, 150:156]
+    goal = eg.Goal(99, max_gaussians=100)
+    [row] = eg.fit_many([photo], target_psnr=goal, iterations=2)
     assert (row.status, row.gaussians, row.stopped) == ("done", 36, "out of reach")
-    assert len(eg.fit(photo[:6, :6], target_psnr=goal, iterations=5).gaussians) == 36

@@ -49,6 +49,7 @@ def test_results_are_those_of_single_fits(backend, options, together):
             assert_same_bits(row.result, alone)
 
 
+@pytest.mark.slow
 def test_default_fits_have_the_bits_of_single_ones():
     """A thousand steps, until Gaussians are as narrow as they may be."""
     photo = eg.sample("coffee")

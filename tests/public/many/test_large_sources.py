@@ -60,7 +60,7 @@ def test_sixteen_bits(tmp_path, pixels, expected):
     assert found.psnr_rgb == pytest.approx(expected.psnr_rgb, abs=0.01)
 
 
-@pytest.mark.parametrize("suffix", [".tif", ".npy", ".pfm"])
+@pytest.mark.parametrize("suffix", [".tif", ".npy"])
 def test_floats_in_files_are_light(tmp_path, pixels, suffix):
     """In the code of sRGB, or as they are for data."""
     light = (pixels / np.float32(255)) ** 2

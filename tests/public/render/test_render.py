@@ -1,9 +1,7 @@
 """Rendering: against a float64 sum over all pairs, of good and of bad numbers and arguments."""
 
 import math
-from dataclasses import replace
 
-import drjit as dr
 import numpy as np
 import pytest
 from hypothesis import given
@@ -114,18 +112,6 @@ def test_set_split_in_two_and_summed(backend, scene):
     assert (np.abs(joined - sum(parts)) <= limit).all()
 
 
-def test_thousands_of_splats_on_one_pixel(backend):
-    """No cap on the length of a list."""
-    rng = np.random.default_rng(0)
-    scene = random_scene(0, 2000)
-    mean = np.full((2000, 2), 6.5) + rng.uniform(-0.4, 0.4, (2000, 2))
-    scene = scene._replace(mean=mean, factor=np.tile([1.0, 0.2, 1.0], (2000, 1)))
-    scene = scene._replace(color=np.abs(scene.color))
-    image = rendered(scene, backend, cutoff=SMOOTH)
-    np.testing.assert_allclose(image, scene.exact(SMOOTH), rtol=1e-4, atol=1e-5)
-    assert image[6, 6].min() > 500
-
-
 # --- Numbers without a place or an end ---------------------------------------------------------
 
 spoil = pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -173,17 +159,6 @@ def test_extreme_widths(backend, diagonal, width):
     np.testing.assert_allclose(image, exact, atol=1e-6)
 
 
-@pytest.mark.parametrize("opaque", [False, True])
-def test_a_value_that_all_splats_share(backend, opaque):
-    scene = random_scene(10)._replace(factor=np.tile([0.5, 0.25, 0.75], (COUNT, 1)))
-    gaussians = scene.on(backend)
-    shared = type(gaussians.factor)(0.5, 0.25, 0.75)
-    if opaque:
-        dr.make_opaque(shared)
-    image = eg.render(replace(gaussians, factor=shared))
-    np.testing.assert_array_equal(image, eg.render(gaussians))
-
-
 # --- Spaces ------------------------------------------------------------------------------------
 
 
@@ -193,13 +168,6 @@ def test_ycbcr_comes_out_as_rgb(backend):
     clear = scene.off_edge(CUTOFF)
     expected = (scene.exact(CUTOFF) - BLACK) @ FROM_YCBCR.T
     np.testing.assert_allclose(image[clear], expected[clear], rtol=0, atol=2e-5)
-
-
-@pytest.mark.parametrize("space", ["rgb", "linear"])
-def test_other_spaces_come_out_as_they_are(backend, space):
-    scene = random_scene(13)
-    image = eg.render(scene.on(backend, space=space))
-    np.testing.assert_array_equal(image, eg.render(scene.on(backend)))
 
 
 def test_negative_light_is_black(backend):
@@ -292,10 +260,3 @@ def test_bad_arguments(backend, asked, words):
     with pytest.raises((ValueError, TypeError), match=words) as error:
         eg.render(random_scene().on(backend), **asked)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("kind", [int, np.float64, np.float32])
-def test_numbers_of_other_types(backend, kind):
-    gaussians = random_scene().on(backend)
-    image = eg.render(gaussians, width=np.int64(10), height=np.int64(8), cutoff=kind(3))
-    np.testing.assert_array_equal(image, eg.render(gaussians, width=10, height=8, cutoff=3.0))

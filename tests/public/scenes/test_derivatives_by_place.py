@@ -128,7 +128,11 @@ class TestTexture:
 
     @pytest.mark.parametrize(
         ("integrator", "properties"),
-        [("path", {}), ("prb", {"wrap_mode": "clamp"}), ("direct", {"wrap_mode": "mirror"})],
+        [
+            pytest.param("path", {}, marks=pytest.mark.slow),
+            ("prb", {"wrap_mode": "clamp"}),
+            ("direct", {"wrap_mode": "mirror"}),
+        ],
     )
     def test_other_integrators_and_borders(self, square, integrator, properties):
         scene = scene_of(square, painted(prefilter=0.05, **properties), integrator)
@@ -147,6 +151,7 @@ class TestTexture:
         follow(scene)
         assert_close(ratios(scene, *MOVES["uv"]))
 
+    @pytest.mark.slow
     def test_derivative_by_colours_too(self, square):
         """With derivatives by place beside them, those by the parameters stay what they were."""
         scene = scene_of(square, painted(prefilter=0.1))
@@ -163,6 +168,7 @@ class TestTexture:
         np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-4 * np.abs(found).max())
 
 
+@pytest.mark.slow
 def test_material_of_lights(square):
     bsdf = material_of(LitFormula().model(), prefilter=0.2)
     assert_close(ratios(scene_of(square, {"bsdf": bsdf}), *MOVES["uv"]))
@@ -284,7 +290,7 @@ class TestEnvironment:
         dr.backward(dr.sum(light(t) * mi.Float(np.float32(wanted))))
         assert_close(np.array([forward, dr.grad(t)[0]]) / np.square(wanted).sum())
 
-    @pytest.mark.parametrize("integrator", ["path", "prb"])
+    @pytest.mark.parametrize("integrator", [pytest.param("path", marks=pytest.mark.slow), "prb"])
     def test_turned_in_a_scene(self, integrator):
         scene = mi.load_dict(
             {

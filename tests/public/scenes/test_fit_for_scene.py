@@ -66,9 +66,9 @@ class TestFootprint:
     def test_a_grazing_look_counts_by_its_narrow_axis(self):
         tilt, distance = np.radians(70), 3.0
         eye = [distance * np.sin(tilt), 0, distance * np.cos(tilt)]
-        found = seen_by(camera(eye), side=33)
+        found = seen_by(camera(eye)).footprint[15:17, 15:17].mean()
         # At the middle of the picture a pixel is as wide as at this distance from the front.
-        assert found.footprint[16, 16] == pytest.approx(PIXEL * pixel_at(distance, 33), rel=0.02)
+        assert found == pytest.approx(PIXEL * pixel_at(distance), rel=0.02)
 
     def test_far_away_hits_leave_no_holes(self):
         found = seen_by(camera([0, 0, 200.0], 64), side=1024)
@@ -199,6 +199,7 @@ class TestFit:
         counts = [count for count, reached in found.tried if reached >= BOUND]
         assert min(counts) == len(found.gaussians)
 
+    @pytest.mark.slow
     def test_data_of_one_channel(self):
         data = photo()[..., :1]
         found = fitted(camera([0, 0, 5.0]), image=data, space="data")

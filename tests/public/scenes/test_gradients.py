@@ -87,11 +87,12 @@ def check_gradients(scene, names):
 
 
 @pytest.mark.parametrize(
-    ("integrator", "prefilter"), [("direct", 0.0), ("path", 0.0), ("prb", 0.05)]
+    ("integrator", "prefilter"),
+    [("direct", 0.0), pytest.param("path", 0.0, marks=pytest.mark.slow), ("prb", 0.05)],
 )
 def test_gradients_are_finite_differences(integrator, prefilter):
     """A cutoff of 6 leaves no edge for finite differences to cross."""
-    bsdf = wall(gaussians("ycbcr"), cutoff=6.0, prefilter=prefilter)
+    bsdf = wall(gaussians(), cutoff=6.0, prefilter=prefilter)
     check_gradients(small_scene(bsdf, integrator, SIDE, SPP), PARAMETERS)
 
 
@@ -124,7 +125,8 @@ import drjit as dr, eigengs_dr as eg, mitsuba as mi
 from eigengs_dr.plugins import texture_of
 mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()
-g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1, 1, 1]], size=(8, 8), space="linear")
+arrays = [[4, 4]] * 24, [[0.5, 0, 0.5]] * 24, [[0.01] * 3] * 24, [0.5] * 3
+g = eg.Gaussians.from_arrays(*arrays, size=(22, 17), space="linear")
 texture = mi.load_dict(texture_of(g, prefilter=0.05))
 parameters, along = mi.traverse(texture), mi.Float(0)
 dr.enable_grad(along)
@@ -141,6 +143,25 @@ def test_forward_mode_of_a_prefilter_says_that_there_is_none():
     """In another process: after an error in a walk, Dr.Jit 1.5 may end it when it exits."""
     told = run_python(FORWARD_WITH_PREFILTER).stdout
     assert told.startswith("no forward mode of Gaussians with a prefilter")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["direct_projective", "prb_projective"])
+def test_projective_integrators(kind):
+    """Their pictures, and the derivatives that the plain ones have too: those of colours."""
+    seen, slopes = [], []
+    for name in (kind, kind.removesuffix("_projective")):
+        scene = small_scene(wall(gaussians("linear")), "direct", spp=256)
+        parameters, key = mi.traverse(scene), f"{TEXTURE}.color"
+        dr.enable_grad(parameters[key])
+        parameters.update()
+        image = mi.render(scene, parameters, integrator=mi.load_dict({"type": name}), seed=1)
+        dr.backward(dr.mean(dr.square(image), axis=None))
+        seen.append(np.array(image))
+        slopes.append(np.array(dr.grad(parameters[key])))
+    assert np.abs(slopes[1]).max() > 1e-4
+    for found, expected in (seen, slopes):  # but for noise
+        assert np.linalg.norm(found - expected) < 0.1 * np.linalg.norm(expected)
 
 
 def test_derivatives_that_nobody_walks_keep_nothing_alive():
@@ -218,7 +239,7 @@ def test_extreme_gaussians_stay_finite(factor):
     """Very wide, very narrow and very long ones, near, and from afar in the pyramid."""
     scene = random_scene()
     scene.factor[0] = factor
-    tex = texture(scene.on(backend(), space="rgb"), prefilter=0.1, wrap_mode="clamp")
+    tex = texture(scene.on(backend(), space="linear"), prefilter=0.1, wrap_mode="clamp")
     for distance in (0.01, 0.5, 2.0, 10.0):
         points = in_front(at(mi.Float(0.1, 0.45, 0.99), mi.Float(0.3, 0.5, 0.02)), distance)
         assert np.isfinite(np.array(tex.eval_1(points))).all()

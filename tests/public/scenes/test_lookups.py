@@ -115,7 +115,7 @@ class TestWhere:
 class TestSlope:
     @pytest.mark.parametrize(
         ("space", "wrap"),
-        [("rgb", "repeat"), ("rgb", "mirror"), ("rgb", "clamp"), ("log", "repeat")],
+        [("linear", "repeat"), ("linear", "mirror"), ("linear", "clamp"), ("log", "repeat")],
     )
     def test_is_a_finite_difference(self, space, wrap):
         turn = mi.ScalarTransform4f().rotate([0, 0, 1], 30) @ mi.ScalarTransform4f().scale(0.7)

@@ -108,7 +108,7 @@ class TestMapsOfAFile:
             def texture(name):
                 source = {"type": "gaussian_texture", "filename": str(file), "map": name}
                 source["memory"] = "exact"  # pictures are compared to rounding
-                return {**(source if shared else texture_of(whole[name])), "prefilter": 0.05}
+                return source if shared else texture_of(whole[name])
 
             inner = {"type": "diffuse", "reflectance": texture("albedo")}
             return {"type": "mask", "opacity": texture("roughness"), "inner": inner}
@@ -128,7 +128,7 @@ class TestMapsOfAFile:
                 pictures.append(np.array(mi.render(small_scene(coat, "direct"), spp=8)))
             sizes.append(max(len(kernel.ir.getvalue()) for kernel in jit(launched)))
         np.testing.assert_allclose(*pictures, atol=1e-6)
-        assert mapped or sizes[0] < 0.9 * sizes[1]
+        assert mapped or sizes[0] < 0.95 * sizes[1]
 
     def test_frozen_renderings(self, of_files):
         frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=4, seed=seed))

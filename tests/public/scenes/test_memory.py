@@ -108,7 +108,7 @@ class TestLoss:
     def test_what_words_do_not_hold_stays_floats(self, tmp_path):
         arrays = gaussians().to_arrays()
         arrays["factor"][0] = 1e-12, 0, 1
-        g = eg.Gaussians.from_arrays(**arrays, size=SIZE, space="rgb", backend=backend())
+        g = eg.Gaussians.from_arrays(**arrays, size=SIZE, space="linear", backend=backend())
         np.testing.assert_array_equal(seen(mi.load_dict(in_a_file(tmp_path, g))), seen(texture(g)))
 
     def test_light_above_65504(self, tmp_path):

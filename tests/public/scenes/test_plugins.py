@@ -76,7 +76,7 @@ random = np.random.default_rng(0)
 noise = random.random((256, 256, 3)).astype(np.float32)
 gaussians = eg.Gaussians.from_arrays(
     random.random((24, 2)) * (22, 17), np.tile([0.4, 0, 0.4], (24, 1)), random.random((24, 3)) / 9,
-    [0.5] * 3, size=(22, 17), space="rgb",
+    [0.5] * 3, size=(22, 17), space="linear",
 )
 for n in range(6):
     mi.Bitmap(noise).write(rf"FOLDER/{n}.exr")

@@ -8,9 +8,10 @@ import eigengs_dr as eg
 from _helpers.errors import refused
 from _helpers.kernels import launches
 from _helpers.light import to_coded, to_log
+from _helpers.poster import camera
 from _helpers.sets import COUNT, SIZE
 from _helpers.texture import at, backend, gaussians, mi, small_scene, texture
-from _helpers.variants import in_all, in_variants, on_both
+from _helpers.variants import in_variants, on_both
 from eigengs_dr.plugins import bake_environment, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -53,7 +54,8 @@ COLUMNS, TILE = 4, 8
 
 
 def gallery(show=texture_of):
-    """A wall for each slot, in two rows, seen from the front in the light of a sky and a lamp."""
+    """A wall for each slot, in two rows, seen from the front in the light of a sky and a lamp
+    behind the camera."""
     at = mi.ScalarTransform4f()
     walls = {
         name: {
@@ -72,7 +74,7 @@ def gallery(show=texture_of):
             "type": "scene",
             "integrator": {"type": "direct"},
             "sensor": {"type": "orthographic", "to_world": view, "film": film},
-            "lamp": {"type": "sphere", "center": [0, 3.2, 3], "emitter": light},
+            "lamp": {"type": "sphere", "center": [0, 0, 7], "emitter": light},
             "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}},
             **walls,
         }
@@ -80,20 +82,19 @@ def gallery(show=texture_of):
 
 
 def test_every_slot_shows_what_a_bitmap_of_the_same_picture_shows():
-    """Slopes of a bitmap are those of its texels, random normals point behind a surface, and rays
-    through glass end at edges."""
+    """Slopes of a bitmap are those of its texels, and random normals point behind a surface."""
     images = [
         np.array(mi.render(gallery(show), spp=64, seed=1)) for show in (texture_of, fine_bitmap)
     ]
     for k, name in enumerate(slots(texture_of)):
-        row, column = TILE * (k // COLUMNS), TILE * (COLUMNS - 1 - k % COLUMNS)
+        row, column = TILE * (k // COLUMNS), TILE * (k % COLUMNS)
         seen, expected = (i[row : row + TILE, column : column + TILE] for i in images)
         apart = np.sqrt(np.mean((seen - expected) ** 2)) / expected.mean()
-        assert apart < {"bump": 0.02, "normals": 0.02, "glass": 0.01}.get(name, 5e-4), name
+        assert apart < {"bump": 0.02, "normals": 0.05}.get(name, 5e-4), name
         assert seen.std() > 1e-3, name
 
 
-@in_all
+@in_variants([*on_both("rgb"), *on_both("spectral")])
 def test_every_slot_has_derivatives(variant):
     scene = gallery()
     parameters = mi.traverse(scene)
@@ -226,3 +227,49 @@ def test_sky_of_a_set(space, value):
 def test_data_is_no_sky():
     with refused(ValueError, "bake_environment: the set has 3 channels"):
         bake_environment(even("data", BRIGHT))
+
+
+class TestPeers:
+    """Scenes of other packages, where they are installed, show what a bitmap shows in them."""
+
+    @staticmethod
+    def check(render):
+        g = gaussians("linear")
+        bitmap = fine_bitmap(g)
+        for seen, expected in zip(render(texture_of(g)), render(bitmap), strict=True):
+            seen, expected = np.array(seen), np.array(expected)
+            assert np.isfinite(seen).all() and expected.mean() > 0.01
+            assert np.sqrt(np.mean((seen - expected) ** 2)) < 0.02 * expected.mean()
+
+    def test_a_transient_path(self):
+        """Of mitransient: the steady picture, and one for each time of flight."""
+        pytest.importorskip("mitransient", reason="mitransient is not installed")
+        film = {"type": "transient_hdr_film", "width": 16, "height": 16}
+        film |= {"temporal_bins": 8, "start_opl": 3.0, "bin_width_opl": 2.0}
+
+        def render(reflectance):
+            wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+            integrator = {"type": "transient_path", "max_depth": 3}
+            sensor = {**camera([0, 0, 3.0]), "film": film | {"rfilter": {"type": "box"}}}
+            lamp = {"type": "point", "position": [0, 1, 3], "intensity": 10.0}
+            scene = {"integrator": integrator, "sensor": sensor, "wall": wall, "lamp": lamp}
+            return mi.render(mi.load_dict({"type": "scene", **scene}), spp=32, seed=1)
+
+        self.check(render)
+
+    def test_a_scene_of_typed_parts(self):
+        """Of mitsuba-scene-description: the dictionary stands where a plugin would."""
+        msd = pytest.importorskip("mitsuba_scene_description", reason="it is not installed")
+
+        def render(reflectance):
+            view = msd.Transform().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+            material = msd.SmoothDiffuseMaterial(reflectance=reflectance)
+            scene = msd.Scene(
+                integrator=msd.PathTracer(max_depth=2),
+                sensors=msd.PerspectivePinholeCamera(fov=40, to_world=view),
+                shapes={"wall": msd.Rectangle(bsdf=material)},
+                emitters={"sky": msd.ConstantEnvironmentEmitter()},
+            )
+            return [mi.render(mi.load_dict(scene.to_dict()), spp=4, seed=1)]
+
+        self.check(render)
