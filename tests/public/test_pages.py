@@ -28,7 +28,7 @@ TEXTURE = re.compile(r'<texture name="\w+" (type="gaussian_texture">.*?</texture
 ELSEWHERE = {
     r"^(pip|apt|dnf|brew|winget) ": "it installs something",
     r"^(make|python3 -m venv) ": "it is for a clone of the repository",
-    r"tcp://": "it needs a scheduler on another machine",
+    r"tcp://|https?://": "it needs a scheduler, or files, on another machine",
     r"^#!/bin/bash": "it is a job of Slurm",
 }
 """What no test runs, and why."""
@@ -127,7 +127,7 @@ def test_commands_of_a_page_have_the_options_that_they_name(page):
     texts = [help_of(name) for name in commands_in(help_of())]
     text = "\n".join(texts) if page == "help" else page.read_text()
     for match in COMMAND.finditer(text):
-        line = " ".join((match[1] or match[2]).split())
+        line = re.sub(r"<\(.*?\)", "FILE", " ".join((match[1] or match[2]).split()))
         words = shlex.split(line.rstrip("\\&").replace("...", ""))[1:]
         command = ()
         while commands_in(help_of(*command)) and words and not words[0].startswith("-"):

@@ -108,6 +108,7 @@ def test_cuda_without_gpu(photo, existing):
     assert_refused(run(*command), "CUDA", "llvm")
 
 
+@pytest.mark.slow
 def test_command_finds_few_or_says_that_it_cannot(photo, tmp_path):
     out, report = tmp_path / "a.npz", tmp_path / "a.json"
     base = ["fit", photo, "-o", out, "--quiet", "--iterations", 20, "--report", report]

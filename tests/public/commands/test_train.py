@@ -69,6 +69,7 @@ def test_target_psnr(tmp_path):
     assert len({len(line) for line in table}) == 1
 
 
+@pytest.mark.slow
 def test_options(trained, tmp_path):
     expected = {"energy": 0.5, "space": "rgb", "seed": 3, "preset": "eigengs", "iterations": 2}
     options = [word for name, value in expected.items() for word in (f"--{name}", value)]
