@@ -24,8 +24,9 @@ SLOW = [name for name in MODULES if name.startswith("eigengs_dr.plugins.")]
     "module", [pytest.param(m, marks=pytest.mark.slow if m in SLOW else ()) for m in MODULES]
 )
 def test_examples_in_docstrings(module):
-    if module.startswith("eigengs_dr.scene."):
-        pytest.importorskip("mitsuba", reason="scenes need mitsuba")
+    if module.startswith(("eigengs_dr.scene.", "eigengs_dr.plugins.")):
+        mi = pytest.importorskip("mitsuba", reason="scenes need mitsuba")
+        mi.set_variant("llvm_ad_rgb")
     found = doctest.testmod(importlib.import_module(module))
     assert found.failed == 0
 
