@@ -78,11 +78,7 @@ class TestFit:
         assert "60 Gaussians, 32x32 pixels" in repr(smooth) and "35 lights" in repr(smooth)
         assert '<img src="data:image/' in smooth._repr_html_()
 
-    def test_numbers_of_planes_and_gaussians_can_be_given(self):
-        found = model_of(PHOTOS[~LEFT_OUT], gaussians=40, planes=6, iterations=0)
-        assert (len(found.planes), found.planes.channels) == (40, 6)
-        assert found.table.values.shape == (35, 3, 7)
-
+    @pytest.mark.slow
     def test_photos_that_do_not_depend_on_the_light(self):
         same = np.repeat(photos(directions(30)[:1]), 8, axis=0)
         options = OPTIONS | {"gaussians": 80, "planes": None, "iterations": 20}
@@ -126,7 +122,7 @@ class TestFit:
 
 
 class TestRelight:
-    @pytest.mark.parametrize("kind", ["thin_plate", "hsh"])
+    @pytest.mark.parametrize("kind", ["thin_plate", pytest.param("hsh", marks=pytest.mark.slow)])
     def test_the_derivative_by_the_direction_is_that_of_finite_differences(self, kind):
         """In float64, and for any length of the direction."""
         lit = LitFormula().model(kind=kind, smoothing=1e-3)
@@ -226,6 +222,7 @@ class TestNumber:
     """The PSNR of photos that the model has never seen."""
 
     def test_is_that_of_photos_left_out_by_hand(self, model):
+        assert (len(model.planes), model.planes.channels) == (60, 6)
         assert model.psnr_held_out == pytest.approx(real_psnr(model), abs=0.5)
 
     def test_after_packing_is_that_of_the_file(self, model, tmp_path):

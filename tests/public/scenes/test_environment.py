@@ -14,7 +14,7 @@ from _helpers.light import to_log
 from _helpers.poster import camera
 from _helpers.skies import HEIGHT, WIDTH, directions, lit, mi, seen, sky, uniform
 from _helpers.texture import backend
-from _helpers.variants import in_all, in_variants, on_both
+from _helpers.variants import BOTH_RGB_AND_SLOW_SPECTRAL, in_all, in_variants
 from eigengs_dr.plugins import (
     bake_environment,
     environment_of,
@@ -55,6 +55,7 @@ class TestPicture:
         expected = np.broadcast_to(expected.clip(0, top), found.shape)
         np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-4)
 
+    @pytest.mark.slow
     def test_the_more_texels_the_closer_is_an_envmap(self):
         """Its rows go from pole to pole."""
         g = sky(size=(32, 16))
@@ -80,6 +81,7 @@ class TestPicture:
         assert np.sqrt(np.square(difference).mean()) < 0.025 * pictures[1].mean()
         assert abs(difference.mean()) < 0.005 * pictures[1].mean()
 
+    @pytest.mark.slow
     @in_variants(["llvm_ad_spectral_polarized"])
     def test_polarized(self, variant):
         a, b = (
@@ -114,6 +116,7 @@ class TestPicture:
         _, weight = emitter.sample_direction(dr.zeros(mi.Interaction3f, 1000), uniform(1000))
         assert np.array(weight).min() >= 0
 
+    @pytest.mark.slow
     def test_of_a_single_bright_channel(self):
         g = one([8, 4], [0], (16, 8), "log", to_log(np.float32([30.0])))
         np.testing.assert_allclose(seen(mi.load_dict(environment_of(g)), texels()), 30, rtol=1e-3)
@@ -183,7 +186,6 @@ class TestFootprint:
 SETS = {
     "sharp": {"deviation": (0.2, 0.5), "count": 10},
     "log": {"space": "log", "deviation": (0.5, 3.0)},
-    "wide": {"size": (400, 60), "deviation": (1.0, 9.0)},
 }
 
 
@@ -233,7 +235,7 @@ class TestSampling:
         assert np.isfinite(np.array(ds.pdf)).all()
         assert (np.array(weight) == 0).all()
 
-    @in_variants([*on_both("rgb"), *on_both("spectral")])
+    @in_variants(BOTH_RGB_AND_SLOW_SPECTRAL)
     def test_rays_from_the_light(self, variant):
         """Light traced from the sky is that traced from the camera, the background too.
 
@@ -307,7 +309,8 @@ class TestDerivatives:
             assert (gradient * along).sum() == pytest.approx(expected, rel=0.02, abs=0.05), key
 
     @pytest.mark.parametrize(
-        ("integrator", "name"), [("direct", "mean"), ("direct", "scale"), ("prb", "color")]
+        ("integrator", "name"),
+        [pytest.param("direct", "mean", marks=pytest.mark.slow), ("prb", "color")],
     )
     def test_forward_mode_is_backward_mode(self, integrator, name):
         found = []
