@@ -108,24 +108,6 @@ class TestSampling:
         density = np.array(texture(g, raw=True).pdf_position(mi.Point2f(0.3, 0.7)))
         assert density == pytest.approx(1)
 
-    def test_in_a_frozen_program(self):
-        """It follows the colours, which are changed between the calls."""
-        tex = texture(gaussians("linear", quiet=False))
-        tex.sample_position(mi.Point2f(0.5))  # a recording cannot make the distribution
-        parameters = mi.traverse(tex)
-        rng = np.random.default_rng(1)
-        sample = mi.Point2f(*(mi.Float(rng.random(50, np.float32)) for _ in "uv"))
-        frozen = dr.freeze(lambda tex, sample: tex.sample_position(sample))
-        for _ in range(3):
-            before = np.array(tex.mean()).item()
-            parameters["color"] *= 0.5
-            parameters.update()
-            assert abs(np.array(tex.mean()).item() - before) > 1e-4
-            for found, expected in zip(
-                frozen(tex, sample), tex.sample_position(sample), strict=True
-            ):
-                np.testing.assert_allclose(np.array(found), np.array(expected), atol=1e-6)
-
 
 @pytest.mark.parametrize("space", ["linear", "log"])
 def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(space):

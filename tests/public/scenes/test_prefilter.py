@@ -55,8 +55,9 @@ def clamped(scene, **properties):
 
 
 class TestCone:
-    @pytest.mark.parametrize("tilt", [0.0, 1.2])
-    @pytest.mark.parametrize("linear", [np.eye(2), np.array([[0.6, 0.9], [-0.3, 1.1]])])
+    @pytest.mark.parametrize(
+        ("tilt", "linear"), [(0.0, np.eye(2)), (1.2, np.array([[0.6, 0.9], [-0.3, 1.1]]))]
+    )
     def test_is_as_wide_as_a_pixel_and_as_long_as_the_tilt_makes_it(self, tilt, linear):
         """Also for a `to_uv` that is no scale."""
         scene, angle = random_scene(), 0.05
