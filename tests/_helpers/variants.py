@@ -25,6 +25,12 @@ def in_variants(names):
 
 in_all = in_variants([*BOTH_RGB, *on_both("mono"), *on_both("spectral")])
 
+BOTH_RGB_AND_SLOW_SPECTRAL = [
+    *BOTH_RGB,
+    pytest.param("llvm_ad_spectral", marks=pytest.mark.slow),
+    *on_both("spectral")[1:],
+]
+
 
 @pytest.fixture(params=BOTH_RGB)
 def variant(request):

@@ -100,10 +100,7 @@ SHEARED = np.array([[1, 0.5], [0, 0.6], [0, 0.0]])
 
 WALLS = {
     "upright": (PLANE, UPRIGHT, {}),
-    "a quarter turn": (PLANE, [[0, -1, 1], [1, 0, 0]], {}),
-    "scaled unequally": (PLANE, [[3, 0, 0.2], [0, -0.5, 0.1]], {}),
     "sheared": (SHEARED, [[2, 0.7, 0.3], [-0.4, -1.5, 0.2]], {}),
-    "mirrored copies": (PLANE, [[2.6, 0, -0.8], [0, -3.3, 1.2]], {"wrap": "mirror"}),
     "turned, mirrored copies": (SHEARED, [[1.5, -2, 0.8], [2.2, 1.4, -1.2]], {"wrap": "mirror"}),
     "turned over": (PLANE @ np.diag([1, -1]), UPRIGHT, {"flipped": True, "flip_normals": True}),
     "uv mirrored": (PLANE[:, ::-1], [[1, 0, 0], [0, 1, 0]], {}),
@@ -276,6 +273,7 @@ def test_light_above_white_survives_and_what_is_brighter_than_the_photos_does_no
         assert np.percentile(abs(found - expected), 98) < 0.02 * expected.max()
 
 
+@pytest.mark.slow
 def test_an_environment_of_a_model_of_bright_photos_is_not_clamped():
     formula = LitFormula(scale=3.0)
     shown = [
@@ -519,6 +517,7 @@ class TestTexture:
             expected = eg.picture_of(formula.model().relight(light)).clip(0, 1)
             np.testing.assert_allclose(found, to_light(expected), atol=1e-3)
 
+    @pytest.mark.slow
     @few_groups()
     def test_packed_models_are_read(self, formula, saved, tmp_path):
         eg.pack(formula.model(), tmp_path / "m.egs", max_psnr_drop=0.1)
@@ -527,10 +526,9 @@ class TestTexture:
         found, expected = (picture(t.eval_3(texel_centres(SIZE)), SIZE) for t in (packed, whole))
         np.testing.assert_allclose(found, expected, atol=0.05)
 
-    @pytest.mark.parametrize("integrator", ["direct", "prb"])
-    def test_the_derivative_is_that_of_finite_differences(self, saved, integrator):
+    def test_the_derivative_is_that_of_finite_differences(self, saved):
         texture = {"type": "gaussian_texture", "model": saved, "light": LIGHT}
-        scene = wall_in_light({"type": "diffuse", "reflectance": texture}, integrator)
+        scene = wall_in_light({"type": "diffuse", "reflectance": texture}, "prb")
         parameters = mi.traverse(scene)
 
         def rendered(light):
@@ -568,6 +566,7 @@ class TestTexture:
                 mi.load_dict({"type": "gaussian_texture", "model": saved, "light": light})
 
 
+@pytest.mark.slow
 def test_one_plane_is_a_plane():
     """As two are, which of another texture would be those of normals, and get a third."""
     lights = directions(8)

@@ -15,7 +15,7 @@ from eigengs_dr.plugins import environment_of, follow, material_of, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
-PREFILTERS = [0.05, 0.2]
+EXACT, PYRAMID = 0.05, 0.2
 """Angles in radians: exact sums, then lookups of the pyramid."""
 
 STEP = 0.01
@@ -110,32 +110,27 @@ MOVES = {
     "vertices": ("wall.vertex_positions", lambda at, t: at + mi.Float([1, 0.3, 0] * 4) * t),
     "camera": (
         "camera.to_world",
-        lambda view, t: view @ mi.Transform4f().translate(mi.Vector3f(t, 0.3 * t, 0)),
-    ),
-    "nearer camera": (
-        "camera.to_world",
-        lambda view, t: view @ mi.Transform4f().translate(mi.Vector3f(0, 0, t)),
+        lambda view, t: view @ mi.Transform4f().translate(mi.Vector3f(t, 0.3 * t, t)),
     ),
 }
 
 
 class TestTexture:
-    @pytest.mark.parametrize("prefilter", PREFILTERS)
-    @pytest.mark.parametrize("what", MOVES)
+    @pytest.mark.parametrize(
+        ("what", "prefilter"),
+        [
+            ("uv", EXACT),
+            pytest.param("zoom of uv", PYRAMID, marks=pytest.mark.slow),
+            ("vertices", PYRAMID),
+            ("camera", EXACT),
+        ],
+    )
     def test_derivative_by_what_moves(self, square, what, prefilter):
         scene = scene_of(square, painted(prefilter=prefilter))
         assert_close(ratios(scene, *MOVES[what]))
 
-    @pytest.mark.parametrize(
-        ("integrator", "properties"),
-        [
-            pytest.param("path", {}, marks=pytest.mark.slow),
-            ("prb", {"wrap_mode": "clamp"}),
-            ("direct", {"wrap_mode": "mirror"}),
-        ],
-    )
-    def test_other_integrators_and_borders(self, square, integrator, properties):
-        scene = scene_of(square, painted(prefilter=0.05, **properties), integrator)
+    def test_replayed_path_and_a_clamped_border(self, square):
+        scene = scene_of(square, painted(prefilter=EXACT, wrap_mode="clamp"), "prb")
         assert_close(ratios(scene, *MOVES["uv"]))
 
     @pytest.mark.slow
@@ -151,22 +146,6 @@ class TestTexture:
         scene = scene_of(square, {"emitter": {"type": "area", "radiance": radiance}})
         follow(scene)
         assert_close(ratios(scene, *MOVES["uv"]))
-
-    @pytest.mark.slow
-    def test_derivative_by_colours_too(self, square):
-        """With derivatives by place beside them, those by the parameters stay what they were."""
-        scene = scene_of(square, painted(prefilter=0.1))
-        parameters = mi.traverse(scene)
-        color, uv = "wall.bsdf.reflectance.color", "wall.vertex_texcoords"
-        found = []
-        for keys in ([color], [color, uv]):
-            for key in keys:
-                parameters[key] = type(parameters[key])(dr.detach(parameters[key]))
-                dr.enable_grad(parameters[key])
-            parameters.update()
-            dr.backward(dr.sum(mi.render(scene, parameters, spp=16, seed=3), axis=None))
-            found.append(np.array(dr.grad(parameters[color])))
-        np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-4 * np.abs(found).max())
 
 
 @pytest.mark.slow
@@ -267,29 +246,6 @@ class TestEnvironment:
         return eg.Gaussians.from_arrays(
             mean, factor, color, np.ones(3), size=(64, 32), space="radiance"
         )
-
-    def test_directions(self):
-        sky = mi.load_dict(environment_of(self.sky(), prefilter=0.2, scale=2.0))
-        rng = np.random.default_rng(0)
-        towards = rng.normal(size=(3, 1000)).astype(np.float32)
-        towards /= np.linalg.norm(towards, axis=0)
-        aside = np.cross(towards.T, [0.3, 0.5, -0.2]).T.astype(np.float32)
-
-        def light(t):
-            si = dr.zeros(mi.SurfaceInteraction3f, towards.shape[1])
-            si.wi = -(mi.Vector3f(*map(mi.Float, towards)) + t * mi.Vector3f(*map(mi.Float, aside)))
-            return sky.eval(si).x
-
-        ahead, behind = (np.array(light(mi.Float(t))) for t in (STEP, -STEP))
-        wanted = (ahead - behind) / (2 * STEP)
-        t = mi.Float(0)
-        dr.enable_grad(t)
-        value = light(t)
-        dr.forward(t, flags=dr.ADFlag.ClearVertices)
-        forward = (np.array(dr.grad(value)) * wanted).sum()
-        dr.set_grad(t, 0)
-        dr.backward(dr.sum(light(t) * mi.Float(np.float32(wanted))))
-        assert_close(np.array([forward, dr.grad(t)[0]]) / np.square(wanted).sum())
 
     @pytest.mark.parametrize("integrator", [pytest.param("path", marks=pytest.mark.slow), "prb"])
     def test_turned_in_a_scene(self, integrator):

@@ -9,7 +9,7 @@ from _helpers.chi_square import assert_density
 from _helpers.light import LUMINANCE, to_linear
 from _helpers.sets import SIZE
 from _helpers.texture import at, backend, gaussians, mi, small_scene, texel_centres, texture
-from _helpers.variants import in_variants, on_both
+from _helpers.variants import BOTH_RGB_AND_SLOW_SPECTRAL, in_variants, on_both
 from eigengs_dr.plugins import texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -28,7 +28,7 @@ def lamps(deviation, count=40, side=256, space="linear"):
 
 
 class TestMean:
-    @pytest.mark.parametrize("deviation", [0.03, 0.3, 2.0])
+    @pytest.mark.parametrize("deviation", [0.03, 2.0])
     def test_is_the_integral_however_small_the_gaussians_are(self, deviation):
         g, expected = lamps(deviation)
         assert np.array(texture(g).mean()).item() == pytest.approx(expected, rel=2e-3)
@@ -108,24 +108,6 @@ class TestSampling:
         density = np.array(texture(g, raw=True).pdf_position(mi.Point2f(0.3, 0.7)))
         assert density == pytest.approx(1)
 
-    def test_in_a_frozen_program(self):
-        """It follows the colours, which are changed between the calls."""
-        tex = texture(gaussians("linear", quiet=False))
-        tex.sample_position(mi.Point2f(0.5))  # a recording cannot make the distribution
-        parameters = mi.traverse(tex)
-        rng = np.random.default_rng(1)
-        sample = mi.Point2f(*(mi.Float(rng.random(50, np.float32)) for _ in "uv"))
-        frozen = dr.freeze(lambda tex, sample: tex.sample_position(sample))
-        for _ in range(3):
-            before = np.array(tex.mean()).item()
-            parameters["color"] *= 0.5
-            parameters.update()
-            assert abs(np.array(tex.mean()).item() - before) > 1e-4
-            for found, expected in zip(
-                frozen(tex, sample), tex.sample_position(sample), strict=True
-            ):
-                np.testing.assert_allclose(np.array(found), np.array(expected), atol=1e-6)
-
 
 @pytest.mark.parametrize("space", ["linear", "log"])
 def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(space):
@@ -140,7 +122,7 @@ def test_a_lamp_lights_as_a_bitmap_of_the_same_picture_does(space):
     np.testing.assert_allclose(means[0], means[1], rtol=0.02)
 
 
-@in_variants([*on_both("rgb"), *on_both("spectral")])
+@in_variants(BOTH_RGB_AND_SLOW_SPECTRAL)
 def test_particles_leave_it_as_paths_find_it(variant):
     """Light traced from the emitter, which samples positions and wavelengths of the texture."""
     emitter = {"type": "area", "radiance": texture_of(gaussians("linear", quiet=False))}

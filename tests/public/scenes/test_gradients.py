@@ -88,7 +88,7 @@ def check_gradients(scene, names):
 
 @pytest.mark.parametrize(
     ("integrator", "prefilter"),
-    [("direct", 0.0), pytest.param("path", 0.0, marks=pytest.mark.slow), ("prb", 0.05)],
+    [("direct", 0.0), ("prb", 0.05)],
 )
 def test_gradients_are_finite_differences(integrator, prefilter):
     """A cutoff of 6 leaves no edge for finite differences to cross."""
@@ -108,7 +108,7 @@ def along_parameters(integrator):
     return mi.render(scene, parameters, seed=SEED, spp=8), along
 
 
-@pytest.mark.parametrize("integrator", ["direct", "prb"])
+@pytest.mark.parametrize("integrator", [pytest.param("direct", marks=pytest.mark.slow), "prb"])
 def test_forward_mode_in_the_usual_order(integrator):
     """Rendered first and walked then, from a variable behind the parameters."""
     image, along = along_parameters(integrator)
@@ -228,10 +228,7 @@ HUGE = 3.3e38
     "factor",
     [
         (1e-20, 0, 1e-20),
-        (1e-37, 0, 1),
         (1, 0, 1e-37),
-        (HUGE, 0, HUGE),
-        (1, HUGE, 1),
         (HUGE, HUGE, HUGE),
     ],
 )

@@ -130,6 +130,7 @@ class TestMapsOfAFile:
         np.testing.assert_allclose(*pictures, atol=1e-6)
         assert mapped or sizes[0] < 0.95 * sizes[1]
 
+    @pytest.mark.slow
     def test_frozen_renderings(self, of_files):
         frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=4, seed=seed))
         scenes = [small_scene(of_files(shared), "direct") for shared in (True, False)]

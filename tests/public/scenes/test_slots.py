@@ -11,7 +11,7 @@ from _helpers.light import to_coded, to_log
 from _helpers.poster import camera
 from _helpers.sets import COUNT, SIZE
 from _helpers.texture import at, backend, gaussians, mi, small_scene, texture
-from _helpers.variants import in_variants, on_both
+from _helpers.variants import BOTH_RGB_AND_SLOW_SPECTRAL, in_variants, on_both
 from eigengs_dr.plugins import bake_environment, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -94,7 +94,7 @@ def test_every_slot_shows_what_a_bitmap_of_the_same_picture_shows():
         assert seen.std() > 1e-3, name
 
 
-@in_variants([*on_both("rgb"), *on_both("spectral")])
+@in_variants(BOTH_RGB_AND_SLOW_SPECTRAL)
 def test_every_slot_has_derivatives(variant):
     scene = gallery()
     parameters = mi.traverse(scene)
@@ -111,6 +111,7 @@ def test_every_slot_has_derivatives(variant):
         assert np.abs(gradient).max() > 0, key
 
 
+@pytest.mark.slow
 @in_variants(["llvm_ad_spectral_polarized"])
 def test_polarized_light(variant):
     """All parameters of Stokes, of light off white: spectra of a colour differ in both models."""
@@ -241,6 +242,7 @@ class TestPeers:
             assert np.isfinite(seen).all() and expected.mean() > 0.01
             assert np.sqrt(np.mean((seen - expected) ** 2)) < 0.02 * expected.mean()
 
+    @pytest.mark.slow
     def test_a_transient_path(self):
         """Of mitransient: the steady picture, and one for each time of flight."""
         pytest.importorskip("mitransient", reason="mitransient is not installed")
