@@ -202,7 +202,9 @@ def waves(width, height):
     return (0.5 + 0.2 * np.sin(3 * x[:, None] + [0, 1, 2]) * np.cos(2 * y)).astype(np.float32)
 
 
-@pytest.mark.parametrize("size", [(32, 32), (64, 64), (48, 20), (28, 90)])
+@pytest.mark.parametrize(
+    "size", [(32, 32), (64, 64), pytest.param((48, 20), marks=pytest.mark.slow), (28, 90)]
+)
 def test_any_size_and_aspect(backend, size):
     """The splats are those of the image at the model's own size, scaled."""
     model, image = small_model(backend), waves(*size)

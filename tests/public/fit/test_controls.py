@@ -86,6 +86,7 @@ def test_a_redistribution_places_all_anew():
     assert found.psnr_rgb > plain.psnr_rgb
 
 
+@pytest.mark.slow
 def test_chosen_gaussians_stay_where_they_fit():
     """Where half of the set has no error, no redistribution is better."""
     start = eg.fit(PHOTO, 150, 300, space="rgb")
@@ -169,6 +170,7 @@ def test_controls_leave_levels_alone(name):
     assert all(before is after for _, before, after in watch.acts)
 
 
+@pytest.mark.slow
 def test_levels_relocate_inside_themselves():
     """A tenth of each level, at most, before the same background."""
     watch = Watch(replace(CONTROLS["Relocate"], every=20))

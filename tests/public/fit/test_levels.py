@@ -94,7 +94,7 @@ def test_a_level_is_sorted_by_worth():
         assert (np.diff(errors) <= 1e-3 * np.ptp(errors)).all()
 
 
-@pytest.mark.parametrize("space", ["linear", "data"])
+@pytest.mark.parametrize("space", [pytest.param("linear", marks=pytest.mark.slow), "data"])
 def test_other_spaces(space):
     found = eg.fit(IMAGE, COUNTS, iterations=5, space=space)
     assert found.gaussians.space == space

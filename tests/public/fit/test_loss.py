@@ -116,7 +116,15 @@ def test_maps_are_given_by_name():
 # --- Without an image ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("space", ["rgb", "ycbcr", "linear", "log"])
+@pytest.mark.parametrize(
+    "space",
+    [
+        "rgb",
+        pytest.param("ycbcr", marks=pytest.mark.slow),
+        pytest.param("linear", marks=pytest.mark.slow),
+        "log",
+    ],
+)
 def test_no_image_is_needed(space):
     """In every space the picture is what `render` gives."""
     found = fit(squares, 100, 120, space, **FREE)
@@ -232,7 +240,7 @@ def test_the_last_set_counts_without_a_judge():
     assert found.loss == found.trace[-1]["loss"]
 
 
-@pytest.mark.parametrize("kind", [float, np.float32, np.asarray, lambda x: int(1e6 * x)])
+@pytest.mark.parametrize("kind", [float, np.asarray, lambda x: int(1e6 * x)])
 def test_a_judge_chooses_the_best_set_by_any_number(kind):
     loss = eg.Loss(squares, judge=lambda p: kind(np.mean((p.numpy() - IMAGE) ** 2)))
     found = fit(loss, 20, 4, image=IMAGE)
@@ -293,7 +301,8 @@ def descent(name, rate):
     return replace(plain, rates={name: rate}, warm_up=0, average=0.0, cutoff=9.0)
 
 
-CASES = [("rgb", "mean"), ("rgb", "factor"), ("ycbcr", "color"), ("log", "color")]
+CASES = [("rgb", "mean"), ("rgb", "factor"), ("log", "color")]
+CASES += [pytest.param("ycbcr", "color", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(("space", "name"), CASES)
@@ -475,7 +484,7 @@ STOPS = {"first": 0, "texels": 2, "later": 13}
 
 
 @given
-@pytest.mark.parametrize("target", [None, 1e-4])
+@pytest.mark.parametrize("target", [None, pytest.param(1e-4, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("stop", [*STOPS, "judge"])
 def test_a_loss_or_a_judge_may_end_the_fit(stop, target, given):
     """The best set so far is there, also if the judge measures no more."""

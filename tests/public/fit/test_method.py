@@ -151,24 +151,22 @@ def adan_by_hand(x, gradient, rate, steps, betas, epsilon=1e-8):
     ("optimizer", "by_hand", "betas"),
     [
         (replace(ADAM, beta_1=0.9, beta_2=0.99, epsilon=1e-12), adam_by_hand, (0.9, 0.99)),
-        (replace(ADAM, beta_1=0.0, beta_2=0.5, epsilon=1e-12), adam_by_hand, (0.0, 0.5)),
         (adan.Adan(), adan_by_hand, (0.98, 0.92, 0.99)),
     ],
-    ids=["adam", "no momentum", "adan"],
+    ids=["adam", "adan"],
 )
 def test_steps_are_those_of_the_paper(optimizer, by_hand, betas, backend):
     """Of a variable whose gradient is always 0 too: it rests."""
     Float, start = getattr(dr, backend).ad.Float64, np.array([1.0, -2, 0.5, 0])
-    steps = 30 if betas[0] else 20  # without momentum it then oscillates, and rounding grows
     value, path = Float(start), []
     moments = optimizer.start(value)
-    for time in range(1, steps + 1):
+    for time in range(1, 31):
         gradient = value * value * value + 3 * dr.sin(value)
         numbers = dr.opaque(Float, 0.1), dr.opaque(Float, time)
         value, moments = optimizer.step(value, gradient, moments, *numbers)
         dr.eval(value, moments)
         path.append(value.numpy().copy())
-    expected = [*by_hand(start, lambda x: x**3 + 3 * np.sin(x), 0.1, steps, betas)]
+    expected = [*by_hand(start, lambda x: x**3 + 3 * np.sin(x), 0.1, 30, betas)]
     np.testing.assert_allclose(path, expected, rtol=0, atol=1e-10 * np.ptp(expected))
 
 
@@ -193,7 +191,7 @@ def test_variables_without_a_rate_stay(rates):
     assert found.psnr_ycbcr > start.psnr_ycbcr
 
 
-@pytest.mark.parametrize("factor", [10, 1000])
+@pytest.mark.parametrize("factor", [pytest.param(10, marks=pytest.mark.slow), 1000])
 @pytest.mark.parametrize("name", ["default", "gaussianimage"])
 def test_rates_far_too_high(name, factor):
     """Nothing but finite numbers, and never worse than the start."""
@@ -203,7 +201,9 @@ def test_rates_far_too_high(name, factor):
     assert result.psnr_ycbcr >= result.trace[0]["psnr_ycbcr"]
 
 
-@pytest.mark.parametrize("count", [300, 8], ids=["many", "large"])
+@pytest.mark.parametrize(
+    "count", [300, pytest.param(8, marks=pytest.mark.slow)], ids=["many", "large"]
+)
 def test_lists_that_last_are_as_good_as_lists_of_every_step(count):
     """A drift of 0 builds lists in every step. Rounding changes most fits by 0.03 dB or less."""
     method, gains = replace(eg.DEFAULT, controls=()), []

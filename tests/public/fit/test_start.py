@@ -171,7 +171,7 @@ def frame(number, shift):
 
 
 @pytest.mark.parametrize("shift", [3, 100])
-@pytest.mark.parametrize("steps", [20, 120])
+@pytest.mark.parametrize("steps", [20, pytest.param(120, marks=pytest.mark.slow)])
 def test_a_film_ends_no_lower_than_fits_of_their_own(shift, steps):
     """Of a camera that moves, and of cuts."""
     start = eg.fit(frame(0, shift), 200, steps)

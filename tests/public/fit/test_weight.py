@@ -28,7 +28,7 @@ def weighted_psnr(rendered, weight, space):
     return -10 * np.log10(np.average(pixels, weights=weights))
 
 
-@pytest.mark.parametrize("layers", [0, 1, 3])
+@pytest.mark.parametrize("layers", [0, pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("space", ["ycbcr", "rgb", "linear", "data"])
 def test_psnrs_are_weighted(space, layers):
     """Weights of channels count by their mean; those of the caller have any scale."""
@@ -45,7 +45,7 @@ def test_psnrs_are_weighted(space, layers):
         assert found.psnr_ycbcr == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.parametrize("space", ["ycbcr", "linear"])
+@pytest.mark.parametrize("space", ["ycbcr", pytest.param("linear", marks=pytest.mark.slow)])
 def test_gaussians_go_where_the_weight_is(space):
     """The disc gains over a fit of the whole image."""
     plain, found = (eg.fit(IMAGE, space=space, weight=w, **QUICK) for w in (None, disc()))

@@ -73,7 +73,7 @@ def test_the_oracle_is_scikit_image():
 
 
 @pytest.mark.parametrize(
-    ("shape", "bits"), [*((s, 32) for s in SHAPES), *((s, 64) for s in SHAPES + SMALL)]
+    ("shape", "bits"), [*((s, 32) for s in SHAPES[1:]), *((s, 64) for s in SHAPES[:1] + SMALL)]
 )
 def test_values(backend, bits, shape):
     """Small pictures have smaller windows; arrays are compared in double precision."""
@@ -163,7 +163,7 @@ def test_every_derivative_is_a_finite_difference(backend, shape, weighted):
             assert found[place] == pytest.approx(expected, abs=1e-8, rel=1e-6)
 
 
-@pytest.mark.parametrize("wanted", [(1, 0), (1, 1)])
+@pytest.mark.parametrize("wanted", [pytest.param((1, 0), marks=pytest.mark.slow), (1, 1)])
 def test_both_modes_equal_finite_differences(backend, wanted):
     a, b = pictures((31, 30, 3), 3)
     moves = np.random.default_rng(4).normal(size=(2, *a.shape)) * np.reshape(wanted, (2, 1, 1, 1))
@@ -247,7 +247,7 @@ def test_frozen_functions_follow_their_arguments(backend):
 # --- Weights ---
 
 
-@pytest.mark.parametrize("layers", [0, 1, 3])
+@pytest.mark.parametrize("layers", [0, pytest.param(1, marks=pytest.mark.slow), 3])
 def test_weights_are_factors_of_windows(backend, layers):
     a, b = pictures((26, 33, 3))
     weight = np.random.default_rng(6).uniform(0, 5, (26, 33, layers) if layers else (26, 33))
