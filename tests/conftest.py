@@ -71,6 +71,15 @@ def one_thread():
         yield
 
 
+thread_count = dr.thread_count
+
+
+@pytest.fixture
+def counted_threads(monkeypatch):
+    """Let `drjit.thread_count` say the truth, see `one_thread`."""
+    monkeypatch.setattr(dr, "thread_count", thread_count)
+
+
 def pytest_runtest_setup(item):
     """Leave the other cores to other processes, and let scenes have the programs of the last run.
 

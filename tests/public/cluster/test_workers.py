@@ -143,7 +143,7 @@ def test_what_is_no_client_is_refused():
 # --- What a cluster has is left as it is ---
 
 
-def test_a_cluster_of_others_is_as_it_was(tmp_path):
+def test_a_cluster_of_others_is_as_it_was(counted_threads, tmp_path):
     """After a run, and after an error; their numbers of threads count during a task alone.
 
     Dask's profiler does not hold the frames of a task: its thread would free the arrays in them.
