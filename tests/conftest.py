@@ -107,3 +107,8 @@ def pytest_terminal_summary(terminalreporter):
     """Say what was not tested for want of a GPU."""
     if not has_gpu():
         terminalreporter.write_line("no CUDA device: the cuda path was not tested")
+
+
+def pytest_unconfigure():
+    """Let the last collection find what `pytest_collection_finish` froze, else nanobind reports it."""
+    gc.unfreeze()
