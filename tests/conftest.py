@@ -110,5 +110,5 @@ def pytest_terminal_summary(terminalreporter):
 
 
 def pytest_unconfigure():
-    """Let the last collection find what `pytest_collection_finish` froze, else nanobind reports it."""
+    """Let the last collection find what was frozen: else nanobind reports it as leaked."""
     gc.unfreeze()
