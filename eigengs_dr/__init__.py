@@ -55,7 +55,7 @@ packed.read_set, packed.read_head = _read_packed, _packed_head
 _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
-WITHOUT_DRJIT = {"load_image", "ms_ssim", "psnr", "sample", "save_image", "ssim"}
+WITHOUT_DRJIT = {"load_image", "psnr", "sample", "save_image"}
 WITHOUT_DRJIT |= {"BackendError", "ClusterError", "ImageError", "Interrupted"}
 
 

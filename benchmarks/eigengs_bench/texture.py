@@ -102,8 +102,8 @@ def _posters(posters: Sequence[Row]) -> Table:
 def _lights(lights: Sequence[Row]) -> Table:
     """Lay out what lights of Gaussians differ by from their bitmaps, and what they cost."""
     caption = (
-        f"Gaussians for {sky.GOAL:g} dB beside the envmap of a bitmap of {2 * sky.ROWS} x "
-        f"{sky.ROWS} texels: PSNR of lookups in even directions, and of pictures without noise; "
+        f"A fit of logarithms for {sky.GOAL:g} dB beside the envmap of a bitmap of {2 * sky.ROWS} "
+        f"x {sky.ROWS} texels: PSNR of lookups in even directions, and of pictures without noise; "
         "largest difference of the mean of a channel; variance at equal samples and time of a "
         "picture, over those with the envmap; memory"
     )

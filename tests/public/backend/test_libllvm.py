@@ -35,12 +35,25 @@ def set_of_one(**backend):
 # --- A libLLVM that is refused ---
 
 
-def refusal(library):
+SIMILARITY = """
+import eigengs_dr as eg, numpy as np
+try:
+    eg.ssim(np.zeros((16, 16, 3)), np.zeros((16, 16, 3)))
+except eg.BackendError as error:
+    print(error)
+"""
+
+
+def refusal(library, program=SELECT):
     """What is said where `library` is forced; it has to be all that is said."""
-    process = run_python(SELECT, **{PATH_VARIABLE: str(library)})
+    process = run_python(program, **{PATH_VARIABLE: str(library)})
     assert process.returncode == 0, process.stderr
     assert process.stderr == "" and process.stdout.count("\n") == 1
     return process.stdout
+
+
+def test_a_metric_that_needs_a_backend_is_as_quiet(tmp_path):
+    assert "does not exist" in refusal(tmp_path / "libLLVM.so", SIMILARITY)
 
 
 @pytest.mark.parametrize(
