@@ -69,7 +69,7 @@ def descent(
     if begun is None:
         begun = method.place_and_solve(objective, problem.first_count, chosen.seed)
     if problem.start is not None or method.place != Adaptive():
-        method = method.without("grows", "places")
+        method = method.without("densify", "redistribute")
     state = begin(begun)
     steps = descend(objective, method, state, iterations, chosen.seed)
     for iteration in range(iterations + 1):

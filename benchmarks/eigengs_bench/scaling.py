@@ -24,7 +24,7 @@ from eigengs_dr.backend.arrays import ArrayTypes, types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.loop import descend
 from eigengs_dr.fitting.objective import Pixels
-from eigengs_dr.fitting.placement.adaptive import place_adaptive
+from eigengs_dr.fitting.place import place_adaptive
 from eigengs_dr.fitting.solve import solve
 from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.resize import center_crop

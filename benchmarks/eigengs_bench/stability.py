@@ -78,7 +78,7 @@ def fit_case(
         begun = {"start": eg.EigenGS.load(BASIS, backend)}
     elif case.place is not None:  # all of it is kept, so that the descent itself is measured
         begun = {"start": _start(case, image, backend)}
-        method = method.without("places")
+        method = method.without("redistribute")
     return eg.fit(
         image,
         iterations=case.iterations,

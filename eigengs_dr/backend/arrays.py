@@ -155,7 +155,7 @@ def upload_rows(kind: type[Kind], rows: Iterable[Values]) -> list[Kind]:
     return targets
 
 
-def settle(rows: list[kinds.Float]) -> list[kinds.Float]:
+def eval_pending_scatters(rows: list[kinds.Float]) -> list[kinds.Float]:
     """Return rows after evaluating their pending scatters, if there are any.
 
     Dr.Jit 1.5 ends the process ("dirty variable") if several rows with pending scatters are

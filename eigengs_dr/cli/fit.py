@@ -205,7 +205,7 @@ def _settings(choices: dict[str, Any], basis: str | None, backend: str | None) -
         raise ValueError("--keep is for the Gaussians of --start; give both")
     if choices["start"] is not None:
         start = eg.Gaussians.load(choices["start"], backend)
-        method = method.without("places") if choices["keep"] else method
+        method = method.without("redistribute") if choices["keep"] else method
     target, count, levels = (choices[name] for name in ("target_psnr", "gaussians", "levels"))
     goal = None
     if target is not None and count is not None:

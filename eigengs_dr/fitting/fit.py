@@ -22,8 +22,8 @@ from ..image.pixels import check_weight
 from ..image.space import space_of
 from ..raster.render import picture_of
 from .coarse import COARSE_TO_FINE
+from .exchange import sort_levels
 from .from_loss import Watch, fit_loss
-from .levels import place_levels, sort_levels
 from .loop import Descent, FitProgress, Refinement, refine, sets_of
 from .loss import Loss, LossFunction, LossObjective
 from .measure import Row
@@ -32,8 +32,8 @@ from .objective import Pixels
 from .options import FitOptions, Goal, Start, named_options
 from .place import Adaptive
 from .problem import Map, PixelsOrPath, Problem, problem_of, problem_of_images
-from .search import fewest
-from .start import set_in, start_from
+from .search import search_count
+from .start import place_levels, set_in, start_from
 from .state import begin
 
 
@@ -180,7 +180,7 @@ def fit(
         method. Gaussians are kept where the image is fitted much better than by a placement; the
         others are placed anew: all of them if the whole is not much better. All Gaussians of a
         model, without steps or without an image, are kept; so are all for a method that places
-        none anew, ``eigengs_dr.DEFAULT.without("places")``. ``result.kept`` says how many.
+        none anew, ``eigengs_dr.DEFAULT.without("redistribute")``. ``result.kept`` says how many.
     space : {"ycbcr", "rgb", "linear", "radiance", "log", "normal", "data"} or mapping, optional
         Space of the colours and of the squared error, by default that of the start, or "ycbcr".
         "linear" decodes sRGB: the Gaussians sum to linear light, as textures need it, and errors
@@ -360,18 +360,16 @@ def _refined(
     objective, method = descent.objective, descent.method
     given = isinstance(problem.start, Model)
     if counts or given or method.place != Adaptive():  # a choice of the user is not undone
-        method = method.without("grows", "places")
+        method = method.without("densify", "redistribute")
     if counts:
-        begun = place_levels(
-            objective, method, counts, options.iterations, options.seed, descent.interrupted
-        )
+        begun = place_levels(replace(descent, method=method), counts, options.iterations)
         objective = replace(objective, levels=counts[:-1])
     elif begun is None:
         begun = method.place_and_solve(objective, problem.first_count, options.seed)
     seconds_init = (time.perf_counter() - started) / problem.images
     descent = replace(descent, objective=objective, method=method)
     if options.searches:
-        refined = [fewest(descent, begun, problem.max_count, options.iterations)]
+        refined = [search_count(descent, begun, problem.max_count, options.iterations)]
     else:
         refined = refine(descent, begin(begun, problem.images, chosen), options.iterations)
     if isinstance(objective, LossObjective) and refined[0].stopped != "interrupted":

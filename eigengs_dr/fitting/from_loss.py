@@ -22,7 +22,7 @@ from .method import DEFAULT
 from .objective import Pixels
 from .place import Adaptive
 from .problem import Problem
-from .search import fewest
+from .search import search_count
 from .state import begin
 
 PIXELS_PER_GAUSSIAN = 4
@@ -126,9 +126,10 @@ def fit_loss(problem: Problem, watch: Watch) -> tuple[Refinement, float]:
     )
     steps = options.iterations - taken
     if options.searches:
-        refined = fewest(descent, start, problem.max_count, steps)
+        refined = search_count(descent, start, problem.max_count, steps)
     else:
-        method = descent.method.without("grows", "places")  # the start is the choice of the user
+        # The start is the choice of the user.
+        method = descent.method.without("densify", "redistribute")
         [refined] = refine(replace(descent, method=method), begin(start), steps)
     if refined.stopped != "interrupted":
         objective.calls.check_use()
@@ -188,7 +189,7 @@ def _start(objective: LossObjective, problem: Problem, coarse: Coarse) -> Gaussi
     pixels = problem.size[0] * problem.size[1]
     method = replace(DEFAULT, place=options.method.place, cutoff=options.method.cutoff)
     if not isinstance(method.place, Adaptive):  # the choice of a placement is not undone
-        method = method.without("grows", "places")
+        method = method.without("densify", "redistribute")
     count = pixels // PIXELS_PER_GAUSSIAN
     if loss.pixels is not None:
         count = min(count, loss.pixels // SEEN_PER_GAUSSIAN)

@@ -13,7 +13,8 @@ from ..backend.arrays import types_of
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
-from .control import Control, prune
+from .control import Control
+from .exchange import prune
 from .measure import Measured, Row
 from .method import Method
 from .objective import Pixels
@@ -176,7 +177,7 @@ class Refinement:
     iterations : int
         Number of steps.
     stopped : str
-        "iterations", "exact" or "interrupted"; see also `eigengs_dr.fitting.search.fewest`.
+        "iterations", "exact" or "interrupted"; see also `eigengs_dr.fitting.search.search_count`.
     row : dict
         The row of the trace that measures the set.
     """

@@ -16,12 +16,12 @@ from ..backend.messages import shown
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians
 from .control import (
+    Backtrack,
     Control,
     Perturb,
     Phase,
     Redistribute,
     Relocate,
-    Retreat,
     Surplus,
     phase_of,
 )
@@ -121,7 +121,7 @@ class Method:
                 f"average is {self.average}; it must be 0 with controls, which exchange Gaussians"
             )
         every = {phase_of(c): getattr(c, "every", 0) for c in reversed(self.controls)}
-        if every.get("grows") and not 0 < every.get("moves", 0) <= every["grows"]:
+        if every.get("densify") and not 0 < every.get("relocate", 0) <= every["densify"]:
             raise ValueError(
                 "controls: a Surplus leaves by a Relocate that comes as often; add one, or leave "
                 "the Surplus out"
@@ -164,7 +164,7 @@ class Method:
 
     def first_phase(self, iterations: int) -> int:
         """Return the steps before a redistribution; 0 if there is none."""
-        return max(self.steps_in("places", iterations), default=0)
+        return max(self.steps_in("redistribute", iterations), default=0)
 
     def in_phase(self, phase: Phase) -> list[Control]:
         """Return the controls of a phase."""
@@ -180,8 +180,8 @@ class Method:
         Examples
         --------
         >>> import eigengs_dr as eg
-        >>> eg.DEFAULT.without("grows", "places", "moves", "shakes").controls
-        (Retreat(rise=4.0, factor=0.4, first=10),)
+        >>> eg.DEFAULT.without("densify", "redistribute", "relocate", "perturb").controls
+        (Backtrack(rise=4.0, factor=0.4, first=10),)
         """
         known = get_args(Phase)
         for phase in phases:
@@ -193,7 +193,7 @@ class Method:
     def surplus(self, gaussians: Gaussians, objective: Pixels, iterations: int) -> int:
         """Return how many Gaussians more than a set a descent from it may have at first."""
         state = begin(gaussians)
-        for control in self.in_phase("grows"):
+        for control in self.in_phase("densify"):
             state = control(state, objective, 0, iterations, 0)
         return state.surplus
 
@@ -229,7 +229,7 @@ class Method:
 
 DEFAULT = Method(
     place=Adaptive(),
-    controls=(Retreat(), Surplus(), Redistribute(), Relocate(), Perturb()),
+    controls=(Backtrack(), Surplus(), Redistribute(), Relocate(), Perturb()),
     optimizer=Adam(0.9, 0.9, 1e-12),
     rates={"mean": 0.4, "factor": 0.22, "color": 0.0115},
     coordinates=Relative(),

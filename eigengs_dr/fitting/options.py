@@ -196,7 +196,7 @@ class FitOptions:
             )
         if isinstance(self.method.place, Coarse):
             return
-        if not places or not self.method.in_phase("places"):
+        if not places or not self.method.in_phase("redistribute"):
             raise ValueError(
                 f"{target} needs a method that places Gaussians by the image and redistributes "
                 "them, such as DEFAULT, and no start"

@@ -30,7 +30,7 @@ from .measure import Measured, Row, psnrs
 from .method import Model
 from .objective import Channels, Pixels, Target, restored, squares_of
 from .options import FitOptions, Goal
-from .placement.redistribution import squares_by_channel
+from .redistribution import squares_by_channel
 from .start import check_start, load_start, set_in
 
 Image = NDArray[np.float32]

@@ -2,8 +2,8 @@
 
 The search has three stages. *Estimate*: short descents with few Gaussians ("tries") estimate the
 number. Two tries measure the gain per doubling; each try shows where to place the Gaussians of the
-next one (`eigengs_dr.fitting.placement.adaptive`). *Fit*: a longer descent with the estimate.
-*Polish*: Gaussians are dropped (`eigengs_dr.fitting.control.prune`) while the set meets the goal,
+next one (`eigengs_dr.fitting.place`). *Fit*: a longer descent with the estimate.
+*Polish*: Gaussians are dropped (`eigengs_dr.fitting.exchange.prune`) while the set meets the goal,
 and added while it does not; each change ends with a short descent.
 """
 
@@ -17,11 +17,11 @@ from typing import NamedTuple
 import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
-from .control import densify, prune
+from .exchange import densify, prune
 from .loop import Descent, Refinement, descend
 from .measure import Row
 from .objective import Pixels
-from .placement.redistribution import redistribute
+from .redistribution import redistribute
 from .state import begin
 
 # The constants of a search, chosen on training photos of ImageNet classes. With a surplus in the
@@ -51,7 +51,7 @@ fit met the goal, so that they drop Gaussians."""
 
 DB_PER_DOUBLING = 4.0
 """Gain of twice as many Gaussians, in dB, until two tries of the image measure it; see
-`eigengs_dr.fitting.placement.adaptive.ERROR_EXPONENT`."""
+`eigengs_dr.fitting.redistribution.ERROR_EXPONENT`."""
 
 DOUBLING_RANGE = (2.0, 12.0)
 """Allowed range of the measured gain, in dB; training images gained 1.6 to 8."""
@@ -94,7 +94,7 @@ ENOUGH = 0.02
 """Decibels above the goal that do not justify another polish."""
 
 
-def fewest(
+def search_count(
     descent: Descent, start: Gaussians, max_count: int, iterations: int = 1000
 ) -> Refinement:
     """Find the smallest number of Gaussians that meets a goal.
@@ -125,11 +125,11 @@ def fewest(
     try:
         run.score(start)
         estimate = _estimate(run, max_count, tries)
-        if not run.ended() and (run.best.missing > 0 or len(run.best.gaussians) > 1):
+        if not run.ended() and (run.best.shortfall_db > 0 or len(run.best.gaussians) > 1):
             longest = round(MAX_LENGTH * iterations)
             trial = _fit_estimate(run, *estimate, max_count, fit, longest)
             # If the iterations are few, or two fits have used them up, polish all the same.
-            sure = SURE_DROPS if trial.missing <= 0 else SURE_POLISHES
+            sure = SURE_DROPS if trial.shortfall_db <= 0 else SURE_POLISHES
             max_steps = max(longest, run.step + sure * polish)
             _polish(run, trial, max_count, polish, max_steps)
     except KeyboardInterrupt:  # of a loss or a judge
@@ -137,7 +137,7 @@ def fewest(
     if run.ended():
         with suppress(KeyboardInterrupt):
             _trim(run)
-    met = "met" if run.best.missing <= 0 else "out of reach"
+    met = "met" if run.best.shortfall_db <= 0 else "out of reach"
     stopped = "interrupted" if run.ended() else met
     return Refinement(run.best.gaussians, run.trace, run.step, stopped, run.best.row)
 
@@ -146,7 +146,7 @@ class _Trial(NamedTuple):
     """A set, by how many decibels it misses the goal, and its row of the trace."""
 
     gaussians: Gaussians
-    missing: float
+    shortfall_db: float
     row: Row
 
 
@@ -171,9 +171,9 @@ class _Run:
     ) -> _Trial:
         """Take some steps at a fraction of the learning rates, and score the pruned set."""
         descent = self.descent
-        method = descent.method.at_rates(share).without("grows", "places")
+        method = descent.method.at_rates(share).without("densify", "redistribute")
         if share < 1:  # a polish moves Gaussians by itself
-            method = method.without("moves", "shakes")
+            method = method.without("relocate", "perturb")
         self.planned, before = max(self.planned, self.step + steps), self.step
         current = replace(begin(gaussians), count=len(gaussians) - surplus, surplus=surplus)
         states = descend(descent.objective, method, current, steps, descent.key + before)
@@ -230,9 +230,9 @@ def _better(a: _Trial, b: _Trial) -> bool:
 
     Of two sets of one size that meet it, the one with the higher PSNR is better.
     """
-    if a.missing <= 0 and b.missing <= 0:
-        return (len(a.gaussians), a.missing) < (len(b.gaussians), b.missing)
-    return a.missing < b.missing
+    if a.shortfall_db <= 0 and b.shortfall_db <= 0:
+        return (len(a.gaussians), a.shortfall_db) < (len(b.gaussians), b.shortfall_db)
+    return a.shortfall_db < b.shortfall_db
 
 
 def _estimate(run: _Run, max_count: int, steps: int) -> tuple[Gaussians, Gaussians]:
@@ -243,13 +243,13 @@ def _estimate(run: _Run, max_count: int, steps: int) -> tuple[Gaussians, Gaussia
     placed, before, last = run.start, run.best, None
     for _ in range(MAX_TRIES):
         trial = run.descend(placed, steps)
-        if trial.missing > before.missing:  # few steps at full rates lose more than they gain
-            trial = before
+        # Few steps at full rates may lose more than they gain.
+        trial = min(trial, before, key=lambda one: one.shortfall_db)
         _update_slope(run, last, trial)
-        gain = LATE_SHARE * max(0.0, before.missing - trial.missing)
+        gain = LATE_SHARE * max(0.0, before.shortfall_db - trial.shortfall_db)
         count = min(
             max_count,
-            round(MARGIN * _count_for_gain(run, len(placed), trial.missing - gain, max_count)),
+            round(MARGIN * _count_for_gain(run, len(placed), trial.shortfall_db - gain, max_count)),
         )
         # The first try was placed by the image, without errors: it does not count as close.
         close = last is not None and abs(count - len(placed)) <= TRY_TOLERANCE * len(placed)
@@ -265,7 +265,7 @@ def _fit_estimate(
 ) -> _Trial:
     """Fit the estimated number; if it was far off, fit once more, in the steps that are left."""
     trial, number = _fit(run, tried, placed, steps), len(placed)
-    count = _count_for_gain(run, number, trial.missing, max_count)
+    count = _count_for_gain(run, number, trial.shortfall_db, max_count)
     if run.ended() or count - number <= FIT_TOLERANCE * number:
         return trial
     again = run.redistribute(trial.gaussians, count)
@@ -287,12 +287,13 @@ def _update_slope(run: _Run, last: _Trial | None, trial: _Trial) -> None:
     octaves = math.log2(len(trial.gaussians) / len(last.gaussians))
     if abs(octaves) >= MIN_OCTAVES:
         low, high = DOUBLING_RANGE
-        run.db_per_doubling = min(max((last.missing - trial.missing) / octaves, low), high)
+        gain = last.shortfall_db - trial.shortfall_db
+        run.db_per_doubling = min(max(gain / octaves, low), high)
 
 
-def _count_for_gain(run: _Run, count: int, missing: float, max_count: int) -> int:
-    """Return the number of Gaussians that would gain the missing decibels."""
-    octaves = min(max(missing / run.db_per_doubling, -MAX_OCTAVES), MAX_OCTAVES)
+def _count_for_gain(run: _Run, count: int, gain: float, max_count: int) -> int:
+    """Return the number of Gaussians that would gain so many decibels more."""
+    octaves = min(max(gain / run.db_per_doubling, -MAX_OCTAVES), MAX_OCTAVES)
     return min(max_count, max(1, round(count * 2**octaves)))
 
 
@@ -304,27 +305,27 @@ def _polish(run: _Run, trial: _Trial, max_count: int, steps: int, max_steps: int
     least_growth, rounds, gain = 1.02, 0, POLISH_GAIN
     while run.step + steps <= max_steps and not run.ended():
         count, best = len(trial.gaussians), run.best
-        if best.missing <= 0 and rounds >= MAX_POLISHES:
+        if best.shortfall_db <= 0 and rounds >= MAX_POLISHES:
             return
-        missing = trial.missing - gain
-        if trial.missing <= 0:
-            drop = min(max(MAX_DROP, -DROP_PER_DB * trial.missing), LARGEST_DROP)
+        shortfall = trial.shortfall_db - gain
+        if trial.shortfall_db <= 0:
+            drop = min(max(MAX_DROP, -DROP_PER_DB * trial.shortfall_db), LARGEST_DROP)
             new_count = max(
-                _count_for_gain(run, count, missing, count),
+                _count_for_gain(run, count, shortfall, count),
                 math.floor((1 - drop) * count),
             )
-            if new_count == count or -missing < ENOUGH:
+            if new_count == count or -shortfall < ENOUGH:
                 return
             changed = prune(trial.gaussians, run.around(trial.gaussians), new_count)
-        elif best.missing <= 0 and len(best.gaussians) <= FAR * count:
+        elif best.shortfall_db <= 0 and len(best.gaussians) <= FAR * count:
             # The best number lies between this one and that of the best set; or a polish suffices.
             new_count = max(
-                count, _count_for_gain(run, count, missing, (count + len(best.gaussians)) // 2)
+                count, _count_for_gain(run, count, shortfall, (count + len(best.gaussians)) // 2)
             )
             changed = densify(trial.gaussians, run.around(trial.gaussians), new_count)
         else:
             new_count = max(
-                _count_for_gain(run, count, missing, max_count), math.ceil(least_growth * count)
+                _count_for_gain(run, count, shortfall, max_count), math.ceil(least_growth * count)
             )
             changed = densify(
                 trial.gaussians, run.around(trial.gaussians), min(new_count, max_count)
@@ -333,9 +334,9 @@ def _polish(run: _Run, trial: _Trial, max_count: int, steps: int, max_steps: int
                 return
             least_growth = 2 * least_growth - 1
         rounds += 1
-        expected = trial.missing + run.db_per_doubling * math.log2(count / len(changed))
+        expected = trial.shortfall_db + run.db_per_doubling * math.log2(count / len(changed))
         trial = run.descend(changed, steps, POLISH_RATE)
-        gain = GAIN_DECAY * max(0.0, expected - trial.missing)
+        gain = GAIN_DECAY * max(0.0, expected - trial.shortfall_db)
 
 
 TRIMS = 5
@@ -345,13 +346,13 @@ TRIMS = 5
 def _trim(run: _Run) -> None:
     """Drop Gaussians of a set above the goal without a step, by bisection; `run` keeps the best."""
     above = run.best
-    if above.missing > 0:
+    if above.shortfall_db > 0:
         return
-    too_few = _count_for_gain(run, len(above.gaussians), above.missing, len(above.gaussians))
+    too_few = _count_for_gain(run, len(above.gaussians), above.shortfall_db, len(above.gaussians))
     for _ in range(TRIMS):
         new_count = (too_few + len(above.gaussians)) // 2
         if new_count in (too_few, len(above.gaussians)):
             return
         near = run.around(above.gaussians)
         trial = run.score(prune(above.gaussians, near, new_count))
-        above, too_few = (trial, too_few) if trial.missing <= 0 else (above, new_count)
+        above, too_few = (trial, too_few) if trial.shortfall_db <= 0 else (above, new_count)

@@ -1,8 +1,18 @@
-"""What a fit starts from: a set of the user, the file of a set, or a model."""
+"""What a fit starts from: a set of the user, the file of a set, a model, or levels of detail.
+
+Levels are one set whose first N Gaussians already form the image, for several N. Placement adds one
+level after another, with more Gaussians where the residual of the earlier levels has larger second
+derivatives. Refinement then moves all levels together and minimises the sum of the logarithms of
+their squared errors. In its first two thirds, Gaussians of little use relocate inside of their
+levels. Sorting the Gaussians of a plain fit by their removal cost does not work: they depend on
+each other, and the first quarter does not form an image.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 
 import drjit as dr
@@ -10,13 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..gaussian.gaussians import Fitted, Gaussians, set_of
+from ..gaussian.gaussians import Fitted, Gaussians, concatenate, set_of
 from ..image.space import Space
-from .control import MAX_ERROR, merged
+from .exchange import MAX_ERROR, merged
+from .loop import Descent, descend
 from .method import Method, Model
 from .objective import Pixels
 from .options import FitOptions, Start
-from .placement.redistribution import error_by_pixel
+from .redistribution import error_by_pixel
+from .state import begin
 
 MAX_RATIO = 0.75
 """Largest squared error of a set with Gaussians of a start over that of a placement, which gains
@@ -111,7 +123,7 @@ def start_from(
         return objective, gaussians.bounded() if iterations else gaussians, len(gaussians)
     gaussians = replace(start.scaled(*objective.size), cutoff=float(method.cutoff))
     gaussians = method.start_from(objective, gaussians.bounded() if iterations else gaussians)
-    if not iterations or method.place.has_colors or not method.in_phase("places"):
+    if not iterations or method.place.has_colors or not method.in_phase("redistribute"):
         return objective, gaussians, len(gaussians)
     return objective, *keep_fitting(gaussians, objective, method, iterations, seed)
 
@@ -149,3 +161,36 @@ def keep_fitting(
     with dr.suspend_grad():
         old, new = (dr.sum(error_by_pixel(one, objective))[0] for one in (both, placed))
     return (both, kept) if old <= MAX_RATIO * new else (placed, 0)
+
+
+STEPS_PER_LEVEL = 50
+"""Largest number of refinement steps between the placements of two levels."""
+
+
+def place_levels(descent: Descent, counts: Sequence[int], iterations: int) -> Gaussians:
+    """Place nested sets: each level by the error after some steps of the earlier levels.
+
+    Parameters
+    ----------
+    descent : Descent
+        Its objective has no levels.
+    counts : sequence of int
+        Numbers of Gaussians up to each level.
+    iterations : int
+        Steps of the refinement that follows; placement takes at most `STEPS_PER_LEVEL` per level.
+    """
+    objective, key = descent.objective, descent.key
+    steps, method = min(STEPS_PER_LEVEL, iterations), replace(descent.method, controls=())
+    gaussians = method.place_and_solve(objective, counts[0], key)
+    for level, count in enumerate(counts[1:], 1):
+        nested = replace(objective, levels=tuple(counts[: level - 1]))
+        with closing(descend(nested, method, begin(gaussians), steps, key)) as states:
+            for state in states:
+                gaussians = state.gaussians
+                if descent.interrupted():
+                    break
+        gaussians = dr.detach(gaussians)
+        added = method.place_and_solve(objective.minus(gaussians), count - len(gaussians), key)
+        # All levels share the background: a new one would change the earlier levels.
+        gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
+    return gaussians

@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
+from ..backend.arrays import eval_pending_scatters, types_in, types_of, upload, upload_rows
 from ..backend.doors import class_of_doors, door
 from ..backend.messages import shown, to_html
 from ..backend.selection import BackendError, select
@@ -435,7 +435,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         color=join("color"),
         background=sum((g.background for g in sets[1:]), first.background),
     )
-    dr.eval(joined)  # leaves no pending scatters, see `settle`
+    dr.eval(joined)  # leaves no pending scatters, see `eval_pending_scatters`
     return joined
 
 
@@ -519,7 +519,7 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     tensors = {}
     for name in FIELDS:
         rows = getattr(gaussians, name)
-        rows = settle(list(rows) if name == "background" else whole(rows, gaussians))
+        rows = eval_pending_scatters(list(rows) if name == "background" else whole(rows, gaussians))
         joint = dr.ravel(types.FloatX(rows), order="F")
         tensors[name] = types.Tensor(joint, (dr.width(joint) // len(rows), len(rows)))
     tensors["background"] = tensors["background"][0]

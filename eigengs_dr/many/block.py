@@ -32,13 +32,13 @@ from ..fitting.loop import descend, last
 from ..fitting.method import Method
 from ..fitting.objective import Channels, Part, Pixels, Target, squares_of
 from ..fitting.options import FitOptions
-from ..fitting.placement.adaptive import (
+from ..fitting.place import (
     density_from_hessian,
     place_by_density,
     planes_of,
     shift_of,
 )
-from ..fitting.placement.redistribution import Owners, density_ratio, error_by_pixel
+from ..fitting.redistribution import Owners, density_ratio, error_by_pixel
 from ..fitting.solve import solve
 from ..fitting.state import State, begin
 from ..gaussian.file import SetData
@@ -99,7 +99,7 @@ class BlockTask(NamedTuple):
         whose means lie in the window, and optionally their color (N, C); otherwise the initial
         colours are solved for. A placement takes the density of an earlier fit, if there is one:
         mean, factor, and the ratio (N, 1), see
-        `eigengs_dr.fitting.placement.adaptive.density_ratio`; otherwise the density depends on
+        `eigengs_dr.fitting.redistribution.density_ratio`; otherwise the density depends on
         second derivatives only.
     gaussians : int
         Number of Gaussians to place, from 1 to the number of pixels of the core.
@@ -279,7 +279,7 @@ def _descend(
     step_done: StepDone | None,
 ) -> Gaussians:
     """Take the steps of a task, with the controls of the method if the objective has a part."""
-    method, seed = settings.options.method.without("places"), settings.options.seed
+    method, seed = settings.options.method.without("redistribute"), settings.options.seed
     if objective.part is None:
         method = replace(method, controls=())
 
@@ -312,7 +312,7 @@ def exchange_rounds(method: Method, iterations: int) -> list[range]:
     >>> exchange_rounds(eg.DEFAULT, 30)
     [range(0, 10), range(10, 20), range(20, 30)]
     """
-    cuts = sorted({0, *method.steps_in("moves", iterations)})
+    cuts = sorted({0, *method.steps_in("relocate", iterations)})
     number, latest = LAST_ROUNDS if cuts[1:] else SHORT_ROUNDS, cuts.pop()
     number = max(1, min(number, iterations - latest))
     cuts += [latest + k * (iterations - latest) // number for k in range(number + 1)]

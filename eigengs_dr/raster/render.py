@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import numpy as np
 
-from ..backend.arrays import ArrayTypes, make_divisor, settle, types_of
+from ..backend.arrays import ArrayTypes, eval_pending_scatters, make_divisor, types_of
 from ..backend.doors import door
 from ..backend.types import Float, FloatLike, Tensor, UInt, Values
 from ..gaussian.channels import slices
@@ -462,7 +462,7 @@ def to_tensor(image: Float, grid: Grid, channels: int) -> Tensor:
     rows = dr.custom(_Rows, image, grid, channels)
     if grid.overhangs:
         rows = _crop(types, rows, grid, channels)
-    settle([rows])
+    eval_pending_scatters([rows])
     return types.Tensor(rows, (grid.height, grid.width, channels))
 
 

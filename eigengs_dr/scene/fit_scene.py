@@ -29,7 +29,7 @@ from ..fitting.measure import Measured
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Pixels, restored
 from ..fitting.options import Goal
-from ..fitting.search import fewest
+from ..fitting.search import search_count
 from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
@@ -347,7 +347,7 @@ def fit_seen(
         score,
         progress=lambda step, steps, row: tell(step, steps, row | {"stage": "search"}),
     )
-    search = fewest(descent, start, max_gaussians, iterations)
+    search = search_count(descent, start, max_gaussians, iterations)
     reached = search.row["psnr"]
     if search.stopped == "out of reach" and reached < goal.psnr:
         raise ValueError(

@@ -9,18 +9,20 @@ from _helpers.sets import few
 from _oracles.objectives import objective_of
 from _oracles.placements import check_placement, covariances_of, generator, images_and_counts
 from eigengs_dr.codec.range_coder import hilbert_encode
-from eigengs_dr.fitting.place import Adaptive, Grid, Random
-from eigengs_dr.fitting.placement.adaptive import (
+from eigengs_dr.fitting.place import (
     MAX_STRETCH,
     RELATIVE_SIZE,
+    Adaptive,
+    Grid,
+    Random,
     blurred,
     centroids_along_curve,
     density_from_hessian,
+    hilbert_curve,
     normalized,
     place_adaptive,
     shapes_from_hessian,
 )
-from eigengs_dr.fitting.placement.curve import hilbert_curve
 from eigengs_dr.paper.gaussianimage import RandomColors
 
 

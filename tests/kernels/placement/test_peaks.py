@@ -10,7 +10,7 @@ from scipy.ndimage import correlate1d, maximum_filter
 from _helpers.sets import few
 from _oracles.tiles import to_tiles
 from eigengs_dr.backend.arrays import types_of
-from eigengs_dr.fitting.placement.peaks import RADIUS, SIZE, Canvas, residual_peaks
+from eigengs_dr.fitting.peaks import RADIUS, SIZE, Canvas, residual_peaks
 
 
 def found_peaks(missed, count, weight=None, backend="llvm"):

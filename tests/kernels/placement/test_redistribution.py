@@ -13,7 +13,7 @@ from _oracles.tiles import to_map, to_tiles
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.place import Grid
-from eigengs_dr.fitting.placement.redistribution import (
+from eigengs_dr.fitting.redistribution import (
     ERROR_EXPONENT,
     Owners,
     redistribute,

@@ -71,7 +71,7 @@ def test_when_they_act():
     steps = (0, 99, 100, 150, 200, 100_000)
     assert [redistribute.steps(n) for n in steps] == [(), (), (10,), (15,), (20,), (20,)]
     assert replace(redistribute, after=0).steps(1000) == ()
-    assert CONTROLS["Retreat"].steps(200) == [10, 20, 40, 80, 160]
+    assert CONTROLS["Backtrack"].steps(200) == [10, 20, 40, 80, 160]
 
 
 # --- Each alone ----------------------------------------------------------------------------------
@@ -96,9 +96,9 @@ def test_chosen_gaussians_stay_where_they_fit():
 
 
 @pytest.mark.parametrize("factor", [1, 1000])
-def test_a_retreat_returns_where_the_error_has_risen(factor):
+def test_a_backtrack_returns_where_the_error_has_risen(factor):
     """To the set at which the optimiser started, with the rates times the factor."""
-    watch = Watch(CONTROLS["Retreat"])
+    watch = Watch(CONTROLS["Backtrack"])
     method = replace(eg.DEFAULT, controls=(watch,)).at_rates(factor)
     start = eg.fit(picture(), COUNT, 0, space="rgb").gaussians
     eg.fit(picture(), COUNT, 20, method=method, space="rgb")
@@ -110,10 +110,10 @@ def test_a_retreat_returns_where_the_error_has_risen(factor):
         assert after.speed == 0.4
 
 
-def test_each_image_of_a_batch_retreats_for_itself():
+def test_each_image_of_a_batch_backtracks_for_itself():
     """Images of a batch that diverges are fitted one by one: with the bits of single fits."""
     images = [PHOTO[:SIDE, :SIDE], np.full((SIDE, SIDE, 3), 0.3, np.float32)]
-    method = replace(eg.DEFAULT.at_rates(30), controls=(CONTROLS["Retreat"],))
+    method = replace(eg.DEFAULT.at_rates(30), controls=(CONTROLS["Backtrack"],))
     options = {"gaussians": 40, "iterations": 45, "method": method}
     for row, image in zip(eg.fit_many(images, **options), images, strict=True):
         np.testing.assert_array_equal(row.result.image, eg.fit(image, **options).image)
@@ -163,7 +163,7 @@ def test_noise_is_what_the_image_can_bear():
     assert amplitude[order[275]] > 2 * amplitude[order[125]]
 
 
-@pytest.mark.parametrize("name", ["Redistribute", "Perturb", "Retreat"])
+@pytest.mark.parametrize("name", ["Redistribute", "Perturb", "Backtrack"])
 def test_controls_leave_levels_alone(name):
     watch = Watch(CONTROLS[name])
     eg.fit(picture(), [10, 30], 200, method=replace(eg.DEFAULT, controls=(watch,)))
@@ -192,7 +192,7 @@ def test_a_surplus_leaves_evenly():
     """More Gaussians after a redistribution, fewer after each round, in the end those asked for."""
     watch = Watch(replace(CONTROLS["Relocate"], every=5))
     method = often()
-    controls = tuple(watch if c.phase == "moves" else c for c in method.controls[1:])
+    controls = tuple(watch if c.phase == "relocate" else c for c in method.controls[1:])
     found = eg.fit(picture(), COUNT, 100, method=replace(method, controls=controls))
     totals = [before.total for _, before, _ in watch.acts] + [watch.acts[-1][2].total]
     dropped = -np.diff(totals)

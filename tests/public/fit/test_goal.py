@@ -139,7 +139,7 @@ def test_interrupted_it_has_no_more_than_it_may():
             {"method": replace(eg.DEFAULT, place=METHODS["gaussianimage"].place)},
             "places Gaussians by the image",
         ),
-        ({"method": eg.DEFAULT.without("places")}, "and redistributes them, such as DEFAULT"),
+        ({"method": eg.DEFAULT.without("redistribute")}, "and redistributes them, such as DEFAULT"),
         ({"target_psnr": 0}, "above 0"),
         ({"target_psnr": True}, "psnr is True; it must be a number"),
     ],

@@ -69,7 +69,7 @@ def test_every_level_gains_by_relocation():
     image, counts = eg.sample("coffee")[200:264, 300:364], [100, 140, 180]
     found, left = (
         eg.fit(image, counts, iterations=300, method=method).gaussians
-        for method in (eg.DEFAULT, eg.DEFAULT.without("grows", "moves"))
+        for method in (eg.DEFAULT, eg.DEFAULT.without("densify", "relocate"))
     )
     for count in counts:
         assert reached(found[:count], image) > reached(left[:count], image) + 0.3

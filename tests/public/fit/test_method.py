@@ -38,13 +38,13 @@ def test_a_method_is_a_value():
 
 def test_phases_of_controls():
     """A control of one's own may say its phase; without one it acts in every descent."""
-    assert eg.DEFAULT.in_phase("grows") == [CONTROLS["Surplus"]]
-    less = eg.DEFAULT.without("grows", "shakes")
-    assert less.controls == tuple(CONTROLS[k] for k in ("Retreat", "Redistribute", "Relocate"))
-    assert GAUSSIANIMAGE.in_phase("places") == []
+    assert eg.DEFAULT.in_phase("densify") == [CONTROLS["Surplus"]]
+    less = eg.DEFAULT.without("densify", "perturb")
+    assert less.controls == tuple(CONTROLS[k] for k in ("Backtrack", "Redistribute", "Relocate"))
+    assert GAUSSIANIMAGE.in_phase("redistribute") == []
     method = replace(eg.DEFAULT, controls=(Shrink(60), Moving(60)))
-    assert method.steps_in("moves", 100) == {60} and method.first_phase(100) == 0
-    assert method.without("moves").controls == (Shrink(60),)
+    assert method.steps_in("relocate", 100) == {60} and method.first_phase(100) == 0
+    assert method.without("relocate").controls == (Shrink(60),)
 
 
 # --- What is refused ----------------------------------------------------------------------------
@@ -55,7 +55,7 @@ NUMBERS = {
     CONTROLS["Redistribute"]: "after solve_steps",
     CONTROLS["Relocate"]: "every share",
     CONTROLS["Perturb"]: "strength every",
-    CONTROLS["Retreat"]: "rise factor first",
+    CONTROLS["Backtrack"]: "rise factor first",
     ADAM: "beta_1 beta_2 epsilon",
     AGREEING: "memory gain first least floor epsilon",
     eg.Coarse(): "share max_steps rate decay fit_steps",
@@ -174,7 +174,7 @@ def test_steps_are_those_of_the_paper(optimizer, by_hand, betas, backend):
 def test_rates_fall_by_half_a_cosine(places):
     """Which ends near what `decay` leaves; another one before a redistribution."""
     method = replace(eg.DEFAULT, decay=0.25)
-    method = method if places else method.without("places")
+    method = method if places else method.without("redistribute")
     lengths = (20, 180) if places else (200,)
     left = [0.25 + 0.75 * 0.5 * (1 + np.cos(np.pi * np.arange(n) / n)) for n in lengths]
     np.testing.assert_allclose(method.rate_factors(200), np.concatenate(left), rtol=1e-6)
@@ -254,7 +254,7 @@ class Shrink:
 class Moving(Shrink):
     """Says its phase."""
 
-    phase = "moves"
+    phase = "relocate"
 
 
 @dataclass(frozen=True)
@@ -288,9 +288,9 @@ def test_a_placement_of_ones_own():
     np.testing.assert_allclose(mean[:20, 0] + mean[20:, 0], 32, rtol=1e-5)
     assert one.psnr_ycbcr > start.psnr_ycbcr + 1
     assert not np.array_equal(other.gaussians.to_arrays()["mean"], mean)
-    plain = eg.fit(PHOTO, 40, 150, method=method.without("grows", "places"), seed=1)
+    plain = eg.fit(PHOTO, 40, 150, method=method.without("densify", "redistribute"), seed=1)
     np.testing.assert_array_equal(one.image, plain.image)
-    image, moves = eg.sample("coffee")[100:164, 200:264], ("grows", "moves", "shakes")
+    image, moves = eg.sample("coffee")[100:164, 200:264], ("densify", "relocate", "perturb")
     moved, left = (eg.fit(image, 200, 600, method=m) for m in (method, method.without(*moves)))
     assert moved.psnr_rgb > left.psnr_rgb + 0.3
 

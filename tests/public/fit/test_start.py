@@ -124,7 +124,7 @@ def test_a_start_that_fits_nowhere_is_placed_anew(photo, fitted):
 
 def test_all_of_a_start_is_kept_on_request(photo, fitted):
     """The row before the first step measures the start with the best colours, a heap."""
-    start, keeps_all = collapsed(fitted, 200), eg.DEFAULT.without("places")
+    start, keeps_all = collapsed(fitted, 200), eg.DEFAULT.without("redistribute")
     solved = eg.fit(photo, start=start, iterations=0)
     result = eg.fit(photo, start=start, iterations=60, method=keeps_all)
     assert solved.kept == result.kept == 200

@@ -106,7 +106,7 @@ def test_levels_with_weights():
     weight[:, 24:], hidden[:, 24:] = 0, np.nan
     found, left = (
         eg.fit(hidden, [40, 120], iterations=200, weight=weight, method=method).gaussians
-        for method in (eg.DEFAULT, eg.DEFAULT.without("grows", "moves"))
+        for method in (eg.DEFAULT, eg.DEFAULT.without("densify", "relocate"))
     )
     for count in (40, 120):
         one, other = (eg.picture_of(g[:count])[:, :24] for g in (found, left))

@@ -30,7 +30,7 @@ def assert_same_bits(found, expected):
     [
         ({}, True),
         ({"space": "data"}, True),
-        ({"method": eg.DEFAULT.without("places")}, True),
+        ({"method": eg.DEFAULT.without("redistribute")}, True),
         ({"encoding": "linear"}, False),
         ({"method": replace(eg.DEFAULT, cutoff=4.0)}, False),
     ],

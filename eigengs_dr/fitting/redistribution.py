@@ -22,17 +22,17 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from ...backend.arrays import rcp, types_of
-from ...backend.recording import record
-from ...backend.types import Float, Singles
-from ...gaussian.gaussians import Gaussians, whole
-from ...raster.binning.lists import TileLists
-from ...raster.kernels import image_of, sum_by_image
-from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
-from ...raster.render import batch_to_tiles, bin_gaussians
-from ..objective import Pixels, Quadratic
-from ..solve import Unknowns, apply, correlate, for_channels, solve, spread
-from .adaptive import place_adaptive, planes_of, shrunk
+from ..backend.arrays import rcp, types_of
+from ..backend.recording import record
+from ..backend.types import Float, Singles
+from ..gaussian.gaussians import Gaussians, whole
+from ..raster.binning.lists import TileLists
+from ..raster.kernels import image_of, sum_by_image
+from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
+from ..raster.render import batch_to_tiles, bin_gaussians
+from .objective import Pixels, Quadratic
+from .place import place_adaptive, planes_of, shrunk
+from .solve import Unknowns, apply, correlate, for_channels, solve, spread
 
 ERROR_EXPONENT = 4 / 3
 """Exponent q of the decay of the squared error: twice as many Gaussians leave ``2^-q`` of it, which

@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, make_divisor
-from ...backend.recording import record
-from ...backend.types import Float, Rows, UInt
-from ...raster.binning.tiles import TILE, Grid, GridArrays
-from ...raster.parameters import gather_run
-from ..solve import for_channels
+from ..backend.arrays import ArrayTypes, make_divisor
+from ..backend.recording import record
+from ..backend.types import Float, Rows, UInt
+from ..raster.binning.tiles import TILE, Grid, GridArrays
+from ..raster.parameters import gather_run
+from .solve import for_channels
 
 SIDE = TILE[0]
 """Width and height of a tile in pixels."""
