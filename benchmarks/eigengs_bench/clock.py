@@ -17,6 +17,7 @@ import eigengs_dr as eg
 from eigengs_dr.fitting.control import Control, Perturb, Redistribute, Relocate, phase_of
 from eigengs_dr.fitting.fit import begin_fit
 from eigengs_dr.fitting.loop import descend
+from eigengs_dr.fitting.objective import Objective
 from eigengs_dr.fitting.options import FitOptions
 from eigengs_dr.fitting.place import Adaptive
 from eigengs_dr.fitting.problem import problem_of_images
@@ -71,7 +72,7 @@ def descent(
     if problem.start is not None or method.place != Adaptive():
         method = method.without("densify", "redistribute")
     state = begin(begun)
-    steps = descend(objective, method, state, iterations, chosen.seed)
+    steps = descend(Objective(objective), method, state, iterations, chosen.seed)
     for iteration in range(iterations + 1):
         if iteration:
             state = next(steps)

@@ -23,7 +23,7 @@ from eigengs_bench.rows import Job, Row, Task, alone, peak_gib
 from eigengs_dr.backend.arrays import ArrayTypes, types_in
 from eigengs_dr.backend.selection import select
 from eigengs_dr.fitting.loop import descend
-from eigengs_dr.fitting.objective import Pixels
+from eigengs_dr.fitting.objective import Objective, Pixels
 from eigengs_dr.fitting.place import place_adaptive
 from eigengs_dr.fitting.solve import solve
 from eigengs_dr.fitting.state import begin
@@ -127,7 +127,7 @@ def time_steps(objective: Pixels, start: eg.Gaussians, steps: int) -> tuple[floa
     """
     single = max(5, steps // 3)
     method, total = replace(eg.DEFAULT, controls=()), WARM_UP + steps + single
-    states = descend(objective, method, begin(start), total)
+    states = descend(Objective(objective), method, begin(start), total)
 
     def spend(count: int) -> float:
         started = time.perf_counter()

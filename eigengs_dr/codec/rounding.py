@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..fitting.loop import descend, last
 from ..fitting.method import DEFAULT
-from ..fitting.objective import Pixels
+from ..fitting.objective import Objective, Pixels
 from ..fitting.solve import solve
 from ..fitting.state import begin
 from ..gaussian.gaussians import Gaussians, like
@@ -283,7 +283,7 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
         objective = Pixels.plain(rest, current)
         current = solve(current[np.flatnonzero(~in_group)], objective, 2, warm_start=True)
         if inside:  # the descent would clip means to the image
-            states = descend(objective, method, begin(current), FEEDBACK_STEPS)
+            states = descend(Objective(objective), method, begin(current), FEEDBACK_STEPS)
             current = last(states, current)
     symbols = Symbols(*map(np.concatenate, zip(*done, strict=True)))
     return _content(gaussians, [symbols], steps, current.to_arrays()["background"])

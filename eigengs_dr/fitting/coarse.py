@@ -10,14 +10,15 @@ import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TypeAlias
 
 import drjit as dr
 
-from ..backend.arrays import types_of
+from ..backend.arrays import ArrayTypes, types_of
 from ..backend.doors import check_fields
 from ..backend.recording import freeze_program
 from ..backend.types import Float, Rows, UInt
-from .loss import LossObjective
+from .loss import TINY, PictureLoss
 from .method import DEFAULT
 from .place import Adaptive
 from .state import Adam, Optimizer, zeros_like
@@ -151,57 +152,44 @@ derivatives with rendering noise. The rates were chosen on the scenes of ``bench
 with the photo "coffee"."""
 
 
-@dataclass(frozen=True)
-class TexelLevel:
-    """The texels of a level of a pyramid, row after row.
-
-    Attributes
-    ----------
-    width, height : int
-    """
-
-    width: int
-    height: int
-
-    @property
-    def texels(self) -> int:
-        """Number of texels."""
-        return self.width * self.height
+Size: TypeAlias = tuple[int, int]
+"""Width and height of a level of a pyramid, whose texels are stored row after row."""
 
 
-def texel_levels(width: int, height: int) -> list[TexelLevel]:
+def texel_levels(width: int, height: int) -> list[Size]:
     """Return the levels of a pyramid from fine to coarse, each of half the size, rounded up."""
-    levels = [TexelLevel(width, height)]
-    while min(levels[-1].width, levels[-1].height) >= 2 * LEAST_SIDE:
-        levels.append(TexelLevel(-(-levels[-1].width // 2), -(-levels[-1].height // 2)))
+    levels = [(width, height)]
+    while min(levels[-1]) >= 2 * LEAST_SIDE:
+        width, height = -(-width // 2), -(-height // 2)
+        levels.append((width, height))
     return levels
 
 
-def enlarge(values: Float, coarse: TexelLevel, fine: TexelLevel) -> Float:
+def enlarge(values: Float, coarse: Size, fine: Size) -> Float:
     """Return a level at twice its size: bilinear, with the border texels repeated outside.
 
     The weights along an axis are 3/4 for the texel that holds the centre, and 1/4 for the next.
     """
     types = types_of(values)
-    texel = dr.arange(types.UInt, fine.texels)
-    row, column = texel // fine.width, texel % fine.width
+    texel, (width, height) = dr.arange(types.UInt, fine[0] * fine[1]), coarse
+    row, column = texel // fine[0], texel % fine[0]
     total = types.Float(0)
-    for y, at_y in _parents(row, coarse.height):
-        for x, at_x in _parents(column, coarse.width):
-            total = dr.fma(at_y * at_x, dr.gather(types.Float, values, y * coarse.width + x), total)
+    for y, at_y in _parents(row, height):
+        for x, at_x in _parents(column, width):
+            total = dr.fma(at_y * at_x, dr.gather(types.Float, values, y * width + x), total)
     return total
 
 
-def shrink(values: Float, fine: TexelLevel, coarse: TexelLevel) -> Float:
+def shrink(values: Float, fine: Size, coarse: Size) -> Float:
     """Return the transpose of `enlarge`: from a derivative by the finer level to the coarser."""
     types = types_of(values)
-    texel = dr.arange(types.UInt, coarse.texels)
-    row, column = texel // coarse.width, texel % coarse.width
+    texel, (width, height) = dr.arange(types.UInt, coarse[0] * coarse[1]), coarse
+    row, column = texel // width, texel % width
     total = types.Float(0)
-    for y, at_y in _children(row, coarse.height, fine.height):
-        for x, at_x in _children(column, coarse.width, fine.width):
+    for y, at_y in _children(row, height, fine[1]):
+        for x, at_x in _children(column, width, fine[0]):
             weight = at_y * at_x
-            child = dr.gather(types.Float, values, y * fine.width + x, weight > 0)
+            child = dr.gather(types.Float, values, y * fine[0] + x, weight > 0)
             total = dr.fma(weight, child, total)
     return total
 
@@ -227,7 +215,7 @@ def _children(place: UInt, count: int, fine: int) -> list[tuple[UInt, Float]]:
     return children
 
 
-def _sum_levels(values: Sequence[Rows], levels: Sequence[TexelLevel]) -> Float:
+def _sum_levels(values: Sequence[Rows], levels: Sequence[Size]) -> Float:
     """Return the sum of all levels as rows of pixels."""
     total = values[-1]
     for value, (fine, coarse) in zip(values[-2::-1], [*pairwise(levels)][::-1], strict=True):
@@ -237,13 +225,19 @@ def _sum_levels(values: Sequence[Rows], levels: Sequence[TexelLevel]) -> Float:
 
 
 def texel_sums(
-    objective: LossObjective, coarse: Coarse, steps: int, start: Sequence[float], unit: float = 1.0
+    types: ArrayTypes,
+    loss: PictureLoss,
+    coarse: Coarse,
+    steps: int,
+    start: Sequence[float],
+    unit: float = 1.0,
 ) -> Generator[Float, None, None]:
     """Descend on a loss by a pyramid of texels; each channel of a level has a rate of its own.
 
     Parameters
     ----------
-    objective : LossObjective
+    types : ArrayTypes
+    loss : PictureLoss
     coarse : Coarse
     steps : int
     start : sequence of float
@@ -257,8 +251,8 @@ def texel_sums(
         The sums of all levels before the first step and after each, as rows of pixels; and last
         those of `fill_unseen`.
     """
-    types, optimizer, channels = objective.types, coarse.optimizer, objective.channels
-    levels = texel_levels(*objective.size)
+    optimizer, channels = coarse.optimizer, loss.number
+    levels = texel_levels(loss.grid.width, loss.grid.height)
 
     def advance(
         values: list,
@@ -269,7 +263,7 @@ def texel_sums(
         size: Float,
         squares: Rows,
     ) -> tuple[list, list, Float, Float, list[Float], Rows]:
-        slope = _planes(objective.pull_back(sums, slopes), channels)
+        slope = _planes(loss.pull_back(sums, slopes), channels)
         rests, later = size == 0, time + 1  # without a derivative nothing moves
         squares = squares + dr.square(slope)
         falling = 0.5 + 0.5 * dr.cos(time * (math.pi / steps))
@@ -282,18 +276,18 @@ def texel_sums(
             values[k], moments[k] = dr.select(rests, (value, moments[k]), moved)
         sums = _sum_levels(values, levels)
         time = dr.select(rests, time, later)
-        return values, moments, time, sums, objective.seen(sums), squares
+        return values, moments, time, sums, loss.seen(sums), squares
 
-    values = [dr.zeros(types.FloatX, (channels, level.texels)) for level in levels]
+    values = [dr.zeros(types.FloatX, (channels, width * height)) for width, height in levels]
     values[-1] += types.FloatX([types.Float(value) for value in start])
     dr.make_opaque(values)
     moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)
-    pictures, time = objective.seen(sums), dr.opaque(types.Float, 0)
+    pictures, time = loss.seen(sums), dr.opaque(types.Float, 0)
     squares = zeros_like(values[0])
     with freeze_program(advance) as take_step:
         yield sums
         for _ in range(steps):
-            slopes, size = objective.step(pictures)
+            slopes, size = loss.step(pictures)
             values, moments, time, sums, pictures, squares = take_step(
                 values, moments, time, sums, slopes, size, squares
             )
@@ -306,7 +300,7 @@ DOUBT = 0.01
 """Share of the mean square of derivatives at which a texel counts half."""
 
 
-def fill_unseen(picture: Rows, squares: Rows, levels: Sequence[TexelLevel]) -> Rows:
+def fill_unseen(picture: Rows, squares: Rows, levels: Sequence[Size]) -> Rows:
     """Replace texels on which a loss hardly depends by what lies around them.
 
     A texel of a coarser level is the mean of finer ones, by their weights, and shows where theirs
@@ -318,13 +312,13 @@ def fill_unseen(picture: Rows, squares: Rows, levels: Sequence[TexelLevel]) -> R
     picture : Rows, shape (C, H * W)
     squares : Rows, shape (C, H * W)
         Sums of the squares of derivatives by the texels.
-    levels : sequence of TexelLevel
+    levels : sequence of Size
         From fine to coarse.
     """
     return type(picture)([_filled(*one, levels) for one in zip(picture, squares, strict=True)])
 
 
-def _filled(plane: Float, square: Float, levels: Sequence[TexelLevel]) -> Float:
+def _filled(plane: Float, square: Float, levels: Sequence[Size]) -> Float:
     """Fill a channel, see `fill_unseen`."""
     weight = square / dr.maximum(square + DOUBT * dr.mean(square), TINY)
     steps, sums = [*pairwise(levels)], [(plane * weight, weight)]
@@ -340,10 +334,6 @@ def _filled(plane: Float, square: Float, levels: Sequence[TexelLevel]) -> Float:
         shown = dr.lerp(enlarge(shown, coarse, fine), mean, dr.minimum(weight, 1))
         dr.eval(shown)
     return shown
-
-
-TINY = 1e-30
-"""Smallest divisor."""
 
 
 def _planes(rows: Float, channels: int) -> Rows:

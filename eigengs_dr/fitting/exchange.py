@@ -353,7 +353,6 @@ def _value(
     squares : Float, shape (images,)
         ``sum h (p - t)^2`` of each image, where it counts.
     """
-    assert scene.model.target is not None
     types, channels = types_of(scene.model.target), len(scene.colors[0])
     slope, squares_of_channels = scene.slope(scene.colors)
     squares = sum(squares_of_channels)

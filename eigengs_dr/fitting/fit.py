@@ -23,17 +23,17 @@ from ..image.space import space_of
 from ..raster.render import picture_of
 from .coarse import COARSE_TO_FINE
 from .exchange import sort_levels
-from .from_loss import Watch, fit_loss
+from .from_loss import fit_loss
 from .loop import Descent, FitProgress, Refinement, refine, sets_of
-from .loss import Loss, LossFunction, LossObjective
+from .loss import Loss, LossFunction
 from .measure import Row
 from .method import DEFAULT, Method, Model
-from .objective import Pixels
+from .objective import Objective, Pixels
 from .options import FitOptions, Goal, Start, named_options
 from .place import Adaptive
 from .problem import Map, PixelsOrPath, Problem, problem_of, problem_of_images
 from .search import search_count
-from .start import place_levels, set_in, start_from
+from .start import keep_fitting, place_levels, set_in
 from .state import begin
 
 
@@ -314,8 +314,7 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
     mean_image = None
     with defer_interrupts() as interrupted:
         if not problem.channels[0].targets:
-            watch = Watch(started, problem.options.iterations, progress, interrupted)
-            refinement, seconds_init = fit_loss(problem, watch)
+            refinement, seconds_init = fit_loss(problem, started, progress, interrupted)
             refinements = [refinement]
             kept = None if problem.start is None else len(set_in(problem.start))
         else:
@@ -325,7 +324,7 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
                 mean_image = pixels.picture(pixels.pictures[0].base).numpy()
             # The score must not refer to the descent that holds it: only the collector would free
             # the arrays of such a circle, and in a frozen function of the user Dr.Jit then hangs.
-            objective = problem.objective(pixels)
+            objective = Objective(pixels, problem.picture_loss())
             descent = Descent(
                 objective,
                 problem.options.method,
@@ -341,15 +340,25 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
 def begin_fit(problem: Problem) -> tuple[Pixels, Gaussians | None, int | None]:
     """Return the squared error, the set to start from, and how many of the user's it holds.
 
-    A method that starts from a model may change the squared error.
+    Gaussians of a set stay where they fit the image, see `keep_fitting`. All stay without steps, of
+    a model, whose shapes the user chose, and for a method that places nothing anew. A method that
+    starts from a model may change the squared error.
     """
-    start, options, objective = problem.start, problem.options, problem.pixels()
+    start, image, options = problem.start, problem.pixels(), problem.options
+    method, iterations = options.method, options.iterations
     if start is None:
-        return objective, None, None
-    if isinstance(start, Gaussians):
-        start = problem.fitted(start)
-    pixels = problem.channels[0].targets[0].pixels
-    return start_from(start, objective, options.method, pixels, options.iterations, options.seed)
+        return image, None, None
+    if not isinstance(start, Gaussians):
+        pixels = problem.channels[0].targets[0].pixels
+        image, gaussians = method.start_from_model(image, start, pixels)
+        # Steps need means inside of the image.
+        return image, gaussians.bounded() if iterations else gaussians, len(gaussians)
+    gaussians = problem.fitted(start).scaled(*image.size)
+    gaussians = replace(gaussians, cutoff=float(method.cutoff))
+    gaussians = method.start_from(image, gaussians.bounded() if iterations else gaussians)
+    if not iterations or method.place.has_colors or not method.in_phase("redistribute"):
+        return image, gaussians, len(gaussians)
+    return image, *keep_fitting(gaussians, image, method, iterations, options.seed)
 
 
 def _refined(
@@ -363,19 +372,19 @@ def _refined(
         method = method.without("densify", "redistribute")
     if counts:
         begun = place_levels(replace(descent, method=method), counts, options.iterations)
-        objective = replace(objective, levels=counts[:-1])
+        objective = replace(objective, image=replace(objective.image, levels=counts[:-1]))
     elif begun is None:
-        begun = method.place_and_solve(objective, problem.first_count, options.seed)
+        begun = method.place_and_solve(objective.image, problem.first_count, options.seed)
     seconds_init = (time.perf_counter() - started) / problem.images
     descent = replace(descent, objective=objective, method=method)
     if options.searches:
         refined = [search_count(descent, begun, problem.max_count, options.iterations)]
     else:
         refined = refine(descent, begin(begun, problem.images, chosen), options.iterations)
-    if isinstance(objective, LossObjective) and refined[0].stopped != "interrupted":
-        objective.calls.check_use()
+    if objective.loss is not None and refined[0].stopped != "interrupted":
+        objective.loss.calls.check_use()
     if counts:
-        sets = [sort_levels(one.gaussians, objective, counts) for one in refined]
+        sets = [sort_levels(one.gaussians, objective.image, counts) for one in refined]
         refined = [replace(one, gaussians=g) for one, g in zip(refined, sets, strict=True)]
     return refined, seconds_init
 

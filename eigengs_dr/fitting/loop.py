@@ -17,13 +17,13 @@ from .control import Control
 from .exchange import prune
 from .measure import Measured, Row
 from .method import Method
-from .objective import Pixels
+from .objective import Objective
 from .state import State
-from .step import listed, rate_table, started, step_program
+from .step import listed, started, step_program
 
 
 def descend(
-    objective: Pixels,
+    objective: Objective,
     method: Method,
     state: State,
     iterations: int,
@@ -53,28 +53,29 @@ def descend(
     """
     part = range(iterations) if part is None else part
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
-    factors, largest = method.rate_factors(iterations), 0
-    rates = rate_table(objective.types, method, factors)
-    program = step_program(objective, method)
+    schedule, largest = method.schedule(iterations), 0
+    kind = np.float32 if objective.image.types.bits == 32 else np.float64
+    image = objective.image
+    program = step_program(image, method)
     with release_later(state), objective.models() as model_at, freeze_program(program) as take_step:
         for step in part:
             acting = [control for control, steps in acts if step in steps]
-            squares = objective.around(state.gaussians) if acting else objective
+            near = objective.near(state.gaussians) if acting else image
             for control in acting:
-                state = _checked(control(state, squares, step, iterations, key), control)
+                state = _checked(control(state, near, step, iterations, key), control)
             if state.moving is None:
-                state = started(state, method, step, objective.grid.images)
+                state = started(state, method, step, image.grid.images)
             if not state.lists or step >= state.until:
-                state = listed(state, objective, method, factors, step, part.stop)
+                state = listed(state, image, method, schedule, step, part.stop)
             largest = max(largest, len(state.gaussians))
+            rates = [schedule.rate(step, state, rate, kind) for rate in method.rates.values()]
             moving, moved = take_step(
                 largest,
                 state.moving,
                 state.fixed,
                 model_at(state),
                 list(state.lists),
-                rates,
-                dr.opaque(objective.types.UInt, step),
+                image.types.Float(rates),
             )
             state = replace(state, moving=moving, gaussians=moved, squares=None)
             yield state
@@ -132,7 +133,7 @@ def averaged(states: Generator[State, None, None], first: int) -> Generator[Stat
 FitProgress = Callable[[int, int, Row], None]
 
 Score = Callable[[Gaussians], list[Measured]]
-"""``score(gaussians)`` measures the set of each image of a batch; `Pixels.merit` of the row says
+"""``score(gaussians)`` measures the set of each image of a batch; `Objective.merit` of the row says
 which set is the best."""
 
 
@@ -156,7 +157,7 @@ class Descent:
         `eigengs_dr.backend.interrupts.defer_interrupts`.
     """
 
-    objective: Pixels
+    objective: Objective
     method: Method
     score: Score
     key: int = 0
@@ -171,7 +172,7 @@ class Refinement:
     Attributes
     ----------
     gaussians : Gaussians
-        The set with the highest `Pixels.merit` in the trace; the batch with it, if there is one.
+        The set with the highest `Objective.merit` in the trace; the batch with it, if there is one.
     trace : list of dict
         Rows with the keys iteration, gaussians, seconds, psnr_ycbcr and psnr_rgb.
     iterations : int
@@ -188,7 +189,9 @@ class Refinement:
     stopped: str = "iterations"
     row: Row = field(default_factory=Row)
 
-    def judged(self, gaussians: Gaussians, row: Row, objective: Pixels, count: int) -> Refinement:
+    def judged(
+        self, gaussians: Gaussians, row: Row, objective: Objective, count: int
+    ) -> Refinement:
         """Return the result with another row of its trace, and the set if it is the best.
 
         Sets of `count` Gaussians are compared; the best one of another number is none any more.
@@ -217,7 +220,7 @@ class Best:
 
     def __init__(self, descent: Descent, state: State, iterations: int) -> None:
         self.descent, self.iterations = descent, iterations
-        images = descent.objective.grid.images
+        images = descent.objective.image.grid.images
         self.refinements = [Refinement(state.gaussians) for _ in range(images)]
         self.marks, self.step, self.state = trace_steps(iterations), 0, state
         self.row = Row()
@@ -261,7 +264,7 @@ class Best:
             for _, step, gaussians in [*larger, (0.0, self.step, self.state.gaussians)]:
                 measured = [row["iteration"] for row in self.refinements[0].trace]
                 if step not in measured or len(gaussians) > self.state.count:
-                    near = self.descent.objective.around(gaussians)
+                    near = self.descent.objective.near(gaussians)
                     self.judge(step, prune(dr.detach(gaussians), near, self.state.count))
         self.refinements = [
             replace(one, stopped="interrupted", iterations=self.step) for one in self.refinements
@@ -289,27 +292,21 @@ def refine(descent: Descent, state: State, iterations: int) -> list[Refinement]:
     KeyboardInterrupt
         If the refinement of a batch is interrupted.
     """
-    best, method, interrupted = (
-        Best(descent, state, iterations),
-        descent.method,
-        descent.interrupted,
-    )
+    best, method = Best(descent, state, iterations), descent.method
     try:
         ended = best.offer(0, state)
         states = descend(descent.objective, method, state, iterations, descent.key)
         if method.average:
             states = averaged(states, round((1 - method.average) * iterations))
         with closing(states):
-            while not (ended or interrupted()) and best.step < iterations:
+            while not (ended or descent.interrupted()) and best.step < iterations:
                 ended = best.offer(best.step + 1, next(states))
-        stopped = interrupted()
+        stopped = descent.interrupted()
     except KeyboardInterrupt:
         stopped = True
     if stopped:
         best.end_early()
-    batches = {id(one.gaussians): one.gaussians for one in best.refinements}
-    detached = {name: dr.detach(batch) for name, batch in batches.items()}
-    return [replace(one, gaussians=detached[id(one.gaussians)]) for one in best.refinements]
+    return best.refinements
 
 
 def trace_steps(iterations: int) -> set[int]:
@@ -333,5 +330,5 @@ def split(batch: Gaussians) -> list[Gaussians]:
 def sets_of(refinements: Sequence[Refinement]) -> list[Gaussians]:
     """Return the best set of each image of a batch."""
     batches = {id(one.gaussians): one.gaussians for one in refinements}
-    sets = {name: split(batch) for name, batch in batches.items()}
+    sets = {name: split(dr.detach(batch)) for name, batch in batches.items()}
     return [sets[id(one.gaussians)][k] for k, one in enumerate(refinements)]

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from inspect import signature
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -25,10 +25,11 @@ from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.space import Affine
 from ..raster.binning.lists import TileLists
-from ..raster.kernels import forward, pixels_inside
+from ..raster.binning.tiles import Grid
+from ..raster.kernels import forward
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import bin_gaussians, to_tensor
-from .objective import Channels, Pixels, Quadratic, Slope
+from .channels import Channels
 
 if TYPE_CHECKING:
     from .state import State
@@ -292,48 +293,61 @@ CHECK_EVERY = 10
 """Calls after which the values are read back; each read waits for the device."""
 
 TINY = 1e-30
-"""Lower bound of a loss before its logarithm."""
-
-NO_ERROR = 1e-20
-"""Squared error of a tile up to which it counts as zero."""
-
-FLAT = 0.02
-"""Secant of a tile, relative to all tiles, below which the loss counts as independent of it."""
-
-LITTLE = 0.1
-"""Squared error of a tile, relative to the mean, at which its secant weighs as much as that of all.
-For L1 + 0.2 (1 - SSIM), 1,000 steps and 8 training photos, 0.01 ends with a loss 0 to 1 % lower,
-and a PSNR 0.13 dB lower."""
+"""Smallest divisor, and lower bound of a loss before its logarithm."""
 
 PULL = 10.0
 """How strongly sums outside the bounds are pulled back: a tenth of the range outside weighs as much
 as the root mean square of the derivative."""
 
 
-@dataclass(frozen=True)
-class LossObjective(Pixels):
-    """The loss of a user for a picture, or for several maps as channels of one picture.
+class Slope(NamedTuple):
+    """The derivative of a loss at the picture of a step, instead of a model around it.
+
+    Attributes
+    ----------
+    derivative : Float, shape (pixels * channels,)
+        In tile layout, times half the number of values, as `Quadratic.compare` returns it.
+    size : Float, shape (1,)
+        0 if there is no derivative at this step, which then moves nothing.
+    """
+
+    derivative: Float
+    size: Float
+
+    def compare(
+        self, packed: Float, background: list, lists: TileLists, radius: float, pairs: bool = False
+    ) -> tuple[Float, list]:
+        """Return the derivative, which is given in Floats; there are no squares."""
+        return self.derivative, []
+
+
+@dataclass(frozen=True, eq=False)
+class PictureLoss:
+    """A loss of the user for the pictures that a set shows.
 
     Attributes
     ----------
     loss : Loss
+        Of a picture, or of several maps as channels of one picture.
     shown : tuple of Channels
         What the channels of a set show.
+    grid : Grid
     calls : Calls
     """
 
-    loss: Loss = field(kw_only=True)
-    shown: tuple[Channels, ...] = field(kw_only=True)
+    loss: Loss
+    shown: tuple[Channels, ...]
+    grid: Grid
     calls: Calls = field(default_factory=Calls)
 
-    @classmethod
-    def of_loss(cls, loss: Loss, shown: Sequence[Channels], base: Pixels) -> LossObjective:
-        """Return the objective of a loss near an image: the user's image, or a first guess."""
-        return cls(**vars(base), loss=loss, shown=tuple(shown))
+    @property
+    def number(self) -> int:
+        """Number of channels of a set."""
+        return self.shown[-1].part.stop
 
     @contextmanager
-    def models(self) -> Iterator[Callable[[State], Slope]]:
-        """Give the derivative at the picture of each step, see `Pixels.models`."""
+    def slopes(self) -> Iterator[Callable[[State], Slope]]:
+        """Give the derivative at the picture of each step, a function of its state."""
         with (
             freeze_program(self.draw) as draw,
             freeze_program(self.to_slope) as to_slope,
@@ -367,7 +381,7 @@ class LossObjective(Pixels):
         """Return the sums of a set in tile layout, and the pictures that the loss sees."""
         sums = forward(packed, background, lists, radius)
         dr.eval(sums)
-        return sums, self.seen(to_tensor(sums, self.grid, self.channels).array)
+        return sums, self.seen(to_tensor(sums, self.grid, self.number).array)
 
     def draw_set(self, gaussians: Gaussians) -> tuple[Float, list[Float]]:
         """Return the sums of a set and the pictures of the loss, see `draw`, by new lists."""
@@ -379,14 +393,14 @@ class LossObjective(Pixels):
 
     def seen(self, sums: Float) -> list[Float]:
         """Return the pictures that the loss sees of sums, both as rows of pixels."""
-        pictures = show(self.shown, sums, self.channels)
+        pictures = show(self.shown, sums, self.number)
         if self.loss.bounds is None:
             return pictures
         return [dr.clip(picture, *self.loss.bounds) for picture in pictures]
 
     def to_slope(self, sums: Float, slopes: list[Float]) -> Float:
         """Return the derivative by sums in tile layout, see `Slope`, from those by the pictures."""
-        number = self.grid.width * self.grid.height * self.channels
+        number = self.grid.width * self.grid.height * self.number
         return self.pull_back(sums, slopes, in_tiles=True) * (0.5 * number)
 
     def pull_back(self, sums: Float, slopes: list[Float], in_tiles: bool = False) -> Float:
@@ -394,8 +408,8 @@ class LossObjective(Pixels):
         with dr.resume_grad():
             traced = type(sums)(sums)
             dr.enable_grad(traced)
-            rows = to_tensor(traced, self.grid, self.channels).array if in_tiles else traced
-            pictures = show(self.shown, rows, self.channels)
+            rows = to_tensor(traced, self.grid, self.number).array if in_tiles else traced
+            pictures = show(self.shown, rows, self.number)
             for picture, slope in zip(pictures, slopes, strict=True):
                 dr.set_grad(picture, self._bounded(dr.detach(picture), slope))
             dr.enqueue(dr.ADMode.Backward, pictures)
@@ -411,6 +425,11 @@ class LossObjective(Pixels):
         pull = dr.sqrt(dr.mean(dr.square(slope))) * (PULL / (high - low))
         inwards = dr.select(slope * excess >= 0, slope, 0)
         return dr.fma(pull, excess, inwards)
+
+    def slope_of(self, gaussians: Gaussians) -> tuple[Float, Float]:
+        """Return the sums of a set and the derivative by them, both in tile layout."""
+        sums, pictures = self.draw_set(gaussians)
+        return sums, self.pull_back(sums, self.derivative(pictures)[1], in_tiles=True)
 
     def derivative(
         self, pictures: list[Float], parameters: Any = None
@@ -435,7 +454,8 @@ class LossObjective(Pixels):
         """
         with dr.resume_grad(), collector_off():
             leaves = self._leaves(pictures)
-            value = self._number(_call(self.loss.function, self._named(leaves), step))
+            called = _call(self.loss.function, self._named(leaves), step)
+            value = _to_array(called, type(pictures[0]))
             dr.clear_grad(leaves)  # of what the function has differentiated itself
             if dr.grad_enabled(value):
                 self.calls.depends = True
@@ -467,7 +487,7 @@ class LossObjective(Pixels):
     @property
     def compares(self) -> bool:
         """Whether losses of two sets say which is better, as those of other cameras do not."""
-        return self.loss.judge is not None or bool(self.pictures)
+        return self.loss.judge is not None or bool(self.shown[0].targets)
 
     @property
     def is_called_by_row(self) -> bool:
@@ -490,72 +510,20 @@ class LossObjective(Pixels):
             raise ValueError(f"loss: {name} is {number:g} for a picture; it must be finite")
         return number
 
-    def _number(self, value: Any) -> Float:
-        """Return the value of a loss as an array of one entry.
-
-        Raises
-        ------
-        ValueError
-            If it is none.
-        """
-        Float = self.types.Float
-        if isinstance(value, (int, float)):
-            return Float(value)
-        if not dr.is_array_v(value) or not dr.is_float_v(value):
-            raise ValueError(f"loss: it returned {type(value).__name__}; return a number of Dr.Jit")
-        if dr.is_tensor_v(value):
-            value = value.array
-        if dr.width(value) != 1 or dr.depth_v(value) != 1:
-            raise _too_many(value.shape)
-        return Float(value)
-
     def _leaves(self, pictures: Sequence[Float]) -> list[Tensor]:
         """Return pictures, rows of pixels, as tensors with derivatives of their own."""
-        leaves = [self._tensor(k, rows) for k, rows in enumerate(pictures)]
+        height, width = self.grid.height, self.grid.width
+        leaves = [
+            types_of(rows).Tensor(rows, (height, width, channels.number))
+            for channels, rows in zip(self.shown, pictures, strict=True)
+        ]
         dr.enable_grad(leaves)
         return leaves
-
-    def _tensor(self, number: int, rows: Float) -> Tensor:
-        size = self.grid.height, self.grid.width, self.shown[number].number
-        return self.types.Tensor(rows, size)
 
     def _named(self, pictures: Sequence[Tensor]) -> Any:
         if not self.shown[0].name:
             return pictures[0]
         return {_Name(c.name): p for c, p in zip(self.shown, pictures, strict=True)}
-
-    def around(self, gaussians: Gaussians) -> Pixels:
-        """Return the squared error of the image, weighed as the loss weighs it near a set.
-
-        The loss L has the derivative g at the picture p, and almost none at the image t: the
-        secant ``h = sum g (p - t) / sum (p - t)^2`` of each tile is its curvature in between. For
-        the squared error it is exact, for an absolute error it is one over its mean. It is in units
-        of the usual secant: the mean, weighed by ``g (p - t)``. Tiles with little error take that,
-        and tiles on which the loss does not depend take 0: their Gaussians go where they count.
-        """
-        grid, target = self.grid, self.model.target
-        assert target is not None
-        sums, pictures = self.draw_set(gaussians)
-        slope = self.pull_back(sums, self.derivative(pictures)[1], in_tiles=True)
-        block, inside = grid.pixels * self.channels, pixels_inside(self.types, grid)
-        each = dr.arange(self.types.UInt, dr.width(sums)) // self.channels
-        error = (sums - target) * dr.gather(self.types.Float, inside, each)
-        along = dr.maximum(dr.block_sum(slope * error, block), 0)
-        squares = dr.block_sum(dr.square(error), block)
-        total = dr.sum(along)
-        usual = dr.sum(dr.square(along) / (squares + NO_ERROR)) / total
-        little = LITTLE * dr.sum(along * squares) / total
-        secant = (along / usual + little) / (squares + little)
-        secant = dr.select(along > FLAT * usual * squares, secant, 0)
-        secant = dr.select(total > 0, secant, 1)
-        tile = dr.arange(self.types.UInt, dr.width(inside)) // grid.pixels
-        curvature = dr.gather(self.types.Float, secant, tile) * inside
-        dr.eval(curvature)
-        return replace(self.image(), model=Quadratic(target, curvature))
-
-    def image(self) -> Pixels:
-        """Return the squared error of the image alone."""
-        return Pixels(**{name: getattr(self, name) for name in Pixels.__dataclass_fields__})
 
 
 class _Name(str):
@@ -583,6 +551,25 @@ def _call(function: Callable[..., Any], *arguments: Any) -> Any:
         if isinstance(error.__cause__, KeyboardInterrupt):  # Dr.Jit wraps exceptions
             raise KeyboardInterrupt from error
         raise
+
+
+def _to_array(value: Any, kind: type[Float]) -> Float:
+    """Return the value of a loss as an array of one entry.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    if isinstance(value, (int, float)):
+        return kind(value)
+    if not dr.is_array_v(value) or not dr.is_float_v(value):
+        raise ValueError(f"loss: it returned {type(value).__name__}; return a number of Dr.Jit")
+    if dr.is_tensor_v(value):
+        value = value.array
+    if dr.width(value) != 1 or dr.depth_v(value) != 1:
+        raise _too_many(value.shape)
+    return kind(value)
 
 
 def _one_number(value: Any) -> float:

@@ -29,7 +29,7 @@ from ..raster.parameters import (
     pack_parameters,
 )
 from ..raster.render import bin_gaussians
-from .objective import Picture
+from .channels import Picture
 from .solve import spread
 
 Row: TypeAlias = Record

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from numbers import Real
-from typing import Protocol, get_args, runtime_checkable
+from typing import NamedTuple, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,30 @@ from .control import (
 from .objective import Pixels
 from .place import Adaptive, Placement
 from .solve import solve
-from .state import Adam, Coordinates, Optimizer, Relative, begin
+from .state import Adam, Coordinates, Optimizer, Relative, State
+
+
+class Schedule(NamedTuple):
+    """The factors of all learning rates of a descent.
+
+    Attributes
+    ----------
+    factors : list of float
+        From `Method.rate_factors`.
+    warm_up : int
+    """
+
+    factors: list[float]
+    warm_up: int
+
+    def rate(self, step: int, state: State, largest: float = 1.0, kind: type = float) -> float:
+        """Return the rate of a step of a variable with the largest rate `largest`.
+
+        It rises after the start of the optimiser. `kind` is the precision in which it is computed.
+        """
+        warm = min(1.0, (step - state.since + 1) / max(1, self.warm_up))
+        rate: float = kind(largest * self.factors[step]) * (kind(warm) * kind(state.speed))
+        return rate
 
 
 @runtime_checkable
@@ -151,6 +174,10 @@ class Method:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])
 
+    def schedule(self, iterations: int) -> Schedule:
+        """Return the factors of the learning rates of a descent."""
+        return Schedule(self.rate_factors(iterations), self.warm_up)
+
     def rate_factors(self, iterations: int) -> list[float]:
         """Return the factors of the learning rates at all steps: half a cosine down to `decay`.
 
@@ -189,13 +216,6 @@ class Method:
                 raise ValueError(f"phase {shown(phase)} is unknown; use one of {', '.join(known)}")
         kept = tuple(c for c in self.controls if phase_of(c) not in phases)
         return replace(self, controls=kept)
-
-    def surplus(self, gaussians: Gaussians, objective: Pixels, iterations: int) -> int:
-        """Return how many Gaussians more than a set a descent from it may have at first."""
-        state = begin(gaussians)
-        for control in self.in_phase("densify"):
-            state = control(state, objective, 0, iterations, 0)
-        return state.surplus
 
     def at_rates(self, factor: float) -> Method:
         """Return the method with all learning rates times a factor."""

@@ -9,31 +9,29 @@ model is exact: t is the image and h the weight, for all pictures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..backend.arrays import ArrayTypes, types_of, upload
+from ..backend.arrays import ArrayTypes, types_of
 from ..backend.types import Float, Record, Tensor
-from ..gaussian.channels import TextureMap
 from ..gaussian.gaussians import Gaussians, whole
-from ..image.color import exposed
-from ..image.space import DATA, Affine, Extent, Space
+from ..image.space import DATA, Space
 from ..raster.binning.lists import TileLists
 from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums, forward, pixels_inside, residual
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import batch_to_tiles, bin_gaussians, to_tensor
+from .channels import Channels, Image, Picture
+from .loss import PictureLoss, Slope
 
 if TYPE_CHECKING:
     from .state import State
-
-Image = NDArray[np.float32]
 
 
 class Quadratic(NamedTuple):
@@ -41,14 +39,14 @@ class Quadratic(NamedTuple):
 
     Attributes
     ----------
-    target : Float, shape (pixels * channels,), or None
+    target : Float, shape (pixels * channels,)
         The picture t at which the model is least, in the tile layout of
-        `eigengs_dr.raster.kernels`; None for 0.
+        `eigengs_dr.raster.kernels`.
     curvature : Float, shape (pixels,) or (pixels * channels,), or None
         h for all channels of a pixel, or for each; None stands for 1 at all pixels of the image.
     """
 
-    target: Float | None
+    target: Float
     curvature: Float | None = None
 
     def compare(
@@ -63,7 +61,6 @@ class Quadratic(NamedTuple):
     def curvatures(self, grid: Grid) -> Float:
         """Return the curvature of every pixel: one value, or one per channel; 0 outside."""
         if self.curvature is None:
-            assert self.target is not None
             return pixels_inside(types_of(self.target), grid)
         return self.curvature
 
@@ -76,7 +73,6 @@ class Quadratic(NamedTuple):
 
     def mean_target(self, grid: Grid, channels: int) -> list:
         """Return the mean of the target weighed by the curvature: a Float (images,) per channel."""
-        assert self.target is not None
         types = types_of(self.target)
         if self.curvature is None:
             area = dr.opaque(types.Float, 1 / (grid.width * grid.height))
@@ -87,212 +83,12 @@ class Quadratic(NamedTuple):
 
     def mean_curvature(self, grid: Grid, channels: int) -> Float:
         """Return the mean of the curvature over the pixels and channels, a Float (images,)."""
-        assert self.target is not None
         types = types_of(self.target)
         if self.curvature is None:
             return dr.full(types.Float, 1, grid.images)
         number = dr.width(self.curvature) // (grid.tiles * grid.pixels)
         sums = channel_sums(self.curvature, number, grid)
         return sum(sums) * dr.opaque(types.Float, 1 / (number * grid.width * grid.height))
-
-
-class Slope(NamedTuple):
-    """The derivative of a loss at the picture of a step, instead of a model around it.
-
-    Attributes
-    ----------
-    derivative : Float, shape (pixels * channels,)
-        In tile layout, times half the number of values, as `Quadratic.compare` returns it.
-    size : Float, shape (1,)
-        0 if there is no derivative at this step, which then moves nothing.
-    """
-
-    derivative: Float
-    size: Float
-
-    def compare(
-        self, packed: Float, background: list, lists: TileLists, radius: float, pairs: bool = False
-    ) -> tuple[Float, list]:
-        """Return the derivative, which is given in Floats; there are no squares."""
-        return self.derivative, []
-
-
-class Picture(NamedTuple):
-    """What some channels of a set show, for a PSNR.
-
-    Attributes
-    ----------
-    space : Space
-        Space of the channels.
-    image : Float
-        In tile layout: sRGB; or the data as they are fitted.
-    channels : slice
-        The channels of the set.
-    scale, offset : Float, shape (images,)
-        ``scale s + offset`` of a fitted value s is in units of the space; of data, with the peak 1.
-    exposure : Float, shape (images,)
-        Factor of light that may exceed 1 before it is compared.
-    weight : Float, shape (pixels,), or None
-        Factor of the squared errors, in tile layout.
-    base : Float or None
-        RGB that is added to the rendering, in tile layout.
-    has_codes : bool
-        Whether the values are displayed in 8 bits: colours, normals, and data between 0 and 1.
-    """
-
-    space: Space
-    image: Float
-    channels: slice
-    scale: Float
-    offset: Float
-    exposure: Float
-    weight: Float | None = None
-    base: Float | None = None
-    has_codes: bool = True
-
-
-class Target(NamedTuple):
-    """An image that some channels should show.
-
-    Attributes
-    ----------
-    pixels : ndarray of float32, shape (H, W, C)
-        Display values: sRGB, above 1 for light above 1; normals or data.
-    values : ndarray of float32, shape (H, W, C)
-        In the space of the channels and the unit of the fit.
-    unit : Affine
-    """
-
-    pixels: Image
-    values: Image
-    unit: Affine
-
-    @classmethod
-    def of(cls, pixels: Image, space: Space, unit: Affine | None = None) -> Target:
-        """Convert pixels to the values of a space, ``(v - offset) / scale``.
-
-        By default the unit is that of the pixels; give one if they are a part of a larger image.
-        """
-        values = space.values_of(pixels)
-        unit = unit or space.unit(Extent.of(values))
-        if unit != Affine():
-            values = (values - np.float32(unit.offset)) / np.float32(unit.scale)
-        return cls(pixels, values, unit)
-
-
-class Channels(NamedTuple):
-    """Some channels of a set: those of an image, or of one map.
-
-    Attributes
-    ----------
-    name : str
-        Name of the map; "" for an image.
-    space : Space
-    part : slice
-        The channels of the set.
-    targets : tuple of Target
-        What they should show, one for each image of a batch; () if only a loss knows.
-    factor : float
-        Factor of the fitted values, and so of the errors.
-    goal : float or None
-        The PSNR in dB that the map must reach.
-    """
-
-    name: str
-    space: Space
-    part: slice
-    targets: tuple[Target, ...] = ()
-    factor: float = 1.0
-    goal: float | None = None
-
-    @property
-    def number(self) -> int:
-        """Number of channels."""
-        return int(self.part.stop - self.part.start)
-
-    def unit(self, image: int = 0) -> Affine:
-        """Return the map from sums of the fit to values of the space, for an image of a batch."""
-        scale, offset = self.targets[image].unit if self.targets else Affine()
-        return Affine(scale / self.factor, offset)
-
-    @property
-    def map(self) -> TextureMap:
-        """The map of the finished set, whose weight is the factor of its errors in the fit."""
-        return TextureMap(self.name, self.space, self.number, 1 / self.unit().scale)
-
-    def values(self) -> Image:
-        """Return the fitted values, shape (images, H, W, C), or (H, W, C) for one image."""
-        return self._stacked([target.values for target in self.targets])
-
-    def placement_images(self) -> Image:
-        """Return the images that place Gaussians, of the shape of `values`."""
-        trivial = Affine()
-        return self._stacked(
-            [
-                self.space.placement_image(values, pixels if unit == trivial else None)
-                for pixels, values, unit in self.targets
-            ]
-        )
-
-    def weights(self) -> Image | None:
-        """Return the factors of the squared errors, of the shape of `values`; None for 1."""
-        weights = [self.space.weight(target.values) for target in self.targets]
-        known = [weight for weight in weights if weight is not None]
-        return (np.stack(known) if len(known) > 1 else known[0]) if known else None
-
-    def _stacked(self, images: list[Image]) -> Image:
-        stacked = np.stack(images) if len(images) > 1 else images[0]
-        return stacked if self.factor == 1 else stacked * np.float32(self.factor)
-
-    def picture(self, types: ArrayTypes, weight: Image | None = None) -> Picture:
-        """Return the display values on the device, for the PSNRs.
-
-        Data are measured with their range as the peak, or 1 if they are codes. Light that may
-        exceed 1 is exposed, see `Space.exposure`.
-
-        Parameters
-        ----------
-        types : ArrayTypes
-        weight : ndarray of float32, shape (H, W) or (H, W, C), optional
-            Factor of the squared errors.
-        """
-        images, codes = [target.pixels for target in self.targets], True
-        units = [self.unit(k) for k in range(len(images))]
-        exposures = [self.space.exposure(pixels) for pixels in images]
-        if self.space.by_range:
-            codes = all(map(self.space.has_codes, images))
-            shown = self.values()
-            if not codes:
-                units = [Affine(1 / self.factor, u.offset / u.scale) for u in units]
-        else:
-            images = [exposed(*pair) for pair in zip(images, exposures, strict=True)]
-            shown = np.stack(images) if len(images) > 1 else images[0]
-        weights = None
-        if weight is not None:
-            weights = batch_to_tiles(types, np.atleast_3d(weight).mean(axis=2, keepdims=True))
-        return Picture(
-            self.space,
-            batch_to_tiles(types, shown),
-            self.part,
-            upload(types.Float, np.array([unit.scale for unit in units])),
-            upload(types.Float, np.array([unit.offset for unit in units])),
-            upload(types.Float, np.array(exposures)),
-            weights,
-            has_codes=codes,
-        )
-
-
-def restored(gaussians: Gaussians, units: Sequence[Affine]) -> Gaussians:
-    """Return a set in the units of an image, from the unit of each channel of the fit."""
-    if all(unit == Affine() for unit in units):
-        return gaussians
-    kind = type(gaussians.color)
-    color = [row * unit.scale for row, unit in zip(gaussians.color, units, strict=True)]
-    background = [
-        row * unit.scale + unit.offset
-        for row, unit in zip(gaussians.background, units, strict=True)
-    ]
-    return replace(gaussians, color=kind(color), background=kind(background))
 
 
 class Part(NamedTuple):
@@ -392,30 +188,12 @@ class Pixels:
     @property
     def types(self) -> ArrayTypes:
         """Backend and precision."""
-        assert self.model.target is not None
         return types_of(self.model.target)
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.grid.width, self.grid.height
-
-    @contextmanager
-    def models(self) -> Iterator[Callable[[State], Quadratic | Slope]]:
-        """Give the model of each step during a descent: a function of its state."""
-        yield lambda state: self.model
-
-    def around(self, gaussians: Gaussians) -> Pixels:
-        """Return the squared error that stands for the objective near a set: itself."""
-        return self
-
-    def judged(self, gaussians: Gaussians) -> dict[str, float]:
-        """Return what a row of a trace holds besides PSNRs: nothing."""
-        return {}
-
-    def merit(self, row: Record) -> float:
-        """Return the figure of a row that is largest for the best set: its PSNR."""
-        return float(row["psnr_ycbcr"])
 
     def minus(self, gaussians: Gaussians) -> Pixels:
         """Return the objective for Gaussians that are added to these, which stay as they are."""
@@ -469,3 +247,74 @@ def squares_of(shown: Sequence[Channels], types: ArrayTypes, weight: Image | Non
 
 def _joined(images: list[Image]) -> Image:
     return images[0] if len(images) == 1 else np.concatenate(images, axis=-1)
+
+
+NO_ERROR = 1e-20
+"""Squared error of a tile up to which it counts as zero."""
+
+FLAT = 0.02
+"""Secant of a tile, relative to all tiles, below which the loss counts as independent of it."""
+
+LITTLE = 0.1
+"""Squared error of a tile, relative to the mean, at which its secant weighs as much as that of all.
+For L1 + 0.2 (1 - SSIM), 1,000 steps and 8 training photos, 0.01 ends with a loss 0 to 1 % lower,
+and a PSNR 0.13 dB lower."""
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """What a descent makes small: the squared error of an image, or a loss of the user near one.
+
+    Attributes
+    ----------
+    image : Pixels
+        For a loss, the user's image or a first guess.
+    loss : PictureLoss or None
+    """
+
+    image: Pixels
+    loss: PictureLoss | None = None
+
+    def models(self) -> AbstractContextManager[Callable[[State], Quadratic | Slope]]:
+        """Give the model of each step during a descent: a function of its state."""
+        if self.loss is None:
+            return nullcontext(lambda state: self.image.model)
+        return self.loss.slopes()
+
+    def judged(self, gaussians: Gaussians) -> dict[str, float]:
+        """Return what a row of a trace holds of a set besides PSNRs."""
+        return {} if self.loss is None else self.loss.judged(gaussians)
+
+    def merit(self, row: Record) -> float:
+        """Return the figure of a row that is largest for the best set."""
+        return float(row["psnr_ycbcr"]) if self.loss is None else self.loss.merit(row)
+
+    def near(self, gaussians: Gaussians) -> Pixels:
+        """Return the squared error that stands for the objective near a set.
+
+        Without a loss it is that of the image. A loss weighs it by a quadratic model about itself.
+        The loss L has the derivative g at the picture p, and almost none at the image t: the
+        secant ``h = sum g (p - t) / sum (p - t)^2`` of each tile is its curvature in between. For
+        the squared error it is exact, for an absolute error it is one over its mean. It is in units
+        of the usual secant: the mean, weighed by ``g (p - t)``. Tiles with little error take that,
+        and tiles on which the loss does not depend take 0: their Gaussians go where they count.
+        """
+        if self.loss is None:
+            return self.image
+        image, types, grid = self.image, self.image.types, self.image.grid
+        sums, slope = self.loss.slope_of(gaussians)
+        block, inside = grid.pixels * image.channels, pixels_inside(types, grid)
+        each = dr.arange(types.UInt, dr.width(sums)) // image.channels
+        error = (sums - image.model.target) * dr.gather(types.Float, inside, each)
+        along = dr.maximum(dr.block_sum(slope * error, block), 0)
+        squares = dr.block_sum(dr.square(error), block)
+        total = dr.sum(along)
+        usual = dr.sum(dr.square(along) / (squares + NO_ERROR)) / total
+        little = LITTLE * dr.sum(along * squares) / total
+        secant = (along / usual + little) / (squares + little)
+        secant = dr.select(along > FLAT * usual * squares, secant, 0)
+        secant = dr.select(total > 0, secant, 1)
+        tile = dr.arange(types.UInt, dr.width(inside)) // grid.pixels
+        curvature = dr.gather(types.Float, secant, tile) * inside
+        dr.eval(curvature)
+        return replace(image, model=image.model._replace(curvature=curvature))

@@ -25,10 +25,12 @@ from ..image.io import check_data, check_image, read_image
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import WHITE, EncodedImage, ImageError
 from ..image.space import DATA, YCBCR, Space, space_of
-from .loss import LossObjective
+from ..raster.binning.tiles import Grid
+from .channels import Channels, Target, restored
+from .loss import PictureLoss
 from .measure import Measured, Row, psnrs
 from .method import Model
-from .objective import Channels, Pixels, Target, restored, squares_of
+from .objective import Objective, Pixels, squares_of
 from .options import FitOptions, Goal
 from .redistribution import squares_by_channel
 from .start import check_start, load_start, set_in
@@ -150,11 +152,10 @@ class Problem:
         pictures = tuple(c.picture(pixels.types, self.weight) for c in self.channels)
         return replace(pixels, pictures=pictures)
 
-    def objective(self, pixels: Pixels) -> Pixels:
-        """Return what is made small: the squared error of pixels, or the loss near them."""
-        if self.options.loss is None:
-            return pixels
-        return LossObjective.of_loss(self.options.loss, self.channels, pixels)
+    def picture_loss(self) -> PictureLoss | None:
+        """Return the loss of the user for the pictures of the fit, if there is one."""
+        loss = self.options.loss
+        return None if loss is None else PictureLoss(loss, self.channels, Grid(*self.size))
 
     def balanced(self, count: int) -> Problem:
         """Return the problem with factors of its maps by which all gain alike.
@@ -192,13 +193,13 @@ class Problem:
         sums = np.array([s[0] for s in squares_by_channel(start, pixels)])
         return [float(sums[c.part].mean()) / np.prod(self.size) for c in self.channels]
 
-    def measure(self, gaussians: Gaussians, objective: Pixels, seconds: float) -> list[Measured]:
+    def measure(self, gaussians: Gaussians, objective: Objective, seconds: float) -> list[Measured]:
         """Measure a set, or the sets of a batch.
 
         Rows hold the seconds, what the objective judges, and psnr_ycbcr and psnr_rgb: means over
         the maps that have them. Maps add maps, with both PSNRs of each, and with goals margin.
         """
-        figures = psnrs(gaussians, objective.pictures)
+        figures = psnrs(gaussians, objective.image.pictures)
         judged, goal = objective.judged(gaussians), self.options.goal
         measured = []
         for image in range(self.images):

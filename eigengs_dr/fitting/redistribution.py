@@ -108,7 +108,6 @@ def _mean_by_image(values: Float, lists: TileLists) -> Float:
 @record
 def _squares(shape: list, x: Unknowns, model: Quadratic, lists: TileLists, cutoff: float) -> Float:
     """Return ``h (p - t)^2`` of every pixel, added over the channels; evaluated."""
-    assert model.target is not None
     types, channels = types_of(model.target), len(x[0])
     error, _ = apply(shape, x, lists, cutoff, Quadratic(model.target))
     dr.eval(error)

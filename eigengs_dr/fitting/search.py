@@ -190,17 +190,16 @@ class _Run:
             self.stopped = True
         fitted = dr.detach(current.gaussians)
         # An interrupt may come before the last relocation.
-        return self.score(prune(fitted, self.around(fitted), current.count))
+        return self.score(prune(fitted, self.near(fitted), current.count))
 
     def redistribute(self, gaussians: Gaussians, count: int) -> Gaussians:
         """Place `count` Gaussians anew, denser where a set leaves more error."""
-        near = self.around(gaussians)
-        descent = self.descent
-        return redistribute(gaussians, near, count, descent.method.solve_steps, descent.key)
+        steps, key = self.descent.method.solve_steps, self.descent.key
+        return redistribute(gaussians, self.near(gaussians), count, steps, key)
 
-    def around(self, gaussians: Gaussians) -> Pixels:
+    def near(self, gaussians: Gaussians) -> Pixels:
         """Return the squared error that stands for the objective near a set."""
-        return self.descent.objective.around(gaussians)
+        return self.descent.objective.near(gaussians)
 
     def score(self, gaussians: Gaussians) -> _Trial:
         [measured] = self.descent.score(gaussians)
@@ -274,7 +273,10 @@ def _fit_estimate(
 
 def _fit(run: _Run, tried: Gaussians, placed: Gaussians, steps: int) -> _Trial:
     """Fit the estimated number, with a surplus that is placed as well and leaves."""
-    more = run.descent.method.surplus(placed, run.descent.objective, steps)
+    state = begin(placed)
+    for control in run.descent.method.in_phase("densify"):
+        state = control(state, run.descent.objective.image, 0, steps, 0)
+    more = state.surplus
     if more:
         placed = run.redistribute(tried, len(placed) + more)
     return run.descend(placed, steps, surplus=more)
@@ -316,20 +318,18 @@ def _polish(run: _Run, trial: _Trial, max_count: int, steps: int, max_steps: int
             )
             if new_count == count or -shortfall < ENOUGH:
                 return
-            changed = prune(trial.gaussians, run.around(trial.gaussians), new_count)
+            changed = prune(trial.gaussians, run.near(trial.gaussians), new_count)
         elif best.shortfall_db <= 0 and len(best.gaussians) <= FAR * count:
             # The best number lies between this one and that of the best set; or a polish suffices.
             new_count = max(
                 count, _count_for_gain(run, count, shortfall, (count + len(best.gaussians)) // 2)
             )
-            changed = densify(trial.gaussians, run.around(trial.gaussians), new_count)
+            changed = densify(trial.gaussians, run.near(trial.gaussians), new_count)
         else:
             new_count = max(
                 _count_for_gain(run, count, shortfall, max_count), math.ceil(least_growth * count)
             )
-            changed = densify(
-                trial.gaussians, run.around(trial.gaussians), min(new_count, max_count)
-            )
+            changed = densify(trial.gaussians, run.near(trial.gaussians), min(new_count, max_count))
             if len(changed) == count:  # at `max_count`, or none would reduce the error
                 return
             least_growth = 2 * least_growth - 1
@@ -353,6 +353,6 @@ def _trim(run: _Run) -> None:
         new_count = (too_few + len(above.gaussians)) // 2
         if new_count in (too_few, len(above.gaussians)):
             return
-        near = run.around(above.gaussians)
+        near = run.near(above.gaussians)
         trial = run.score(prune(above.gaussians, near, new_count))
         above, too_few = (trial, too_few) if trial.shortfall_db <= 0 else (above, new_count)

@@ -133,7 +133,6 @@ def _begin(
 
     A held background keeps its value.
     """
-    assert model.target is not None
     channels, grid, types = len(x[0]), lists.grid, types_of(model.target)
     error, squares = apply(shape, x, lists, cutoff, model)
     color, diagonal = weigh(shape, error, channels, lists, cutoff, model.curvatures(grid))
@@ -233,7 +232,8 @@ def _advance(
 
     Return x, ``q = H A p``, and ``alpha = rz / <A p, q>``.
     """
-    q, lengths = apply(shape, p, lists, cutoff, Quadratic(None, curvature))
+    image = image_of(pack_parameters([*shape, *p[0]]), p[1], lists, kernel_radius(cutoff))
+    q, lengths = difference(image, lists, None, curvature)
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, lengths, strict=True)]
     dr.eval(alpha)
@@ -260,10 +260,7 @@ def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) ->
 def apply(
     shape: list, x: Unknowns, lists: TileLists, cutoff: float, model: Quadratic
 ) -> tuple[Float, list]:
-    """Return ``H (A x - D)``, and for each channel the sums of ``h (A x - D)^2``, of every image.
-
-    A model without a target has ``D = 0``.
-    """
+    """Return ``H (A x - D)``, and the sums of ``h (A x - D)^2`` of every channel and image."""
     image = image_of(pack_parameters([*shape, *x[0]]), x[1], lists, kernel_radius(cutoff))
     return difference(image, lists, model.target, model.curvature)
 

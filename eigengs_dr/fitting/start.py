@@ -16,8 +16,6 @@ from contextlib import closing
 from dataclasses import replace
 
 import drjit as dr
-import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
 from ..gaussian.gaussians import Fitted, Gaussians, concatenate, set_of
@@ -25,7 +23,7 @@ from ..image.space import Space
 from .exchange import MAX_ERROR, merged
 from .loop import Descent, descend
 from .method import Method, Model
-from .objective import Pixels
+from .objective import Objective, Pixels
 from .options import FitOptions, Start
 from .redistribution import error_by_pixel
 from .state import begin
@@ -92,42 +90,6 @@ def check_start(
         )
 
 
-def start_from(
-    start: Gaussians | Model,
-    objective: Pixels,
-    method: Method,
-    pixels: NDArray[np.float32],
-    iterations: int,
-    seed: int,
-) -> tuple[Pixels, Gaussians, int]:
-    """Return the objective, what a descent starts from, and how many Gaussians of the start it has.
-
-    Those of a set stay where they fit the image, see `keep_fitting`. All stay without steps, of a
-    model, whose shapes the user chose, and for a method that places nothing anew.
-
-    Parameters
-    ----------
-    start : Gaussians or Model
-        A set in the units of the fit.
-    objective : Pixels
-    method : Method
-    pixels : ndarray of float32, shape (H, W, C)
-        The image that a model encodes.
-    iterations : int
-        Steps of the descent that follows, which needs means inside of the image.
-    seed : int
-        Seed of a placement.
-    """
-    if not isinstance(start, Gaussians):
-        objective, gaussians = method.start_from_model(objective, start, pixels)
-        return objective, gaussians.bounded() if iterations else gaussians, len(gaussians)
-    gaussians = replace(start.scaled(*objective.size), cutoff=float(method.cutoff))
-    gaussians = method.start_from(objective, gaussians.bounded() if iterations else gaussians)
-    if not iterations or method.place.has_colors or not method.in_phase("redistribute"):
-        return objective, gaussians, len(gaussians)
-    return objective, *keep_fitting(gaussians, objective, method, iterations, seed)
-
-
 def keep_fitting(
     start: Gaussians, objective: Pixels, method: Method, iterations: int, seed: int
 ) -> tuple[Gaussians, int]:
@@ -179,18 +141,18 @@ def place_levels(descent: Descent, counts: Sequence[int], iterations: int) -> Ga
     iterations : int
         Steps of the refinement that follows; placement takes at most `STEPS_PER_LEVEL` per level.
     """
-    objective, key = descent.objective, descent.key
+    image, key = descent.objective.image, descent.key
     steps, method = min(STEPS_PER_LEVEL, iterations), replace(descent.method, controls=())
-    gaussians = method.place_and_solve(objective, counts[0], key)
+    gaussians = method.place_and_solve(image, counts[0], key)
     for level, count in enumerate(counts[1:], 1):
-        nested = replace(objective, levels=tuple(counts[: level - 1]))
+        nested = Objective(replace(image, levels=tuple(counts[: level - 1])))
         with closing(descend(nested, method, begin(gaussians), steps, key)) as states:
             for state in states:
                 gaussians = state.gaussians
                 if descent.interrupted():
                     break
         gaussians = dr.detach(gaussians)
-        added = method.place_and_solve(objective.minus(gaussians), count - len(gaussians), key)
+        added = method.place_and_solve(image.minus(gaussians), count - len(gaussians), key)
         # All levels share the background: a new one would change the earlier levels.
         gaussians = concatenate([gaussians, replace(added, background=0 * added.background)])
     return gaussians

@@ -206,8 +206,6 @@ class Moving(NamedTuple):
         The state of the optimiser for each variable.
     time : Float, shape (1,)
         Steps since the optimiser started.
-    speed : Float, shape (1,)
-        Factor of all learning rates.
     packed : Float
         The parameters of the set for the kernels.
     rate_scale : Float or None
@@ -217,7 +215,6 @@ class Moving(NamedTuple):
     variables: Variables
     moments: dict[str, tuple[Rows, ...]]
     time: Float
-    speed: Float
     packed: Float
     rate_scale: Float | None
 

@@ -13,18 +13,18 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import drjit as dr
-import numpy as np
 
-from ..backend.arrays import ArrayTypes, make_divisor, types_of, upload
-from ..backend.types import Float, FloatLike, Mask, UInt
+from ..backend.arrays import make_divisor, types_of
+from ..backend.types import Float, FloatLike, Mask
 from ..gaussian.gaussians import Gaussians, take, whole
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.binning.lists import TileLists
 from ..raster.kernels import sum_lanes
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import bin_gaussians
-from .method import Method
-from .objective import Pixels, Quadratic, Slope
+from .loss import Slope
+from .method import Method, Schedule
+from .objective import Pixels, Quadratic
 from .state import Coordinates, Moving, State, Variables
 
 SMALL_IMAGE = 96 * 96
@@ -52,9 +52,9 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
     if method.rate_exponent:
         scale = rate_scale_of(whole(gaussians.color, gaussians), method.rate_exponent, images)
         dr.eval(scale)
-    time, speed = dr.opaque(types.Float, 0), dr.opaque(types.Float, state.speed)
+    time = dr.opaque(types.Float, 0)
     packed = pack_parameters([*kernel_shape(gaussians), *gaussians.color])
-    moving = Moving(variables, moments, time, speed, packed, scale)
+    moving = Moving(variables, moments, time, packed, scale)
     return replace(state, fixed=gaussians, moving=moving, since=step, lists=())
 
 
@@ -62,16 +62,21 @@ def listed(
     state: State,
     objective: Pixels,
     method: Method,
-    factors: Sequence[float],
+    schedule: Schedule,
     step: int,
     end: int,
 ) -> State:
     """Make the tile lists of the current set, which last until `end` or until it moves too far."""
     assert state.fixed is not None and state.moving is not None
-    slowed, drift = [factor * state.speed for factor in factors], method.drift
+    drift, total, until = method.drift / max(method.rates.values()), 0.0, step
     if math.prod(objective.size) <= SMALL_IMAGE:
         drift *= SMALL_IMAGE_DRIFT
-    until, moves = next_build(method, drift, slowed, step, end, state.since)
+    while until < end:
+        factor = schedule.rate(until, state)
+        if until > step and total + factor > drift:
+            break
+        total, until = total + factor, until + 1
+    moves = {name: rate * total for name, rate in method.rates.items()}
     pad, growth = method.coordinates.reach(state.fixed, moves)
     if state.moving.rate_scale is not None:
         pad *= state.moving.rate_scale
@@ -94,52 +99,6 @@ def _lists_of_first(
     return bin_gaussians(gaussians, pad, growth, images=images)
 
 
-def next_build(
-    method: Method, drift: float, factors: Sequence[float], step: int, end: int, since: int = 0
-) -> tuple[int, dict[str, float]]:
-    """Return how long the tile lists of a step last, and how far the variables move until then.
-
-    Parameters
-    ----------
-    method : Method
-    drift : float
-        `Method.drift` for an image of this size.
-    factors : sequence of float
-        From `Method.rate_factors`.
-    step : int
-        The step that needs lists.
-    end : int
-        A step that needs no lists, or new ones.
-    since : int, optional
-        The step at which the optimiser started.
-
-    Returns
-    -------
-    stop : int
-        The step that needs new lists, at most `end`.
-    moves : dict of str to float
-        Sums of the rates of every variable.
-    """
-    largest, total, stop = max(method.rates.values()), 0.0, step
-    while stop < end:
-        warm = min(1.0, (stop - since + 1) / max(1, method.warm_up))
-        factor = factors[stop] * warm
-        if stop > step and largest * (total + factor) > drift:
-            break
-        total += factor
-        stop += 1
-    return stop, {name: rate * total for name, rate in method.rates.items()}
-
-
-def rate_table(types: ArrayTypes, method: Method, factors: Sequence[float]) -> Float:
-    """Return the learning rates of all steps, step after step, as Float.
-
-    The factors are those of `Method.rate_factors`.
-    """
-    table = np.outer(factors, list(method.rates.values()))
-    return upload(types.Float, table.ravel().astype(np.float32 if types.bits == 32 else np.float64))
-
-
 StepProgram: TypeAlias = Callable[..., tuple[Moving, Gaussians]]
 """One step of a descent, see `step_program`."""
 
@@ -153,12 +112,12 @@ def step_program(objective: Pixels, method: Method) -> StepProgram:
     Returns
     -------
     callable
-        ``step(largest, moving, fixed, model, lists, rates, index) -> moving, gaussians``: it
+        ``step(largest, moving, fixed, model, lists, rates) -> moving, gaussians``: it
         descends on the mean of ``h (p - t)^2``, then projects the variables into their bounds. With
         levels it descends on the sum of the logarithms of these means for the prefixes of the set,
         so that no level suffers for another. `largest` is the largest number of Gaussians so far:
         each has its own program, since Dr.Jit 1.5 writes beyond arrays if a program is replayed for
-        more Gaussians than it was recorded for.
+        more Gaussians than it was recorded for. `rates` holds that of each variable at this step.
     """
     channels, levels = objective.channels, bool(objective.levels)
 
@@ -169,7 +128,6 @@ def step_program(objective: Pixels, method: Method) -> StepProgram:
         model: Quadratic | Slope,
         lists: list[TileLists],
         rates: Float,
-        index: UInt,
     ) -> tuple[Moving, Gaussians]:
         radius, background = kernel_radius(fixed.cutoff), list(fixed.background)
         gradient: list = []
@@ -187,7 +145,7 @@ def step_program(objective: Pixels, method: Method) -> StepProgram:
         sizes = lists[0].sizes
         size = sizes.width, sizes.height
         rests = model.size == 0 if isinstance(model, Slope) else None
-        return _move(method, moving, fixed, gradient, rates, index, size, rests)
+        return _move(method, moving, fixed, gradient, rates, size, rests)
 
     return step
 
@@ -198,7 +156,6 @@ def _move(
     fixed: Gaussians,
     gradient: list,
     rates: Float,
-    index: UInt,
     size: tuple,
     rests: Mask | None,
 ) -> tuple[Moving, Gaussians]:
@@ -209,10 +166,9 @@ def _move(
     Float, coordinates = type(moving.packed), method.coordinates
     slopes = _pull_back(coordinates, fixed, moving.variables, gradient, size)
     time = moving.time + 1
-    warm = dr.minimum(time * (1 / max(1, method.warm_up)), 1) * moving.speed
     variables, moments = {}, {}
     for k, name in enumerate(method.rates):
-        rate = dr.gather(Float, rates, index * len(method.rates) + k) * warm
+        rate = dr.gather(Float, rates, k)
         if moving.rate_scale is not None and name != "color":
             rate *= moving.rate_scale
         variables[name], moments[name] = method.optimizer.step(
@@ -224,7 +180,7 @@ def _move(
     variables = coordinates.project(fixed, variables, size)
     moved = coordinates.decode(fixed, variables, size)
     packed = pack_parameters([*kernel_shape(moved), *moved.color])
-    return Moving(variables, moments, time, moving.speed, packed, moving.rate_scale), moved
+    return Moving(variables, moments, time, packed, moving.rate_scale), moved
 
 
 def _sum_level(parts: Float, lists: TileLists, channels: int, count: int) -> list:

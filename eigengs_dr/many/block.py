@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_in
 from ..backend.selection import select
 from ..backend.types import Arrays, Float, Singles
+from ..fitting.channels import Channels, Target
 from ..fitting.loop import descend, last
 from ..fitting.method import Method
-from ..fitting.objective import Channels, Part, Pixels, Target, squares_of
+from ..fitting.objective import Objective, Part, Pixels, squares_of
 from ..fitting.options import FitOptions
 from ..fitting.place import (
     density_from_hessian,
@@ -142,7 +143,6 @@ def survey(task: BlockTask, settings: BlockSettings) -> NDArray[np.float64]:
     """
     objective = _objective(task, settings)
     _, density = _density(objective, settings)
-    assert objective.model.target is not None
     values = objective.picture(objective.model.target).numpy()[task.block.core]
     total = values.sum(axis=(0, 1), dtype=np.float64)
     return np.append(_mass(density, task.block), total)
@@ -284,7 +284,9 @@ def _descend(
         method = replace(method, controls=())
 
     def states() -> Generator[State, None, None]:
-        steps = descend(objective, method, begin(start), task.iterations, seed, task.part)
+        steps = descend(
+            Objective(objective), method, begin(start), task.iterations, seed, task.part
+        )
         for taken, state in enumerate(steps, 1):
             if step_done and taken % 10 == 0:
                 dr.sync_thread()  # steps run asynchronously

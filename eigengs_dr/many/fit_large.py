@@ -20,8 +20,8 @@ from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.selection import select
 from ..backend.types import Arrays
 from ..cluster import executor_for
+from ..fitting.channels import restored
 from ..fitting.method import DEFAULT, Method
-from ..fitting.objective import restored
 from ..fitting.options import COLOR_PARAMETERS, FitOptions, named_options
 from ..gaussian.file import SetData, check_suffix, write_set
 from ..gaussian.gaussians import Gaussians

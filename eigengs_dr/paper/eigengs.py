@@ -34,7 +34,6 @@ class EigenGSMethod(Method):
         The mean image becomes the base of the picture of the objective.
         """
         mean = model.dense_mean(*objective.size)
-        assert objective.model.target is not None
         target = objective.model.target - batch_to_tiles(objective.types, mean)
         base = batch_to_tiles(objective.types, mean_picture(mean, objective.space))
         pictures = tuple(picture._replace(base=base) for picture in objective.pictures)

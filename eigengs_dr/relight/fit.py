@@ -28,8 +28,8 @@ from threadpoolctl import threadpool_limits
 from ..backend.messages import warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..eigenbasis.incremental import largest_eigenpairs, orient, product
+from ..fitting.channels import Channels, Target
 from ..fitting.fit import Fit, fit_problem
-from ..fitting.objective import Channels, Target
 from ..fitting.options import FitOptions
 from ..fitting.problem import Problem
 from ..image.color import MAX_CHANNELS

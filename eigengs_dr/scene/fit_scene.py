@@ -24,10 +24,11 @@ from ..backend.doors import door, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.selection import backend_of, select
 from ..backend.types import ArrayLike
+from ..fitting.channels import restored
 from ..fitting.loop import Descent
 from ..fitting.measure import Measured
 from ..fitting.method import DEFAULT
-from ..fitting.objective import Pixels, restored
+from ..fitting.objective import Objective, Pixels
 from ..fitting.options import Goal
 from ..fitting.search import search_count
 from ..gaussian.covariance import max_deviation
@@ -342,7 +343,7 @@ def fit_seen(
         if first.margin >= -GAIN:
             break
     descent = Descent(
-        objective,
+        Objective(objective),
         DEFAULT,
         score,
         progress=lambda step, steps, row: tell(step, steps, row | {"stage": "search"}),

@@ -6,7 +6,8 @@ import eigengs_dr as eg
 from _helpers.halves import picture
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.objective import Channels, Pixels, Target, squares_of
+from eigengs_dr.fitting.channels import Channels, Target
+from eigengs_dr.fitting.objective import Pixels, squares_of
 from eigengs_dr.image.space import space_of
 
 
