@@ -260,7 +260,7 @@ def _gains(cases: Mapping[Case, Curves]) -> Table:
     for case, curves in cases.items():
         line = cells.setdefault(_title(case), {})
         for (steps, row), decibels in zip(sorted(curves["fit"].items()), gain(curves), strict=True):
-            seeds = "" if row["seeds"] == most else f" ({row['seeds']})"
+            seeds = "" if row["seeds"] == most else f" ({row['seeds']:g})"
             line[steps, case[2]] = f"{decibels:+.1f}{seeds}"
     descents = sorted({d for line in cells.values() for d in line}, key=lambda d: (d[1] != SPP, d))
     lines = [
@@ -269,7 +269,7 @@ def _gains(cases: Mapping[Case, Curves]) -> Table:
     columns = ("photos", *(f"{steps} steps, {spp} spp" for steps, spp in descents))
     caption = "psnr_rgb of fit in dB over the best of texels and pyramid at equal seconds"
     if most > 1:
-        caption += f"; means of {most} seeds, or of as many as brackets say"
+        caption += f"; means of {most:g} seeds, or of as many as brackets say"
     return table(caption, columns, lines, name="gains")
 
 
