@@ -30,8 +30,6 @@ FOLDER = Path(__file__).parents[2] / "build" / "docs" / "extra"
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 
-PLUGINS = ("texture", "environment")
-
 TEXTURE_PAGE = "gaussian-texture.md"
 
 
@@ -84,7 +82,7 @@ def outdated() -> dict[Path, str]:
 
 def plugin_pages() -> dict[str, Path]:
     """Return the page of each plugin."""
-    return {f"gaussian_{name}": REFERENCE / f"gaussian-{name}.md" for name in PLUGINS}
+    return {f"gaussian_{name}": REFERENCE / f"gaussian-{name}.md" for name in ("texture", "environment")}
 
 
 def names_list(names: list[str]) -> str:
