@@ -82,7 +82,8 @@ def outdated() -> dict[Path, str]:
 
 def plugin_pages() -> dict[str, Path]:
     """Return the page of each plugin."""
-    return {f"gaussian_{name}": REFERENCE / f"gaussian-{name}.md" for name in ("texture", "environment")}
+    plugins = ("gaussian_texture", "gaussian_environment")
+    return {name: REFERENCE / f"{name.replace('_', '-')}.md" for name in plugins}
 
 
 def names_list(names: list[str]) -> str:
