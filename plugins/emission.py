@@ -88,7 +88,7 @@ def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
     """
     with dr.suspend_grad():
         table, size = dr.detach(texture.table), (texture.width, texture.height)
-        parameters = texture.parameters()
+        parameters = texture.source.parameters()
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
         dr.eval(shape, color)
         smallest = _smallest_deviation(shape, color)
