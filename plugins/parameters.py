@@ -19,7 +19,6 @@ from eigengs_dr.backend.doors import door
 from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.channels import slices
-from eigengs_dr.gaussian.file import file_errors
 from eigengs_dr.gaussian.gaussians import (
     FIELDS,
     Fitted,
@@ -32,6 +31,7 @@ from eigengs_dr.gaussian.gaussians import (
 from eigengs_dr.raster.parameters import EXP2_SCALE, KernelParameters
 from eigengs_dr.raster.render import decode_parameters
 from eigengs_dr.relight.model import Relightable, or_camera
+from eigengs_dr.storage.npz import file_errors
 
 from .emission import outside_of_recordings
 

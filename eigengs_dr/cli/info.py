@@ -15,9 +15,9 @@ import eigengs_dr as eg
 from ..backend.messages import printable
 from ..backend.selection import select
 from ..backend.types import Record
+from ..codec.egs import is_packed, read_egs
 from ..gaussian import file as set_file
 from ..gaussian.file import SetData
-from ..gaussian.packed import is_packed
 from ..storage import npz
 from . import options
 from .console import exit_if_failed, for_each, prefix_errors, table
@@ -136,12 +136,9 @@ def _describe_fit(file: Path) -> Record:
 
 def _describe_packed(file: Path) -> Record:
     """Describe a packed set, with the Gaussians of each section and the quantisation steps."""
-    from ..codec.egs import read_egs
-
     packed = read_egs(file)
-    data = packed.set_data()
     with prefix_errors(file):
-        set_file.check(data)
+        data = set_file.check(set_file.packed_data(packed))
     facts = _describe_set(data) | {"sections": [len(part.cell) for part in packed.sections]}
     steps = {f"{name}_step": float(f"{x:.4g}") for name, x in packed.steps._asdict().items()}
     return facts | steps | ({"psnr": round(packed.psnr, 2)} if isfinite(packed.psnr) else {})

@@ -12,8 +12,8 @@ import eigengs_dr as eg
 
 from ..backend.selection import select
 from ..backend.types import Record
+from ..codec import egs
 from ..gaussian import file as set_file
-from ..gaussian.packed import is_packed
 from ..storage import npz
 from . import options
 from .console import prefix_errors, print_message
@@ -91,7 +91,6 @@ def _load(
 
     The file need not be trusted: the number of Gaussians is checked before they are read.
     """
-    from ..codec import egs
     from ..eigenbasis.eigengs import SHIPPED
     from ..eigenbasis.files import MODEL_FORMAT
     from ..relight.model import holds_lights
@@ -103,7 +102,7 @@ def _load(
         if levels is not None or name is not None:
             raise ValueError(f"{file}: is a model of lights; leave out --levels and --map")
         return eg.Relightable.load(file, backend), []
-    sections = egs.section_counts(file) if is_packed(file) else []
+    sections = egs.section_counts(file) if egs.is_packed(file) else []
     if not sections and npz.format_of(file) == MODEL_FORMAT:
         if levels is not None or name is not None:
             raise ValueError(f"{file}: is a model; leave out --levels and --map")

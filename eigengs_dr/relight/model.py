@@ -21,10 +21,10 @@ from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.messages import to_html
 from ..backend.types import ArrayLike, Doubles, Rows
+from ..codec.egs import is_packed, read_egs_head
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
-from ..gaussian import packed
-from ..gaussian.file import ARRAYS, SetData, check, file_errors, read_set
+from ..gaussian.file import ARRAYS, SetData, check, read_set
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats
@@ -34,7 +34,7 @@ from ..image.resize import resample
 from ..image.space import DATA, LINEAR, RGB
 from ..raster.render import render
 from ..storage import npz
-from ..storage.npz import BadValue, Field
+from ..storage.npz import BadValue, Field, file_errors
 from .fit import find_planes, fit_planes, most_planes, read_photos
 from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
@@ -262,7 +262,7 @@ class Relightable:
             If the file cannot be opened.
         """
         with file_errors(Path(path)):
-            if packed.is_packed(path):
+            if is_packed(path):
                 return cls(*_read_packed(Path(path), backend))
             layout = LAYOUT | (BRIGHTEST if "brightest" in npz.sizes_of(path) else {})
             members = npz.read(path, FORMAT, VERSION, layout)
@@ -330,8 +330,8 @@ def or_camera(light: Any) -> Any:
 
 def holds_lights(path: str | os.PathLike[str]) -> bool:
     """Return whether a file that this package wrote holds a model of lights."""
-    if packed.is_packed(path):
-        return bool(packed.read_head(Path(path))[1])
+    if is_packed(path):
+        return bool(read_egs_head(path).lights)
     return npz.format_of(path) == FORMAT
 
 
@@ -405,7 +405,7 @@ def table_bytes(model: Relightable) -> bytes:
 
 def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable, float, float]:
     """Read the parts of a model from an ``.egs`` file."""
-    content = packed.read_head(path)[1]
+    content = read_egs_head(path).lights
     if not content:
         raise BadValue("holds a set without a table of lights; read it by Gaussians.load")
     data = read_set(path)

@@ -44,6 +44,19 @@ class Field(NamedTuple):
     max_count: int = MAX_ENTRIES
 
 
+@contextmanager
+def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Put the name of a file before error messages, about its values or of the system."""
+    try:
+        yield
+    except BadValue as error:
+        raise ValueError(printable(f"{path}: {error}")) from None
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{printable(str(path))}: no such file; check the path") from None
+    except IsADirectoryError:
+        raise IsADirectoryError(f"{printable(str(path))}: is a folder; give a file in it") from None
+
+
 def write(
     path: str | os.PathLike[str],
     name: str,

@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..backend.doors import door
 from ..backend.types import ArrayLike
+from ..codec.egs import MAX_SECTIONS, SUFFIX
+from ..codec.quantization import Steps
 from ..fitting.fit import Fit
 from ..fitting.problem import Map, read_maps
 from ..gaussian.channels import TextureMap, channel_weights, slices
+from ..gaussian.file import write_packed
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
@@ -26,8 +29,6 @@ from ..image.pixels import check_encoding
 from ..raster.render import picture_of
 from ..relight.model import Relightable, read_table, table_bytes
 from ..storage.atomic import require_writable
-from .egs import MAX_SECTIONS, SUFFIX, write_egs
-from .quantization import Steps
 from .rounding import MIN_MSE, TOO_FINE, Comparison, planes_of, round_within
 
 Array = NDArray[np.floating]
@@ -163,7 +164,7 @@ def pack(
         held_out = after if math.isfinite(model.psnr_held_out) else math.nan
         lights = table_bytes(replace(model, psnr_held_out=held_out))
     content = attempt.packed._replace(maps=maps, psnr=stored, lights=lights)
-    size = write_egs(output, content)
+    size = write_packed(output, content)
     rounded = Gaussians.load(output, types_of(source.mean).backend)
     figure: float | dict[str, float] = seen
     if maps:
