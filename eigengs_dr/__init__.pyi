@@ -33,6 +33,7 @@ from .many.fit_large import LargeFit as LargeFit
 from .many.fit_large import fit_large as fit_large
 from .many.fit_many import fit_many as fit_many
 from .many.images import ImageRow as ImageRow
+from .packing.pack import load as load
 from .packing.pack import pack as pack
 from .plugins import register_plugins as register_plugins
 from .raster.render import picture_of as picture_of
@@ -70,6 +71,7 @@ __all__ = [
     "fit_many",
     "from_tensors",
     "level_counts",
+    "load",
     "load_image",
     "ms_ssim",
     "pack",

@@ -21,7 +21,8 @@ from .channels import MAX_MAP_CHANNELS, TextureMap, channel_weights, check_maps,
 
 FORMAT = "eigengs_dr.gaussians"
 MATERIAL = "eigengs_dr.material"
-"""Formats of a file without maps and with maps."""
+LIGHTS = "eigengs_dr.relightable"
+"""Formats of a file without maps, with maps, and of planes with a table of lights."""
 
 VERSIONS = {FORMAT: 2, MATERIAL: 1}
 """Versions of the formats."""
@@ -221,6 +222,14 @@ def _properties(members: Arrays) -> tuple[tuple[int, int], Space, float, tuple[T
     if not maps:
         raise BadValue("maps are none; give each name once")
     return size, DATA, cutoff, maps
+
+
+def kind_of(path: str | os.PathLike[str]) -> str:
+    """Return the format of a file that this package wrote; of a packed one, that of its content."""
+    if not is_packed(path):
+        return npz.format_of(path)
+    head = read_egs_head(path)
+    return LIGHTS if head.lights else MATERIAL if head.maps else FORMAT
 
 
 def maps_of(path: Path) -> tuple[TextureMap, ...]:

@@ -189,7 +189,9 @@ def _check_format(archive: zipfile.ZipFile, name: str, version: int) -> None:
     """Raise `BadValue` for another format or version."""
     stored = str(_read_array(archive, "format", Field("U", 0)))
     if stored != name:
-        raise BadValue(f"format is {stored[:40]!r}, expected {name!r}")
+        known = stored.startswith("eigengs_dr.")
+        advice = "; eigengs_dr.load reads files of all formats" if known else ""
+        raise BadValue(f"format is {stored[:40]!r}, expected {name!r}{advice}")
     number = int(_read_array(archive, "version", Field("i8", 0)))
     if number != version:
         advice = "upgrade eigengs-dr" if number > version else "make the file again"
