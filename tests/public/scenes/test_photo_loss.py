@@ -111,7 +111,8 @@ class TestFits:
         photos = photos_of(wall(true_texture(), light=1.5))
         light = mi.ad.Adam(lr=0.03, params={LIGHT: mi.Float(1.0)})
         loss = photo_loss(wall(GREY), NAME, photos, parameters=light)
-        start = eg.fit(to_coded(true_texture()), 60, 60, space="linear").gaussians
+        known = photo_loss(wall(GREY), NAME, photos_of(wall(true_texture())))
+        start = few(known, iterations=60).gaussians
         method = eg.COARSE_TO_FINE.at_rates(0.01)
         few(loss, gaussians=None, start=start, iterations=60, method=method)
         assert light[LIGHT][0] == pytest.approx(1.5, abs=0.05)
