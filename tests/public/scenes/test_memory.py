@@ -153,30 +153,20 @@ class TestParameters:
         mi.traverse(tex)
         assert resident_bytes(tex) >= held + 4 * 8 * len(gaussians())
 
-    def test_without_its_file_a_texture_shows_what_its_rows_hold(self, tmp_path):
-        g = gaussians("linear")
-        tex = mi.load_dict(in_a_file(tmp_path, g, prefilter=0.05))
-        (tmp_path / "set.npz").unlink()
-        found = gaussians_of(mi.traverse(tex), "", like=g).to_arrays()
-        for name, values in g.to_arrays().items():
-            np.testing.assert_allclose(found[name], values, rtol=4e-3, atol=2e-3, err_msg=name)
-
-    @pytest.mark.slow
-    def test_maps_lose_little_and_without_their_file_show_what_rows_hold(self, tmp_path):
+    def test_without_their_file_textures_show_what_their_rows_hold(self, tmp_path):
+        """Also those of maps."""
         whole = material(size=SIZE, backend=backend())
         whole.save(tmp_path / "m.npz")
-        file = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz"), "prefilter": 0.05}
-        textures = {m.name: mi.load_dict({**file, "map": m.name}) for m in whole.maps}
-        for name, tex in textures.items():
-            exact = mi.load_dict({**file, "map": name, "memory": "exact"})
-            values = [np.array(t.eval(in_front(texel_centres()))) for t in (tex, exact)]
-            np.testing.assert_allclose(*values, atol=5 * LOSS)
-            assert resident_bytes(tex) < resident_bytes(exact)
-        (tmp_path / "m.npz").write_bytes(b"another one")
-        for name, tex in textures.items():
-            found = gaussians_of(mi.traverse(tex), "", like=whole[name]).to_arrays()
-            for key, values in whole[name].to_arrays().items():
-                np.testing.assert_allclose(found[key], values, rtol=4e-3, atol=2e-3, err_msg=key)
+        maps = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz"), "prefilter": 0.05}
+        given = {m.name: (mi.load_dict({**maps, "map": m.name}), whole[m.name]) for m in whole.maps}
+        g = gaussians("linear")
+        given["set"] = mi.load_dict(in_a_file(tmp_path, g, prefilter=0.05)), g
+        (tmp_path / "m.npz").unlink()
+        (tmp_path / "set.npz").unlink()
+        for tex, expected in given.values():
+            found = gaussians_of(mi.traverse(tex), "", like=expected).to_arrays()
+            for name, values in expected.to_arrays().items():
+                np.testing.assert_allclose(found[name], values, rtol=4e-3, atol=2e-3, err_msg=name)
 
     def test_derivatives_are_finite_differences(self, tmp_path):
         """As those of a texture of floats, which it becomes."""

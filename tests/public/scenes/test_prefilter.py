@@ -102,8 +102,6 @@ class TestCone:
     def test_pixel_angle(self):
         sensor = plane(texture_of(gaussians())).sensors()[0]
         assert pixel_angle(sensor) == pytest.approx(2 * np.tan(np.radians(25)) / 48)
-        with pytest.raises(ValueError, match="has no x_fov"):
-            pixel_angle(mi.load_dict({"type": "orthographic"}))
 
 
 def test_one_filtered_sample_is_closer_to_the_mean_of_many():
