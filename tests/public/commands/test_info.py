@@ -4,8 +4,6 @@ import io
 import json
 import math
 import shutil
-import struct
-import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -190,51 +188,12 @@ def test_hostile_figures_are_refused_in_one_line(change, set_file):
     assert len(eg.Gaussians.load(set_file)) == 64  # the set itself is whole
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"mean": np.full((64, 2), np.nan, np.float32)}, "not finite"),
-        ({"size": np.array([0, 32])}, "size is (0, 32)"),
-        ({"space": np.array("a\x1b[31m")}, r"space is 'a\x1b[31m'"),
-        (
-            {"color": np.full((64, 3), 3e38, np.float32)},
-            "color and background of a channel add up to 1.92e+40",
-        ),
-    ],
-)
-def test_what_cannot_be_loaded_is_not_described(change, words, set_file):
-    np.savez(set_file, **dict(np.load(set_file)) | change)
-    assert_refused(run("info", set_file), set_file, words)
-    with pytest.raises(ValueError, match=r"a\.npz: "):
-        eg.Gaussians.load(set_file)
-
-
 def test_text_from_files_cannot_command_the_terminal(set_file, tmp_path):
     """A name of a member of the archive, and the name of the file itself."""
     file = tmp_path / "b\x1b[31m.npz"
     np.savez(file, **dict(np.load(set_file)) | {"x\x1b[2J": np.zeros(3)})
     text = said("info", file)
     assert r"b\x1b[31m.npz" in text and r"x\x1b[2J" in text and "\x1b" not in text
-
-
-def flip(random, data):
-    """Other bytes."""
-    changed = bytearray(data)
-    for _ in range(random.integers(1, 4)):
-        changed[random.integers(len(changed))] ^= int(random.integers(1, 256))
-    return bytes(changed)
-
-
-def cut(random, data):
-    return data[: random.integers(len(data))]
-
-
-def resealed(random, data):
-    """Other bytes in the header of a packed set, with a checksum that is right."""
-    sums = (struct.unpack_from("<I", data, end)[0] == zlib.crc32(data[:end]) for end in range(200))
-    end = list(sums).index(True)
-    head = data[:4] + flip(random, data[4:end])
-    return head + struct.pack("<I", zlib.crc32(head)) + data[end + 4 :]
 
 
 def written(arrays):
@@ -265,23 +224,17 @@ def extreme(random, data):
 
 
 @pytest.fixture(scope="module")
-def contents(result, trained, fits):
-    """Contents of files with their suffix."""
-    files = [fits / "a.npz", fits / "d.npz", trained[0] / "m.npz", fits / "b.egs"]
-    return [(file.suffix, file.read_bytes()) for file in files]
+def contents(trained, fits):
+    files = (fits / "a.npz", fits / "d.npz", trained[0] / "m.npz")
+    return [file.read_bytes() for file in files]
 
 
-@pytest.mark.parametrize("change", [flip, cut, resealed, extreme])
-def test_readers_agree_on_damaged_files(tmp_path, contents, change):
+def test_readers_agree_on_extreme_values(tmp_path, contents):
     """What is described can be loaded; what is loaded renders as numbers, and can be saved."""
     random = np.random.default_rng(1)
-    files = contents
-    if change not in (flip, cut):
-        files = [file for file in contents if (file[0] == ".egs") == (change is resealed)]
-    for k in range(60 if change is extreme else 25):
-        suffix, data = files[k % len(files)]
-        path = tmp_path / f"x{suffix}"
-        path.write_bytes(change(random, data))
+    path = tmp_path / "x.npz"
+    for k in range(60):
+        path.write_bytes(extreme(random, contents[k % len(contents)]))
         described = run("info", path)
         assert described.exit_code in (0, 2), (described.exception, described.output)
         assert described.output.count("\n") == 1 or described.exit_code == 0

@@ -60,16 +60,6 @@ def test_region_is_the_crop_of_the_whole(fitted, tmp_path, scale, region, suffix
     assert np.abs(found - np.asarray(Image.open(whole).crop(box)).astype(int)).max() <= 1
 
 
-@pytest.mark.parametrize("options", [["--size", "8"], ["--scale", "0.25"], ["--size", "32x8"]])
-def test_smaller_pictures_are_averages(fitted, tmp_path, options):
-    succeeded(run("render", fitted[0] / "fit.npz", "-o", tmp_path / "y.png", *options))
-    found = eg.load_image(tmp_path / "y.png")
-    gaussians = eg.Gaussians.load(fitted[0] / "fit.npz")
-    for filter in (True, False):
-        expected = eg.render(gaussians, *found.shape[1::-1], filter=filter).numpy().clip(0, 1)
-        assert (np.abs(found - expected).max() < 0.6 / 255) == filter
-
-
 @pytest.mark.parametrize(
     ("space", "channels", "modes"),
     [

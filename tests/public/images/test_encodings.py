@@ -11,6 +11,7 @@ from PIL import Image
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
 from _helpers.errors import refused
+from _helpers.light import to_coded, to_linear
 from _helpers.lit_spheres import directions, photos
 
 mi = pytest.importorskip("mitsuba", reason="renderings are tensors and bitmaps of Mitsuba")
@@ -19,17 +20,6 @@ pytestmark = pytest.mark.mitsuba
 
 LIGHTS = directions(12)
 SMALL = {"gaussians": 100, "planes": 8, "iterations": 30, "progress": False}
-
-
-def linear(codes):
-    """The curve of IEC 61966-2-1, which goes on above white."""
-    codes = np.asarray(codes, np.float64)
-    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
-
-
-def coded(light):
-    light = np.asarray(light, np.float64)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -49,7 +39,7 @@ def codes():
 @pytest.fixture(scope="module")
 def light(codes):
     """Renderings, three times as bright as white in places."""
-    return (3 * linear(codes)).astype(np.float32)
+    return 3 * to_linear(codes)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +79,7 @@ def test_renderings_under_lights_are_light_also_above_white(light, kind):
     model, texts = warned(eg.Relightable.fit, KINDS[kind](light), LIGHTS, **SMALL)
     assert texts == []
     assert shown(model).max() > 1.2
-    assert np.abs(shown(model) - coded(light[3])).mean() < 0.02
+    assert np.abs(shown(model) - to_coded(light[3])).mean() < 0.02
 
 
 def test_files_of_light_keep_what_is_above_white(light, tmp_path):
@@ -97,7 +87,7 @@ def test_files_of_light_keep_what_is_above_white(light, tmp_path):
         eg.save_image(tmp_path / f"{k:02}.exr", photo, encoding="linear")
     files = sorted(tmp_path.glob("*.exr"))
     model = eg.Relightable.fit(files, LIGHTS, **SMALL)
-    assert np.abs(shown(model) - coded(light[3])).mean() < 0.02
+    assert np.abs(shown(model) - to_coded(light[3])).mean() < 0.02
     eg.save_image(tmp_path / "shown.exr", eg.render(model.relight(LIGHTS[3])), encoding="srgb")
     assert eg.load_image(tmp_path / "shown.exr").max() > 1.5
 
@@ -115,7 +105,7 @@ def test_codes_under_lights_are_named(codes):
 def test_linear_integers_are_light_on_the_command_line(codes, tmp_path):
     lines = [str(len(LIGHTS))]
     for k, direction in enumerate(LIGHTS):
-        whole = np.rint(65535 * linear(codes[k])) / 65535
+        whole = np.rint(65535 * to_linear(codes[k])) / 65535
         eg.save_image(tmp_path / f"{k}.tif", whole, bits=16)
         lines.append(f"{k}.tif " + " ".join(map(str, direction)))
     (tmp_path / "dirs.lp").write_text("\n".join(lines))
@@ -127,7 +117,7 @@ def test_linear_integers_are_light_on_the_command_line(codes, tmp_path):
 
 @pytest.mark.parametrize("kind", ["one tensor", "bitmaps"])
 def test_families_of_renderings_are_light(family, model, kind):
-    light = KINDS[kind](linear(family).astype(np.float32))
+    light = KINDS[kind](to_linear(family))
     basis, texts = warned(
         eg.Eigenbasis.from_images, light, size=(16, 16), components=6, progress=False
     )
@@ -136,7 +126,7 @@ def test_families_of_renderings_are_light(family, model, kind):
 
 
 def test_a_family_takes_an_encoding(family, model):
-    light, (basis, fitted) = linear(family).astype(np.float32), model
+    light, (basis, fitted) = to_linear(family), model
     given = {"size": (16, 16), "components": 6, "progress": False, "encoding": "linear"}
     np.testing.assert_allclose(
         eg.Eigenbasis.from_images(light, **given).mean, basis.mean, atol=1e-5
@@ -153,10 +143,11 @@ def test_a_family_takes_an_encoding(family, model):
             pairs = zip(owner.project(image, **options), owner.project(family[0]), strict=True)
             assert all(np.allclose(a, b, atol=1e-3) for a, b in pairs)
     np.testing.assert_allclose(eg.render(row.result).numpy(), want, atol=1e-4)
+    assert row.psnr_rgb == pytest.approx(eg.psnr(want, family[0]), abs=0.01)
 
 
 def test_light_above_white_in_a_family_gets_a_word(family, model):
-    bright = [4 * linear(image).astype(np.float32) for image in family[:3]]
+    bright = [4 * to_linear(image) for image in family[:3]]
     word = "light above white"
     for call in (model[0].project, model[1].project, model[1].encode):
         assert [word in text for text in warned(call, bright[0], encoding="linear")[1]] == [True]
@@ -176,12 +167,6 @@ def test_an_encoding_without_pixels_is_refused(model, tmp_path):
     for call in calls.values():
         with refused(ValueError, "encoding is for the pixels"):
             call()
-
-
-def test_a_folder_of_another_encoding_is_refused(family, model, tmp_path):
-    model[1].encode_many([family[0]], tmp_path)
-    with refused(ValueError, "is a result of other options"):
-        model[1].encode_many([family[0], family[1]], tmp_path, encoding="linear")
 
 
 @pytest.fixture
