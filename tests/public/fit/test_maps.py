@@ -88,12 +88,14 @@ def test_the_goal_of_a_fit_is_that_of_maps_without_their_own():
     assert color > 25.9 and shown["normal"] > 25.5
 
 
+@pytest.mark.slow
 def test_levels_are_materials_too():
     result = eg.fit(images(), [40, 160], iterations=40)
     level = eg.picture_of(result.gaussians[:40])
     assert eg.psnr(level["albedo"], images()["albedo"]) > 22
 
 
+@pytest.mark.slow
 def test_maps_by_another_method():
     result = eg.fit(images(), 60, iterations=30, method=METHODS["gaussianimage"])
     assert list(result.image) == list(images())

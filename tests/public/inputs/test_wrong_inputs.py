@@ -235,7 +235,6 @@ def test_what_is_no_plugin_of_mitsuba():
             assert "like is " in complaint(TypeError, function, {}, "a", wrong)
         for function in (plugins.texture_of, plugins.bake_environment):
             complaint(TypeError, function, wrong)
-    assert plugins.resident_bytes(mi.load_dict(plugins.texture_of(SET))) > 0
 
 
 ESCAPE = "a\x1b[31m\nb\u202e"

@@ -97,7 +97,12 @@ def check(found, exact, rtol, floor=0.02):
 
 
 @pytest.mark.parametrize(
-    ("asked", "channels"), [({}, 1), ({}, 4), *((asked, 3) for asked in SIZES)]
+    ("asked", "channels"),
+    [
+        pytest.param({}, 1, marks=pytest.mark.slow),
+        ({}, 4),
+        *((asked, 3) for asked in SIZES),
+    ],
 )
 def test_reverse(backend, asked, channels):
     scene = random_scene(channels, COUNT, channels=channels)
