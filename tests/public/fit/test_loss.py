@@ -441,22 +441,6 @@ def test_many_images_take_no_loss():
 # --- Interruptions ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("last", [20, 80])
-def test_an_interrupted_fit_keeps_its_set(last):
-    """Of texels, to which Gaussians are fitted yet; and of Gaussians."""
-
-    def stop(step, steps, row):
-        assert steps == 100
-        if step >= last:
-            raise KeyboardInterrupt
-
-    with pytest.raises(eg.Interrupted) as error:
-        fit(squares, 50, 100, progress=stop, **FREE)
-    result = error.value.result
-    assert len(result.gaussians) == 50 and result.iterations == last
-    assert result.stopped == "interrupted" and result.loss < 0.05
-
-
 STOPS = {"first": 0, "texels": 2, "later": 13}
 """Steps at which a loss ends a fit of 20, in half of them texels without an image."""
 
