@@ -42,6 +42,7 @@ from .raster.render import tile_lists as tile_lists
 from .relight.model import Relightable as Relightable
 from .scene.fit_scene import fit_for_scene as fit_for_scene
 from .version import __version__ as __version__
+from .viewer.view import to_html as to_html
 from .viewer.view import view as view
 
 __all__ = [
@@ -83,6 +84,7 @@ __all__ = [
     "save_image",
     "ssim",
     "tile_lists",
+    "to_html",
     "to_tensors",
     "view",
 ]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..backend.doors import checks_types, shows_progress
-from ..backend.messages import shown, to_html, warn
+from ..backend.messages import notebook_html, shown, warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..image.folder import TrainingImages, find_lists
 from ..image.io import check_member
@@ -157,7 +157,7 @@ class Eigenbasis:
         components = name_components(self.space, map(len, self.components))
         return f"Eigenbasis({self.count} images, {self.width}x{self.height} pixels, {components})"
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     @property
     def width(self) -> int:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..backend.doors import checks_types, door, shows_progress
-from ..backend.messages import to_html
+from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike, Doubles, Record, Singles
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.io import Codes, check_member
@@ -148,7 +148,7 @@ class EigenGS:
         size = f"{len(self.gaussians)} Gaussians, {self.gaussians.width}x{self.gaussians.height}"
         return f"EigenGS({size} pixels, {name_components(self.gaussians.space, self.components)})"
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     @property
     def components(self) -> tuple[int, ...]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of
 from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
-from ..backend.messages import to_html
+from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..codec.egs import is_packed, read_egs
 from ..fitting.objective import Pixels
@@ -88,7 +88,7 @@ class Relightable:
     psnr_held_out: float = float("nan")
     brightest: float = 1.0
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     @classmethod
     @shows_progress
