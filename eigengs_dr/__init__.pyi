@@ -2,10 +2,10 @@
 
 from . import paper as paper
 from . import plugins as plugins
-from .backend.executor import ClusterError as ClusterError
 from .backend.interrupts import Interrupted as Interrupted
 from .backend.recording import exclusive as exclusive
 from .backend.selection import BackendError as BackendError
+from .cluster import ClusterError as ClusterError
 from .eigenbasis.basis import Eigenbasis as Eigenbasis
 from .eigenbasis.eigengs import EigenGS as EigenGS
 from .fitting.coarse import COARSE_TO_FINE as COARSE_TO_FINE

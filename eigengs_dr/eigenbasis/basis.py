@@ -217,7 +217,11 @@ class Eigenbasis:
             See `from_images`.
         """
         if images is None:
-            refuse_encoding(encoding, "the curve follows from the eigenvalues")
+            if encoding is not None:
+                raise ValueError(
+                    "encoding is for the pixels of images, and the curve follows from the "
+                    "eigenvalues; leave it out"
+                )
             return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean.size)
         with series():
             rows = [self._residuals(image, encoding) for image in images]
@@ -274,12 +278,6 @@ class Eigenbasis:
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
         pairs = zip(lengths, self._coefficients(planes), strict=True)
         return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
-
-
-def refuse_encoding(encoding: str | None, reason: str) -> None:
-    """Raise ValueError if an encoding is given where no pixels are read."""
-    if encoding is not None:
-        raise ValueError(f"encoding is for the pixels of images, and {reason}; leave it out")
 
 
 def check_components(

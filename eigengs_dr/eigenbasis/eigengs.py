@@ -88,7 +88,6 @@ class EigenGS:
         iterations: int | None = None,
         backend: str | None = None,
         progress: Any = None,
-        encoding: str | None = None,
     ) -> EigenGS:
         """Fit one set of Gaussians to the mean image and all components of an eigenbasis.
 
@@ -112,8 +111,6 @@ class EigenGS:
         progress : bool or callable, optional
             By default a bar, in a terminal or a notebook, after two seconds; False shows none. A
             function is called as ``progress(step, steps, {})`` after every round of training.
-        encoding : {"srgb", "linear"}, optional
-            What the pixels of images are, see `eigengs_dr.Eigenbasis.from_images`.
 
         Raises
         ------
@@ -122,13 +119,11 @@ class EigenGS:
         BackendError
             If the backend does not work.
         """
-        from .basis import Eigenbasis, refuse_encoding
+        from .basis import Eigenbasis
         from .components import TrainOptions, fit_model
 
         if not isinstance(basis, Eigenbasis):
-            basis = Eigenbasis.from_images(basis, progress=False, encoding=encoding)
-        else:
-            refuse_encoding(encoding, "a basis holds none")
+            basis = Eigenbasis.from_images(basis, progress=False)
         options = TrainOptions(
             size=(basis.width, basis.height),
             gaussians=gaussians,

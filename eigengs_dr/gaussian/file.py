@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from operator import index
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..backend.messages import printable, shown
-from ..backend.types import Arrays
+from ..backend.types import Arrays, Singles
 from ..codec.egs import EgsContent, is_packed, read_egs, read_egs_head, write_egs
 from ..codec.quantization import dequantize
 from ..image.color import MAX_CHANNELS
@@ -114,6 +116,48 @@ class SetData(NamedTuple):
         texture_map, part = find_map(self.maps, name)
         arrays = {k: self.arrays[k][..., part] for k in ("color", "background")}
         return self._replace(arrays=self.arrays | arrays, space=texture_map.space, maps=())
+
+    def crop(
+        self,
+        corner: tuple[float, float],
+        size: tuple[int, int],
+        scale: tuple[float, float] = (1.0, 1.0),
+    ) -> SetData:
+        """Return the Gaussians that touch a region, as a set with the size of the region.
+
+        Parameters
+        ----------
+        corner : (float, float)
+            x and y of the upper left corner of the region, in native pixels of the set.
+        size : (int, int)
+            Width and height of the region in pixels of the result.
+        scale : (float, float), optional
+            Pixels of the result per native pixel, along x and y.
+
+        Returns
+        -------
+        SetData
+            Its rendering equals the region in the rendering of the full set, up to rounding. The
+            Gaussians keep their order. The set is empty if the region shows only the background.
+        """
+        mean = self.arrays["mean"]
+        touches = np.ones(len(mean), bool)
+        for axis, reach in enumerate(self.reaches()):
+            half = 0.5 * size[axis] / scale[axis]
+            distance = np.abs(mean[:, axis] - np.float32(corner[axis] + half))
+            touches &= distance <= reach * np.float32(1.001) + np.float32(half + 1)
+        arrays = {name: self.arrays[name][touches] for name in ("mean", "factor", "color")}
+        x, y = scale
+        arrays["mean"] = ((arrays["mean"].astype(np.float64) - corner) * scale).astype(np.float32)
+        arrays["factor"] = (arrays["factor"] / np.array([x, y, y])).astype(np.float32)
+        return self._replace(arrays=self.arrays | arrays, size=size)
+
+    def reaches(self) -> tuple[Singles, Singles]:
+        """Return how far each Gaussian reaches from its mean along x and along y, in pixels."""
+        a, b, c = self.arrays["factor"].T
+        # The covariance (F^T F)^-1 has the entries xx = (1 + (b / c)^2) / a^2 and yy = 1 / c^2.
+        across = self.cutoff * np.hypot(np.float32(1), b / c) / a
+        return across.astype(np.float32), (self.cutoff / c).astype(np.float32)
 
 
 class FitFigures(NamedTuple):
@@ -389,6 +433,25 @@ def _known(name: str) -> Space:
         return space_of(name)
     except ValueError:
         raise BadValue(f"space is {shown(name)}, expected one of {', '.join(SPACES)}") from None
+
+
+Region = tuple[int, int, int, int]
+"""Left, top, width and height, in native pixels of a set."""
+
+
+def check_region(name: str, region: Sequence[int], size: tuple[int, int]) -> Region:
+    """Return a region, or raise ValueError unless it is inside an image of (width, height)."""
+    values = [index(v) for v in region]
+    if len(values) != 4:
+        raise ValueError(f"{name} is {values}; expected left, top, width and height in pixels")
+    left, top, width, height = values
+    inside = 0 <= left <= size[0] - width and 0 <= top <= size[1] - height
+    if not inside or min(width, height) < 1:
+        raise ValueError(
+            f"{name} {left},{top},{width},{height} is not inside the image of "
+            f"{size[0]}x{size[1]} pixels"
+        )
+    return left, top, width, height
 
 
 MAX_VALUES = (1 << 32) - 1
