@@ -344,12 +344,11 @@ class EigenGS:
         ValueError, OSError
             As for `eigengs_dr.Gaussians.load`; also if there is no such file or name.
         """
-        if path in SHIPPED:
-            return cls(**read_model(SHIPPED[str(path)], backend))
-        if not Path(path).is_file():
+        file = SHIPPED.get(str(path), Path(path))
+        if not file.is_file():
             names = ", ".join(SHIPPED)
             raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
-        return cls(**read_model(path, backend))
+        return cls(**read_model(file, backend))
 
     def __getstate__(self) -> Record:
         """Leave out the encoder, whose cached values are Dr.Jit arrays."""

@@ -18,7 +18,7 @@ from ..image.color import MAX_CHANNELS
 from ..image.formats import SUFFIXES
 from ..image.space import DATA, SPACES, Space, space_of
 from ..storage import npz
-from ..storage.npz import BadValue, Field, file_errors
+from ..storage.npz import BadValue, Field, check_values, file_errors
 from .channels import MAX_MAP_CHANNELS, TextureMap, channel_weights, check_maps, find_map
 
 FORMAT = "eigengs_dr.gaussians"
@@ -206,13 +206,9 @@ def write_set(
         If the file cannot be written; an existing file does not change.
     """
     check_suffix(path)
-    kind = MATERIAL if data.maps else FORMAT
-    with np.errstate(over="ignore"):  # the check rejects infinity
-        members: Arrays = {name: np.asarray(a, np.float32) for name, a in data.arrays.items()}
+    kind, members = MATERIAL if data.maps else FORMAT, members_of(data)
     with file_errors(path):
         check(data._replace(arrays=members))
-    members["size"] = np.array(data.size, np.int64)
-    members["cutoff"] = np.array(data.cutoff, np.float64)
     if data.maps:
         columns = zip(*data.maps, strict=True)
         members |= {name: np.array(column) for name, column in zip(MAPS, columns, strict=True)}
@@ -225,6 +221,13 @@ def write_set(
             members["options"] = np.array(figures.options)
     compressed = len(members["mean"]) < UNCOMPRESSED_COUNT
     npz.write(path, kind, VERSIONS[kind], members, compressed)
+
+
+def members_of(data: SetData) -> Arrays:
+    """Return the arrays of a file for a set, in single precision, without its maps and space."""
+    with np.errstate(over="ignore"):  # the check of a set rejects infinity
+        members = {name: np.asarray(a, np.float32) for name, a in data.arrays.items()}
+    return members | {"size": np.array(data.size, np.int64), "cutoff": np.array(float(data.cutoff))}
 
 
 def read_head(path: Path) -> tuple[int, SetData]:
@@ -276,14 +279,6 @@ def kind_of(path: str | os.PathLike[str]) -> str:
     return LIGHTS if head.lights else MATERIAL if head.maps else FORMAT
 
 
-def maps_of(path: Path) -> tuple[TextureMap, ...]:
-    """Return the maps of an ``.npz`` or ``.egs`` file, () for one image; errors: see `read_set`."""
-    if not is_packed(path):
-        return read_head(path)[1].maps
-    with file_errors(path):
-        return _maps_in(read_egs_head(path))
-
-
 def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
     """Read the set of one image, or of one map of a file.
 
@@ -301,13 +296,12 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
         As for `read_set`; if a file with maps is read without a name, or one without maps with a
         name; or if there is no such map. The message lists the maps.
     """
-    maps = maps_of(path)
-    if not maps and name is not None:
-        raise ValueError(f"{path}: holds one image and no maps; leave out {option}")
-    if maps and name is None:
-        names = ", ".join(m.name for m in maps)
-        raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
     data = read_set(path)
+    if not data.maps and name is not None:
+        raise ValueError(f"{path}: holds one image and no maps; leave out {option}")
+    if data.maps and name is None:
+        names = ", ".join(m.name for m in data.maps)
+        raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
     with file_errors(path):
         return data if name is None else data.map_data(name)
 
@@ -347,15 +341,10 @@ def packed_data(content: EgsContent) -> SetData:
     values = {**dequantize(content.all_symbols(), content.steps), "background": content.background}
     with np.errstate(over="ignore"):
         arrays = {name: value.astype(np.float32) for name, value in values.items()}
-    maps = _maps_in(content)
+    maps = check_maps(content.maps, len(content.background)) if content.maps else ()
     scale = np.array(channel_weights(maps) or 1, np.float32)
     arrays |= {name: arrays[name] / scale for name in ("color", "background")}
     return SetData(arrays, content.size, _known(content.space), content.cutoff, maps)
-
-
-def _maps_in(content: EgsContent) -> tuple[TextureMap, ...]:
-    """Return the maps of a packed file, or raise `BadValue` if they are invalid."""
-    return check_maps(content.maps, len(content.background)) if content.maps else ()
 
 
 def write_packed(path: str | os.PathLike[str], content: EgsContent) -> int:
@@ -379,16 +368,8 @@ def check(data: SetData) -> SetData:
     channels = color.shape[1] if color.ndim == 2 else 3
     if not 1 <= channels <= MAX_CHANNELS:
         raise BadValue(f"color has {channels} channels, expected 1 to {MAX_CHANNELS}")
-    for name, array, expected in (
-        ("factor", factor, (len(mean), 3)),
-        ("color", color, (len(mean), channels)),
-        ("background", arrays["background"], (channels,)),
-    ):
-        if array.shape != expected:
-            raise BadValue(f"{name} has shape {array.shape}, expected {expected}")
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise BadValue(f"{name} holds values that are not finite")
+    shapes = {"factor": (len(mean), 3), "color": (len(mean), channels), "background": (channels,)}
+    check_values(arrays, shapes)
     if not (factor[:, [0, 2]] > 0).all():
         raise BadValue("factor has a or c <= 0; both must be positive")
     sums = np.abs(color).sum(axis=0, dtype=np.float64) + np.abs(arrays["background"])

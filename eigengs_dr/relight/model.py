@@ -24,7 +24,7 @@ from ..backend.types import ArrayLike, Doubles, Rows
 from ..codec.egs import is_packed, read_egs
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
-from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, packed_data
+from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats
@@ -236,11 +236,8 @@ class Relightable:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
-        data, table = self.planes.data(), self.table
-        arrays = {name: values.astype(np.float32) for name, values in data.arrays.items()}
-        arrays |= {
-            "size": np.array(data.size, np.int64),
-            "cutoff": np.array(data.cutoff, np.float64),
+        table = self.table
+        arrays = members_of(self.planes.data()) | {
             "lights": table.lights.astype(np.float32),
             "values": table.values.astype(np.float32),
             "kind": np.array(table.kind),
