@@ -14,6 +14,7 @@ from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.gaussian.gaussians import Fitted, Gaussians
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.raster.render import render
+from eigengs_dr.relight.directions import LatLong
 
 from .parameters import given, plugin_of
 from .versions import columns_beyond
@@ -139,7 +140,8 @@ def _from_pole_to_pole(gaussians: Gaussians, rows: int) -> Gaussians:
             "have at least 2, one for each pole"
         )
     types, native = types_of(gaussians.mean), gaussians.height
-    stretch = (rows - 1) / (native - 1) * (native / rows)
+    now, then = (LatLong(gaussians.width, n, pole_to_pole=True) for n in (native, rows))
+    stretch = then.rows / now.rows * (native / rows)
     ratio, border = (dr.opaque(types.Float, v) for v in (stretch, (native / rows - stretch) / 2))
     (x, y), (a, b, c) = gaussians.mean, gaussians.factor
     return replace(

@@ -15,13 +15,12 @@ import mitsuba as mi
 
 from eigengs_dr.backend.types import Bool, Float
 from eigengs_dr.raster.lookup.points import sum_at_points, value_terms
-from eigengs_dr.raster.parameters import KernelParameters
 
 from . import properties
 from .color import shown_channels, upload_table
 from .cone import current_angle
-from .lookup import list_gaussians, make_table, sum_over_footprint, table_of_file
-from .parameters import SHAPES
+from .lookup import list_gaussians, make_table, sum_over_footprint
+from .sources import SHAPES
 
 
 def plugin_of_sums(base: type) -> Any:
@@ -89,8 +88,8 @@ def plugin_of_sums(base: type) -> Any:
             """Take over the Gaussians; with new lists if they have moved."""
             source, size = self.source, (self.width, self.height)
             settings = self.cutoff, self.wrap, self.filtered(), self.memory
-            if source.file and source.is_that_of_file():
-                self.table, self.part = table_of_file(source.file, *settings), source.part
+            if shared := source.shared_table(*settings):
+                self.table, self.part = shared
                 return
 
             # The lists come first, since they may raise: old lists would read beyond new Gaussians.
@@ -105,14 +104,6 @@ def plugin_of_sums(base: type) -> Any:
             # A texture that has changed may change its colours next, and needs all lists again.
             self.table = table if self.changed else replace(table, lists=lists)
             self.part = slice(None)
-
-        def parameters(self) -> KernelParameters:
-            """Return the Gaussians; of a file, they need not be read again for it."""
-            source = self.source
-            if not (source.file and source.is_that_of_file()):
-                return source.decode(source.tensors)
-            found, part = source.file.parameters(), source.part
-            return KernelParameters(found.shape, found.color[part], found.background[part])
 
         # --- The prefilter -----------------------------------------------------------------------
 

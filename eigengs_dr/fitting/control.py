@@ -511,7 +511,7 @@ class _Comparison:
 
     def peaks(self, slope: Float, count: int) -> Peaks:
         """Return where at most `count` added Gaussians would reduce the loss of an image most."""
-        canvas = Canvas(types_of(slope), self.lists.grid, self.lists.sizes)
+        canvas = Canvas(types_of(slope), self.lists.grid, self.lists.layout)
         return residual_peaks(canvas, -slope, self.model.curvatures(self.lists.grid), count)
 
 

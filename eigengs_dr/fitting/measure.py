@@ -101,7 +101,7 @@ def _squared_errors(
     rendered = image_of(packed, background, lists, kernel_radius(cutoff))
     length = grid.tile[0]
     run = dr.arange(types.UInt, grid.tiles * grid.pixels // length)
-    owner = lists.sizes.image_of(run // (grid.pixels // length))
+    owner = lists.layout.image_of(run // (grid.pixels // length))
 
     def read(image: Float) -> list:
         channels = dr.width(image) // (grid.tiles * grid.pixels)

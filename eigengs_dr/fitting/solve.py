@@ -249,7 +249,7 @@ def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) ->
     types, grid = types_of(image), lists.grid
     tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * len(factors)
     change = gather_run(types, step, tile, length, True)
-    owner = lists.sizes.image_of(tile)
+    owner = lists.layout.image_of(tile)
     factors = [spread(f, owner) for f in factors]
     added = [c * f for c, f in zip(change, factors * grid.pixels, strict=True)]
     add, alone = dr.ReduceOp.Add, dr.ReduceMode.NoConflicts

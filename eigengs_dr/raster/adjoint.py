@@ -77,7 +77,7 @@ def adjoint_pieces(
     for the cutoff, 2 per channel and 5 for the shape.
     """
     types = types_of(packed)
-    sizes, pieces, tile_size = lists.sizes, lists.pieces, lists.grid.tile
+    layout, pieces, tile_size = lists.layout, lists.pieces, lists.grid.tile
     assert pieces is not None
     rows, shares = shares_of(types, lists.grid)
     fields = [pieces.splat, pieces.begin, pieces.end, pieces.slot]
@@ -95,7 +95,7 @@ def adjoint_pieces(
         active = i < end
         tile = gather_index(types, pieces.tile, i, active)
         d = gather_run(types, delta, tile * shares + part, length * channels, active)
-        column, row = sizes.first_pixel(tile)
+        column, row = layout.first_pixel(tile)
         x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
         color = sums[-channels - images :][:channels]
 

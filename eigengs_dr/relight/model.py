@@ -35,6 +35,7 @@ from ..image.space import DATA, LINEAR, RGB
 from ..raster.render import render
 from ..storage import npz
 from ..storage.npz import BadValue, Field, file_errors
+from .directions import LatLong
 from .fit import find_planes, fit_planes, most_planes, read_photos
 from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
@@ -358,13 +359,9 @@ def environment_lights(environment: object) -> tuple[Doubles, Doubles]:
     if len(light) > 1:  # the outermost rows have half the height of the others
         light = np.repeat(resample(light, width, len(light)), 2, axis=0)[1:-1]
     average = np.maximum(resample(light, width, height), 0).astype(np.float64)
-    polar = np.pi * (np.arange(height) + 0.5) / height
-    turn = 2 * np.pi * (np.arange(width) + 0.5) / width
-    ring, up = np.sin(polar)[:, None], np.cos(polar)[:, None]
-    directions = np.stack(np.broadcast_arrays(ring * np.sin(turn), up, -ring * np.cos(turn)), -1)
-    share = 2 * np.pi / (width * height) * ring[..., None]  # solid angles, over pi
+    directions, areas = LatLong(width, height).directions(), LatLong(width, height).areas()
     above = directions[..., 2] > 0
-    return directions[above], (average * share)[above]
+    return directions[above], (average * areas[:, None, None] / np.pi)[above]
 
 
 # --- The table in a packed file ------------------------------------------------------------------

@@ -91,7 +91,7 @@ class Owners:
         """Return the average of values (N,) over the owners of each pixel."""
         sums = _sum_weights(self.shape, values, self.lists, self.cutoff)
         tile = dr.arange(types_of(values).UInt, dr.width(sums)) // self.lists.grid.pixels
-        mean = spread(_mean_by_image(values, self.lists), self.lists.sizes.image_of(tile))
+        mean = spread(_mean_by_image(values, self.lists), self.lists.layout.image_of(tile))
         return dr.fma(NO_WEIGHT, mean, sums) / (self.total + NO_WEIGHT)
 
 

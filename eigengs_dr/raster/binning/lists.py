@@ -26,7 +26,7 @@ from ..evaluate import is_steep
 from .tiles import (
     TILE,
     Grid,
-    GridArrays,
+    TileLayout,
     for_each_row,
     granularity_of,
     tile_columns,
@@ -80,8 +80,8 @@ class TileLists:
     Attributes
     ----------
     grid : Grid
-    sizes : GridArrays
-        The sizes of `grid` as arrays.
+    layout : TileLayout
+        That of `grid`, in arrays.
     splat : UInt32, shape (capacity,)
         Indices of Gaussians, tile after tile; entries after the last list are not used.
     begin, end : UInt32, shape (tiles,)
@@ -106,7 +106,7 @@ class TileLists:
     """
 
     grid: Grid
-    sizes: GridArrays
+    layout: TileLayout
     splat: UInt
     begin: UInt
     end: UInt
@@ -178,10 +178,10 @@ def build_lists(
     """
     types = types_of(shape[0])
     # Numbers are in arrays: as literals, each value would compile a program of its own.
-    sizes, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
+    layout, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
     share = granularity_of(types)
-    touched, totals = _count_tiles(shape, radius, wide, sizes, pad)
+    touched, totals = _count_tiles(shape, radius, wide, layout, pad)
     narrow, entries = divmod(int(totals[0]), 1 << 40)  # one copy to the host
     exact_exp = narrow > 0 or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
@@ -194,14 +194,14 @@ def build_lists(
     # At most one piece of each Gaussian is not full: this bounds their number without a copy.
     max_pieces = _padded(dr.width(touched) + entries // visits) if adjoint else 0
     tile, last, cut = _list_tiles(
-        shape, wide, sizes, pad, image, touched, visits, (_padded(entries), max_pieces)
+        shape, wide, layout, pad, image, touched, visits, (_padded(entries), max_pieces)
     )
     pieces = _in_order(types, tile, *cut) if adjoint else None
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
     order, begin, end = _lanes(types, grid, starts, ordered and share.ordered)
     lists = TileLists(
-        grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), exact_exp, radius
+        grid, layout, splat, begin, end, order, image, pieces, dr.width(splat), exact_exp, radius
     )
     dr.eval(lists)
     return lists
@@ -254,7 +254,7 @@ def _padded(count: int) -> int:
 
 @record
 def _count_tiles(
-    shape: list, radius: float, wide: FloatLike, grid: GridArrays, pad: FloatLike
+    shape: list, radius: float, wide: FloatLike, grid: TileLayout, pad: FloatLike
 ) -> tuple[UInt, UInt]:
     """Return the number of tiles that each Gaussian touches, and a total for one copy to the host.
 
@@ -276,7 +276,7 @@ def _count_tiles(
 def _list_tiles(
     shape: list,
     radius: FloatLike,
-    grid: GridArrays,
+    grid: TileLayout,
     pad: FloatLike,
     image: UInt | None,
     touched: UInt,
@@ -306,7 +306,7 @@ def _emit_tiles(
     types: ArrayTypes,
     shape: list,
     radius: FloatLike,
-    grid: GridArrays,
+    grid: TileLayout,
     pad: FloatLike,
     image: UInt | None,
     slots: tuple[UInt, UInt],
@@ -345,7 +345,7 @@ def _find_tiles(
     types: ArrayTypes,
     shape: list,
     radius: FloatLike,
-    grid: GridArrays,
+    grid: TileLayout,
     pad: FloatLike,
     image: UInt | None,
     slots: tuple[UInt, UInt],

@@ -20,7 +20,7 @@ from ...backend.arrays import ArrayTypes, types_of, upload, upload_rows
 from ...backend.recording import record
 from ...backend.types import Bool, Float, UInt
 from ..binning.lists import TileLists, build_lists
-from ..binning.tiles import Grid, GridArrays, State, tile_columns
+from ..binning.tiles import Grid, State, TileLayout, tile_columns
 from ..parameters import NUM_SHAPE_PARAMS, pack_parameters, unpack_parameters
 
 MOST = (1 << 16) - 1
@@ -196,7 +196,9 @@ def list_cells(
     bands, reach = _number(types, count, lists), dr.opaque(types.Float, radius)
     grids = [Grid(width, height, (side, side)) for _, side in levels]
     strips = [
-        _Strips(one.splat, number, one.begin, one.end, one.sizes, grid.in_arrays(types), grid.tiles)
+        _Strips(
+            one.splat, number, one.begin, one.end, one.layout, grid.in_arrays(types), grid.tiles
+        )
         for one, number, grid in zip(lists, bands.numbers, grids, strict=True)
     ]
     rows, starts = _count_runs([shape for shape, _ in levels], strips, reach)
@@ -241,7 +243,7 @@ class _Strips:
         Their numbers in the band of the strip; None for a single band, where they are one higher.
     begin, end : UInt32, shape (strips,)
         Range of each strip in `splat`.
-    grid, cells : GridArrays
+    grid, cells : TileLayout
         Division of the image into strips, and into cells.
     tiles : int
         Number of cells.
@@ -251,8 +253,8 @@ class _Strips:
     number: UInt | None
     begin: UInt
     end: UInt
-    grid: GridArrays
-    cells: GridArrays
+    grid: TileLayout
+    cells: TileLayout
     tiles: int
 
 
