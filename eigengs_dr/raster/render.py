@@ -22,9 +22,8 @@ from ..gaussian.file import MAX_CUTOFF, check_index_range
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
 from ..gaussian.region import Region, check_region
 from .adjoint import adjoint
-from .binning.lists import TileLists, build_lists, update_exact_exp
-from .binning.tiles import TILE, Grid
 from .kernels import channel_sums, forward
+from .lists import TileLists, build_lists, update_exact_exp
 from .parameters import (
     EXP2_SCALE,
     KernelParameters,
@@ -34,6 +33,7 @@ from .parameters import (
     kernel_shape,
     pack_parameters,
 )
+from .tiles import TILE, Grid
 
 
 @door

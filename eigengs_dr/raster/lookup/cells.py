@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ...backend.arrays import ArrayTypes, types_of, upload, upload_rows
 from ...backend.types import Bool, Float, UInt
-from ..binning.lists import TileLists, build_lists
-from ..binning.tiles import Grid
+from ..lists import TileLists, build_lists
 from ..parameters import pack_parameters
+from ..tiles import Grid
 
 MOST = (1 << 16) - 1
 """Largest number of Gaussians of a band. Their numbers start at 1: row 0 of a band is blank."""

@@ -6,8 +6,8 @@ import drjit as dr
 
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.backend.types import Float, UInt
-from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.evaluate import weights
+from eigengs_dr.raster.lists import TileLists
 from eigengs_dr.raster.parameters import EXP2_SCALE, NUM_SHAPE_PARAMS, kernel_radius
 
 
