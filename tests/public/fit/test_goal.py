@@ -13,15 +13,6 @@ from _helpers.photos import coffee
 from _helpers.waves import METHODS
 
 
-def test_two_colours_take_few():
-    image = np.full((SIDE, SIDE, 3), 0.4, np.float32)
-    image[:, SIDE // 2 :] = (0.9, 0.2, 0.1)
-    result = eg.fit(image, target_psnr=32, iterations=300)
-    assert result.stopped == "met"
-    assert len(result.gaussians) <= 12
-    assert eg.psnr(image, result.image) >= 32
-
-
 def test_noise_is_out_of_reach():
     """With as many parameters as the image has numbers; in at most a quarter more than twice the
     steps."""
