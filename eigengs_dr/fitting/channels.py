@@ -33,8 +33,8 @@ class Picture(NamedTuple):
         Space of the channels.
     image : Float
         In tile layout: sRGB; or the data as they are fitted.
-    channels : slice
-        The channels of the set.
+    first : int
+        The first of its channels of the set.
     scale, offset : Float, shape (images,)
         ``scale s + offset`` of a fitted value s is in units of the space; of data, with the peak 1.
     exposure : Float, shape (images,)
@@ -49,7 +49,7 @@ class Picture(NamedTuple):
 
     space: Space
     image: Float
-    channels: slice
+    first: int
     scale: Float
     offset: Float
     exposure: Float
@@ -123,6 +123,12 @@ class Channels(NamedTuple):
         return Affine(scale / self.factor, offset)
 
     @property
+    def peak(self) -> float:
+        """The peak of a PSNR in the unit of the fit, before the factor."""
+        pixels, _, unit = self.targets[0]
+        return 1 / unit.scale if self.space.has_codes(pixels) else 1.0
+
+    @property
     def map(self) -> TextureMap:
         """The map of the finished set, whose weight is the factor of its errors in the fit."""
         return TextureMap(self.name, self.space, self.number, 1 / self.unit().scale)
@@ -180,7 +186,7 @@ class Channels(NamedTuple):
         return Picture(
             self.space,
             batch_to_tiles(types, shown),
-            self.part,
+            self.part.start,
             upload(types.Float, np.array([unit.scale for unit in units])),
             upload(types.Float, np.array([unit.offset for unit in units])),
             upload(types.Float, np.array(exposures)),

@@ -137,23 +137,12 @@ class Surplus:
         self, state: State, objective: Pixels, step: int, iterations: int, key: int
     ) -> State:
         """Return the state with the surplus that a redistribution may place."""
-        width, height = objective.size
-        weighed = objective.model.curvature is not None
-        number = self.number(state.count, width * height, iterations, weighed)
-        return replace(state, surplus=number)
-
-    def number(self, count: int, pixels: int, iterations: int, weighed: bool = False) -> int:
-        """Return how many Gaussians more than `count` an image of so many pixels may have.
-
-        Examples
-        --------
-        >>> [Surplus().number(count, 256 * 256, 1000) for count in (1000, 3000, 5000)]
-        [1000, 1096, 0]
-        """
-        none, whole = (0, FULL_ROUNDS) if weighed else SURPLUS_ROUNDS
+        count, (width, height) = state.count, objective.size
+        none, whole = SURPLUS_ROUNDS if objective.model.curvature is None else (0, FULL_ROUNDS)
         strength = (len(round_steps(self.every, iterations)) - none) / (whole - none)
+        most = int(self.max_density * width * height) - count
         share = self.share * min(1, strength)
-        return max(0, min(int(share * count), int(self.max_density * pixels) - count))
+        return replace(state, surplus=max(0, min(int(share * count), most)))
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from ..backend.arrays import make_divisor, types_of
 from ..backend.recording import record
 from ..backend.types import Bool, Float, UInt
 from ..gaussian.gaussians import Gaussians, concatenate, take, whole
-from ..raster.binning.lists import TileLists
-from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums
+from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape
 from ..raster.render import bin_gaussians, to_tiles
+from ..raster.tiles import Grid
 from .objective import Part, Pixels, Quadratic
 from .peaks import SIZE, Canvas, Peaks, residual_peaks
 from .redistribution import Owners, error_by_pixel
@@ -83,7 +83,7 @@ class _Comparison:
 
     def peaks(self, slope: Float, count: int) -> Peaks:
         """Return where at most `count` added Gaussians would reduce the loss of an image most."""
-        canvas = Canvas(types_of(slope), self.lists.grid, self.lists.sizes)
+        canvas = Canvas(types_of(slope), self.lists.grid, self.lists.layout)
         return residual_peaks(canvas, -slope, self.model.curvatures(self.lists.grid), count)
 
 

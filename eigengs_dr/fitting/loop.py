@@ -16,7 +16,7 @@ from ..image.metrics import MAX_PSNR
 from .control import Control
 from .exchange import prune
 from .measure import Measured, Row
-from .method import Method
+from .method import Method, Schedule
 from .objective import Objective
 from .state import State
 from .step import listed, started, step_program
@@ -53,7 +53,7 @@ def descend(
     """
     part = range(iterations) if part is None else part
     acts = [(control, frozenset(control.steps(iterations))) for control in method.controls]
-    schedule, largest = method.schedule(iterations), 0
+    schedule, largest = Schedule(method.rate_factors(iterations), method.warm_up), 0
     kind = np.float32 if objective.image.types.bits == 32 else np.float64
     image = objective.image
     program = step_program(image, method)

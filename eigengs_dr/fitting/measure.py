@@ -20,8 +20,8 @@ from ..backend.types import Float, Record
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import RGB_TO_YCBCR, to_linear, to_pu21
 from ..image.metrics import psnr_from_mse
-from ..raster.binning.lists import TileLists
 from ..raster.kernels import image_of, pixels_inside, sum_by_image
+from ..raster.lists import TileLists
 from ..raster.parameters import (
     detached_shape,
     gather_run,
@@ -74,11 +74,8 @@ def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float
         lists = bin_gaussians(gaussians, adjoint=False, images=images)
         shape, color = detached_shape(gaussians), whole(gaussians.color, gaussians)
         background = list(gaussians.background)
-        given = [
-            (p.space, p.channels.start, p.image, p.scale, p.offset, p.exposure, p.weight, p.base)
-            for p in pictures
-        ]
-        sums = _squared_errors(shape, color, background, lists, gaussians.cutoff, given)
+        cutoff = gaussians.cutoff
+        sums = _squared_errors(shape, color, background, lists, cutoff, list(pictures))
         dr.eval(sums)
     *squares, areas = np.split(np.array([s.numpy() for s in sums]), 3, axis=0)
     mse = np.stack(squares, axis=1) / areas[:, None]
@@ -89,19 +86,24 @@ def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float
 
 @record
 def _squared_errors(
-    shape: list, color: list, background: list, lists: TileLists, cutoff: float, pictures: list
+    shape: list,
+    color: list,
+    background: list,
+    lists: TileLists,
+    cutoff: float,
+    pictures: list[Picture],
 ) -> list:
     """Return the squared errors of pictures in both spaces each, Float64 of shape (images,).
 
     First those in the space of floats, then those in 8 bits, then the sums of the weights of all
-    values. A lane owns the pixels of a row of a tile. The pictures are those of `psnrs`.
+    values. A lane owns the pixels of a row of a tile.
     """
     types, grid = types_of(shape[0]), lists.grid
     packed = pack_parameters([*shape, *color])
     rendered = image_of(packed, background, lists, kernel_radius(cutoff))
     length = grid.tile[0]
     run = dr.arange(types.UInt, grid.tiles * grid.pixels // length)
-    owner = lists.sizes.image_of(run // (grid.pixels // length))
+    owner = lists.layout.image_of(run // (grid.pixels // length))
 
     def read(image: Float) -> list:
         channels = dr.width(image) // (grid.tiles * grid.pixels)
@@ -109,15 +111,14 @@ def _squared_errors(
         return [values[k * channels : (k + 1) * channels] for k in range(length)]
 
     pixels, inside = read(rendered), pixels_inside(types, grid)
-    floats: list[Float] = []
-    codes: list[Float] = []
-    areas: list[Float] = []
-    for space, first, image, scale, offset, exposure, weight, base in pictures:
-        a, b, light = (spread(v, owner) for v in (scale, offset, exposure))
+    results: list[list[Float]] = []
+    for picture in pictures:
+        space, first, weight, base = picture.space, picture.first, picture.weight, picture.base
+        a, b, light = (spread(v, owner) for v in (picture.scale, picture.offset, picture.exposure))
         totals = [types.Float(0)] * 3
         factors = read(inside if weight is None else weight)
         bases = None if base is None else read(base)
-        for k, seen in enumerate(read(image)):
+        for k, seen in enumerate(read(picture.image)):
             sums = pixels[k][first : first + len(seen)]
             if space.by_range:
                 # Differences of the fitted values keep their digits.
@@ -134,10 +135,8 @@ def _squared_errors(
             f = factors[k][0]
             totals = [t + dr.select(f > 0, e * f, 0) for t, e in zip(totals, errors, strict=True)]
         Double = dr.float64_array_t(types.Float)
-        sums = [sum_by_image(Double(total), grid) for total in totals]
-        for group, value in zip((floats, codes, areas), sums, strict=True):
-            group.append(value)
-    return [*floats, *codes, *areas]
+        results.append([sum_by_image(Double(total), grid) for total in totals])
+    return [value for group in zip(*results, strict=True) for value in group]
 
 
 def _minus(a: list, b: list) -> list:

@@ -174,10 +174,6 @@ class Method:
         lines = [f"    {f.name}={getattr(self, f.name)!r}," for f in fields(self)]
         return "\n".join([f"{type(self).__name__}(", *lines, ")"])
 
-    def schedule(self, iterations: int) -> Schedule:
-        """Return the factors of the learning rates of a descent."""
-        return Schedule(self.rate_factors(iterations), self.warm_up)
-
     def rate_factors(self, iterations: int) -> list[float]:
         """Return the factors of the learning rates at all steps: half a cosine down to `decay`.
 

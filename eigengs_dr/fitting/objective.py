@@ -22,11 +22,11 @@ from ..backend.arrays import ArrayTypes, types_of
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.space import DATA, Space
-from ..raster.binning.lists import TileLists
-from ..raster.binning.tiles import Grid
-from ..raster.kernels import channel_sums, forward, pixels_inside, residual
+from ..raster.kernels import channel_sums, pixels_inside, residual
+from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import batch_to_tiles, bin_gaussians, to_tensor
+from ..raster.tiles import Grid
 from .channels import Channels, Image, Picture
 from .loss import PictureLoss, Slope
 
@@ -200,10 +200,8 @@ class Pixels:
         lists = bin_gaussians(gaussians, adjoint=False)
         packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
-        rendering = forward(packed, background, lists, radius)
-        pixel = dr.arange(self.types.UInt, dr.width(rendering)) // self.channels
-        inside = dr.gather(self.types.Float, pixels_inside(self.types, self.grid), pixel)
-        left = self.model.target - rendering * inside
+        beyond, _ = Quadratic(self.model.target).compare(packed, background, lists, radius)
+        left = -beyond
         dr.eval(left)
         return replace(self, model=self.model._replace(target=left), placement_image=left)
 

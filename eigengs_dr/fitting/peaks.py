@@ -19,8 +19,8 @@ import drjit as dr
 from ..backend.arrays import ArrayTypes, make_divisor
 from ..backend.recording import record
 from ..backend.types import Float, Rows, UInt
-from ..raster.binning.tiles import TILE, Grid, GridArrays
 from ..raster.parameters import gather_run
+from ..raster.tiles import TILE, Grid, TileLayout
 from .solve import for_channels
 
 SIDE = TILE[0]
@@ -37,40 +37,25 @@ class Canvas:
     ----------
     types : ArrayTypes
     grid : Grid
-    sizes : GridArrays
+    layout : TileLayout
         Sizes of `grid`: computing them takes microseconds, and many kernels need them.
     """
 
     types: ArrayTypes
     grid: Grid
-    sizes: GridArrays
-
-    def sides(self) -> tuple[UInt, UInt]:
-        """Return width and height of an image as Int32."""
-        return self.types.Int(self.sizes.width), self.types.Int(self.sizes.height)
-
-    def corner(self, tile: UInt) -> tuple[UInt, UInt]:
-        """Return column and row of the first pixel of a tile as Int32."""
-        column, row = self.sizes.first_pixel(tile)
-        return self.types.Int(column), self.types.Int(row)
+    layout: TileLayout
 
     def channels(self, image: Float) -> int:
         """Return the number of values of a pixel."""
         return dr.width(image) // (self.grid.tiles * PIXELS)
 
-    def pixels(self, index: UInt) -> tuple[UInt, UInt]:
-        """Return column and row as Int32 of pixels, by their index in tile layout."""
-        column, row = self.corner(index >> 4)
-        return column + self.types.Int(index & 3), row + self.types.Int((index >> 2) & 3)
-
     def read(self, image: Float, right: int = 0, down: int = 0) -> list:
         """Return the channels of the pixels beside all pixels, 0 outside the image."""
         types, pixel = self.types, dr.arange(self.types.UInt, self.grid.tiles * PIXELS)
-        x, y = self.pixels(pixel)
+        x, y = map(types.Int, self.layout.pixel(pixel))
         column, row = x + right, y + down
-        width, height = self.sides()
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        tiles = ((row >> 2) - (y >> 2)) * self.sizes.nx + (column >> 2) - (x >> 2)
+        inside = (column >= 0) & (row >= 0) & self.layout.inside(column, row)
+        tiles = ((row >> 2) - (y >> 2)) * self.layout.nx + (column >> 2) - (x >> 2)
         place = (tiles + types.Int(pixel >> 4)) * PIXELS + (row & 3) * SIDE + (column & 3)
         return gather_run(types, image, types.UInt(place), self.channels(image), inside)
 
@@ -149,7 +134,7 @@ def residual_peaks(canvas: Canvas, slope: Float, curvature: Float, count: int) -
     if not dr.width(place):  # Dr.Jit does not compute with empty arrays
         none = types.Float()
         return Peaks(types.Float2(none, none), [none] * channels, place, place)
-    x, y = canvas.pixels(place)
+    x, y = canvas.layout.pixel(place)
     mean = types.Float2(types.Float(x) + 0.5, types.Float(y) + 0.5)
     peaks = Peaks(mean, gather_run(types, colors, place, channels, True), image, rank)
     dr.eval(peaks)

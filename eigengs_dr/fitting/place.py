@@ -29,8 +29,8 @@ from ..backend.types import Doubles, Float, Singles
 from ..gaussian.covariance import factor_from_covariance
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..raster.binning.tiles import TILE
-from ..raster.binning.tiles import Grid as TileGrid
+from ..raster.tiles import TILE
+from ..raster.tiles import Grid as TileGrid
 from .objective import Pixels
 
 Shapes = tuple[Doubles, Doubles]

@@ -25,7 +25,7 @@ from ..image.io import check_data, check_image, read_image
 from ..image.metrics import MAX_PSNR
 from ..image.pixels import WHITE, EncodedImage, ImageError
 from ..image.space import DATA, YCBCR, Space, space_of
-from ..raster.binning.tiles import Grid
+from ..raster.tiles import Grid
 from .channels import Channels, Target, restored
 from .loss import PictureLoss
 from .measure import Measured, Row, psnrs
@@ -172,11 +172,8 @@ class Problem:
         if not self.has_maps:
             return self
         if self.channels[0].goal is not None:
-            units = [c.targets[0].unit.scale for c in self.channels]
-            coded = [c.space.has_codes(c.targets[0].pixels) for c in self.channels]
-            peaks = [1.0 if k else 1 / u for k, u in zip(coded, units, strict=True)]
             logs = np.array([c.goal for c in self.channels]) / 20 * np.log(10)
-            logs += np.log([u * p for u, p in zip(units, peaks, strict=True)])
+            logs -= np.log([c.peak for c in self.channels])
         else:
             logs = -0.5 * np.log(np.maximum(self._first_errors(count), MIN_MSE))
         factors = np.exp(logs - logs.mean()).tolist()

@@ -9,7 +9,6 @@ With the diagonal matrix H of the curvature, the normal equations are ``A^T H A 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -19,9 +18,8 @@ from ..backend.recording import record
 from ..backend.types import Float, UInt
 from ..gaussian.gaussians import Gaussians, whole
 from ..raster.adjoint import adjoint
-from ..raster.binning.lists import TileLists
-from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums, difference, image_of, sum_by_image
+from ..raster.lists import TileLists
 from ..raster.parameters import (
     detached_shape,
     gather_run,
@@ -29,6 +27,7 @@ from ..raster.parameters import (
     pack_parameters,
 )
 from ..raster.render import bin_gaussians
+from ..raster.tiles import Grid
 from .objective import Pixels, Quadratic
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
@@ -53,7 +52,7 @@ def solve(
     objective: Pixels,
     steps: int = 10,
     warm_start: bool = False,
-    background: Sequence[float] | None = None,
+    held: bool = False,
 ) -> Gaussians:
     """Find the colours and the background that fit an image best on fixed shapes.
 
@@ -71,8 +70,8 @@ def solve(
         Number of steps. Few steps regularise the colours of Gaussians that overlap strongly.
     warm_start : bool, optional
         Start from the colours and background of the set instead of zero and the mean of the image.
-    background : sequence of C floats, optional
-        The background of the result. By default the best one is found.
+    held : bool, optional
+        Whether a warm start keeps its background.
 
     Returns
     -------
@@ -95,34 +94,23 @@ def solve(
         cutoff, model, values = gaussians.cutoff, objective.model, dr.width(objective.model.target)
         lists = bin_gaussians(gaussians, images=objective.grid.images)
         shape = detached_shape(gaussians)
-        x = _first(gaussians, objective, warm_start, background)
+        types = types_of(gaussians.mean)
+        if warm_start:
+            x = whole(gaussians.color, gaussians), list(gaussians.background)
+        else:
+            color = [dr.zeros(types.Float, len(gaussians)) for _ in range(gaussians.channels)]
+            x = color, model.mean_target(objective.grid, gaussians.channels)
         dr.make_opaque(shape, x)
-        held = background is not None
         inverse, enough, state = _begin(shape, x, model, held, lists, cutoff)
         release_memory(values)  # memory of the lists and the start would stay reserved
         for _ in range(steps):
             state = _step(shape, state, model.curvature, enough, inverse, lists, cutoff)
-        (color, free), FloatX = state[0], types_of(gaussians.mean).FloatX
-        solved = replace(gaussians, color=FloatX(color), background=FloatX(free))
+        best, free = map(types.FloatX, state[0])
+        solved = replace(gaussians, color=best, background=free)
         dr.eval(solved)
         del lists
     release_memory(values)
     return solved
-
-
-def _first(
-    gaussians: Gaussians, objective: Pixels, warm: bool, background: Sequence[float] | None
-) -> Unknowns:
-    """Return the first unknowns: those of the set, or zero and the mean of each image."""
-    types = types_of(gaussians.mean)
-    if warm:
-        color, free = whole(gaussians.color, gaussians), list(gaussians.background)
-    else:
-        color = [dr.zeros(types.Float, len(gaussians)) for _ in range(gaussians.channels)]
-        free = objective.model.mean_target(objective.grid, gaussians.channels)
-    if background is not None:
-        free = [dr.opaque(types.Float, float(value)) for value in background]
-    return color, free
 
 
 @record
@@ -249,7 +237,7 @@ def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) ->
     types, grid = types_of(image), lists.grid
     tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * len(factors)
     change = gather_run(types, step, tile, length, True)
-    owner = lists.sizes.image_of(tile)
+    owner = lists.layout.image_of(tile)
     factors = [spread(f, owner) for f in factors]
     added = [c * f for c, f in zip(change, factors * grid.pixels, strict=True)]
     add, alone = dr.ReduceOp.Add, dr.ReduceMode.NoConflicts

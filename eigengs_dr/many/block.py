@@ -259,7 +259,7 @@ def _start(task: BlockTask, objective: Pixels, settings: BlockSettings) -> tuple
     placed = _set_of(unset | task.arrays, objective.size, settings.space, settings).bounded()
     if "color" not in task.arrays:
         steps = settings.options.method.solve_steps
-        placed = solve(placed, objective, steps, background=settings.background)
+        placed = solve(placed, objective, steps, warm_start=True, held=True)
     return objective, placed
 
 

@@ -25,10 +25,10 @@ def roomy(count=COUNT // 2, channels=3):
     return Scene(*(a.astype(np.float32).astype(float) for a in arrays))
 
 
-def solve(gaussians, image, steps=10, warm_start=False, background=None, weight=None):
+def solve(gaussians, image, steps=10, warm_start=False, held=False, weight=None):
     """The solve for an image (H, W, C) in the space of the set, with weights."""
     objective = objective_for(gaussians, image, weight)
-    return solve_objective(gaussians, objective, steps, warm_start, background)
+    return solve_objective(gaussians, objective, steps, warm_start, held)
 
 
 def best_colors(scene, image, weight=None, cutoff=3.0):
@@ -75,11 +75,10 @@ def test_least_squares(backend, channels, steps):
     check_equal(gaussians, scene._asdict())
 
 
-@pytest.mark.parametrize("cutoff", [2.0, 9.0])
-def test_cutoffs(backend, cutoff):
+def test_another_cutoff(backend):
     scene, image = roomy(), noise()
-    solution = solve(replace(scene.on(backend), cutoff=cutoff), image, steps=40)
-    best, _ = best_colors(scene, image, cutoff=cutoff)
+    solution = solve(replace(scene.on(backend), cutoff=2.0), image, steps=40)
+    best, _ = best_colors(scene, image, cutoff=2.0)
     np.testing.assert_allclose(solution.to_arrays()["color"], best, atol=1e-4)
 
 
