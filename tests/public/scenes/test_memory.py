@@ -107,9 +107,18 @@ class TestLoss:
         slopes = [np.array(t.eval_1_grad(in_front(texel_centres()))) for t in (tex, exact)]
         np.testing.assert_allclose(*slopes, atol=0.02 * np.abs(slopes[1]).max())
 
-    def test_what_words_do_not_hold_stays_floats(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("factor", (1e-12, 0, 1)),  # an endless one
+            ("factor", (1e6, 0, 1)),  # a narrow one, for which a step of a mean is far
+            ("mean", (1e6, 3)),
+            ("color", (1e7, 0, 0)),  # beside its light the others would lose their bits
+        ],
+    )
+    def test_what_words_do_not_hold_stays_floats(self, tmp_path, name, value):
         arrays = gaussians().to_arrays()
-        arrays["factor"][0] = 1e-12, 0, 1
+        arrays[name][0] = value
         g = eg.Gaussians.from_arrays(**arrays, size=SIZE, space="linear", backend=backend())
         np.testing.assert_array_equal(seen(mi.load_dict(in_a_file(tmp_path, g))), seen(texture(g)))
 
