@@ -108,7 +108,7 @@ class TestFit:
             raise KeyboardInterrupt
 
         with pytest.raises(eg.Interrupted) as error:
-            model_of(PHOTOS[~LEFT_OUT], progress=stop, gaussians=24)
+            model_of(PHOTOS[~LEFT_OUT], progress=stop, gaussians=12)
         partial = error.value.result
         assert partial.psnr_held_out < model.psnr_held_out - 0.5
         assert partial.psnr_held_out == pytest.approx(real_psnr(partial), abs=0.5)
