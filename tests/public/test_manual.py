@@ -26,23 +26,6 @@ def test_figures_of_the_manual_can_be_traced(check):
     assert check["untraced"]() == []
 
 
-@pytest.mark.parametrize(
-    ("text", "traced"),
-    [
-        ("it takes 3.5 s", False),
-        ("| a | b |\n|---|---:|\n| x | 2 |", False),
-        ("it is 5.3 times closer", False),
-        ("it takes 3.5 s (2 photos,\ncommit 0a1b2c3). It is set.", True),
-        ("it takes <!-- figure: kernels.fast -->3.5 ms<!-- end -->, and $6$ dB", True),
-        ("it takes 4 GB <!-- setting --> of memory", True),
-        ("<!-- table: a.b -->\n\n| a | b |\n|---|---:|\n| x | 2 |\n\n<!-- end -->", True),
-        ("```sh\nfit photo.jpg  # 36 dB\n```\n16 bits, 3 x 3 pixels, 24 photos, min(k, 2)", True),
-    ],
-)
-def test_what_a_traced_figure_is(check, text, traced):
-    assert (check["untraced_in"](text) == []) == traced
-
-
 def test_links_of_pages_work_in_a_checkout(check):
     assert check["broken"]() == []
 

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 
 import drjit as dr
 import pytest
@@ -146,13 +144,6 @@ def test_drjit_that_cannot_be_imported(tmp_path):
     assert process.stdout.count("\n") == 1
     assert "libatomic.so.1" in process.stdout
     assert "apt install libatomic1" in process.stdout
-
-
-def test_import_where_standard_error_is_closed():
-    """As in some daemons."""
-    code = "import os; os.close(2); import eigengs_dr as eg; print(eg.render.__name__)"
-    found = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert (found.returncode, found.stdout) == (0, "render\n")
 
 
 def test_a_mitsuba_for_another_drjit_is_explained(tmp_path):

@@ -98,24 +98,6 @@ def test_calls_wait_for_the_block_of_another_thread():
     assert sorted(done) == sorted(CALLS)
 
 
-EAGER_THREADS = """
-import sys, threading
-import eigengs_dr as eg
-from _helpers.command import smooth_pixels
-
-def fits():
-    for _ in range(6):
-        eg.fit(smooth_pixels(32, 32), 40, iterations=3, progress=False)
-
-sys.setswitchinterval(1e-6)
-threads = [threading.Thread(target=fits, daemon=True) for _ in range(2)]
-for thread in threads:
-    thread.start()
-for thread in threads:
-    thread.join()
-print("whole")
-"""
-
 LITTER = """
 import gc
 import drjit as dr
@@ -162,8 +144,6 @@ print("whole")
 """
 
 PROGRAMS = {
-    # Python changes threads as often as it may, as it does once a minute on a loaded machine.
-    "threads that drop results": EAGER_THREADS,
     # Dr.Jit 1.5 ends the process if an array that shares NumPy's memory is freed in a recording.
     "garbage in cycles": LITTER,
     # Dr.Jit 1.5 ends the process where it replays a kernel that was compiled again.

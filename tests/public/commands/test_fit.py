@@ -218,11 +218,8 @@ def test_levels(photo, tmp_path):
     assert np.abs(eg.load_image(out) - expected).max() < 0.003
     too_many = run("render", fitted, "-o", out, "--first", 65)
     assert_refused(too_many, "--first is 65; the file has 64 Gaussians")
-
     succeeded(run(*base, "--levels", "16,40,64", "--report", report))
     assert read(report)["levels"] == [16, 40, 64]
-    succeeded(run("pack", fitted, "-o", small, "--levels", "16,40,64"))
-    assert json.loads(said("info", small, "--json"))["sections"] == [16, 24, 24]
     assert_refused(run("pack", fitted, "-o", small, "--levels", "16,40"), "levels 16, 40")
 
 

@@ -69,19 +69,6 @@ def test_target_psnr(tmp_path):
     assert len({len(line) for line in table}) == 1
 
 
-@pytest.mark.slow
-def test_options(trained, tmp_path):
-    expected = {"energy": 0.5, "space": "rgb", "seed": 3, "preset": "eigengs", "iterations": 2}
-    options = [word for name, value in expected.items() for word in (f"--{name}", value)]
-    outputs = ["-o", tmp_path / "m.npz", "--report", tmp_path / "m.json", "--quiet"]
-    size = ["--size", "16x16", "--components", "6,5,4"]
-    assert said("train", trained[0] / "photos", *outputs, *size, *options) == ""
-    report = json.loads((tmp_path / "m.json").read_text())
-    expected |= {"gaussians": 256, "most_components": [6, 5, 4]}  # one Gaussian per pixel
-    assert {key: report[key] for key in expected} == expected
-    assert max(report["components"]) < 6
-
-
 MISTAKES = [
     (["--gaussians", 1025, "--size", "32x32"], "gaussians is 1025"),
     (["--components", "3,4"], "3,4: expected a number above 0, or three such as 230,60,60"),

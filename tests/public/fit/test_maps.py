@@ -57,12 +57,13 @@ def test_one_map_of_one_channel_and_data_above_1():
     assert np.abs(result.image["height"] - height).mean() < 0.1
 
 
-def test_equal_channels_of_data_become_one_and_spaces_are_the_users():
+def test_equal_channels_of_data_become_one_and_spaces_are_of_names_or_the_users():
     grey = np.repeat(images()["roughness"], 3, axis=2)
     glow = eg.Map(images()["albedo"], space="rgb")
-    result = eg.fit({"roughness": grey, "albedo": grey, "glow": glow}, 30, iterations=0)
+    maps = {"Roughness": grey, "Base_Color": grey, "glow": glow}
+    result = eg.fit(maps | {"NORMAL": images()["normal"]}, 30, iterations=0)
     kinds = [(m.space, m.channels) for m in result.gaussians.maps]
-    assert kinds == [("data", 1), ("linear", 3), ("rgb", 3)]
+    assert kinds == [("data", 1), ("linear", 3), ("rgb", 3), ("normal", 3)]
 
 
 def test_goals_of_maps_are_met_by_few():
@@ -87,12 +88,14 @@ def test_the_goal_of_a_fit_is_that_of_maps_without_their_own():
     assert color > 25.9 and shown["normal"] > 25.5
 
 
+@pytest.mark.slow
 def test_levels_are_materials_too():
     result = eg.fit(images(), [40, 160], iterations=40)
     level = eg.picture_of(result.gaussians[:40])
     assert eg.psnr(level["albedo"], images()["albedo"]) > 22
 
 
+@pytest.mark.slow
 def test_maps_by_another_method():
     result = eg.fit(images(), 60, iterations=30, method=METHODS["gaussianimage"])
     assert list(result.image) == list(images())

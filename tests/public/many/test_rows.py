@@ -88,10 +88,19 @@ def test_folders_and_patterns(photos, tmp_path):
         assert [row.name for row in rows] == ["00", "01", "02", "04"]
     with pytest.raises(ValueError, match="recursive is for a folder; the images are given one"):
         eg.fit_many([photos / "00.png"], recursive=True, **few)
+    with pytest.raises(eg.ImageError, match=r"recursive is for a folder; write \*\* into"):
+        eg.fit_many(pattern, recursive=True, **few)
     with pytest.raises(ValueError, match=r"\*\.jpg: no file matches; check the pattern"):
         eg.fit_many(str(photos / "*.jpg"), **few)
     (photos / "deep" / "04.png").rename(photos / "04.png")
     assert len(eg.fit_many(photos.rename(tmp_path / "photos[1]"), **few)) == 4
+
+
+def test_a_bound_above_an_image_leaves_it_one_gaussian_per_pixel():
+    photo = eg.sample("chelsea")[100:106, 150:156]
+    goal = eg.Goal(99, max_gaussians=100)
+    [row] = eg.fit_many([photo], target_psnr=goal, iterations=2)
+    assert (row.status, row.gaussians, row.stopped) == ("done", 36, "out of reach")
 
 
 def raise_interrupt(done, total, row):
