@@ -10,7 +10,6 @@ from _helpers.derivatives import check_gradients
 from _helpers.light import to_coded
 from _helpers.lit_models import SIZE, LitFormula, to_light
 from _helpers.lit_spheres import directions, photos
-from _helpers.packed import few_groups
 from _helpers.poster import camera, quad
 from _helpers.texture import in_front, mi, picture, texel_centres
 from _helpers.variants import in_variants
@@ -458,15 +457,6 @@ class TestTexture:
             found = picture(texture.eval_3(texel_centres(SIZE)), SIZE)
             expected = eg.picture_of(formula.model().relight(light)).clip(0, 1)
             np.testing.assert_allclose(found, to_light(expected), atol=1e-3)
-
-    @pytest.mark.slow
-    @few_groups()
-    def test_packed_models_are_read(self, formula, saved, tmp_path):
-        eg.pack(formula.model(), tmp_path / "m.egs", max_psnr_drop=0.1)
-        packed = mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "m.egs")})
-        whole = mi.load_dict({"type": "gaussian_texture", "model": saved})
-        found, expected = (picture(t.eval_3(texel_centres(SIZE)), SIZE) for t in (packed, whole))
-        np.testing.assert_allclose(found, expected, atol=0.05)
 
     def test_a_light_that_an_optimiser_spoilt_is_that_of_the_camera(self, saved):
         texture = mi.load_dict({"type": "gaussian_texture", "model": saved, "memory": "exact"})

@@ -13,7 +13,7 @@ import eigengs_dr as eg
 from _helpers.process import run_python
 from _helpers.texture import at, gaussians, mi, texture
 from _helpers.variants import in_variants, on_both
-from eigengs_dr.plugins import environment_of, follow, gaussians_of, keep_in_bounds, texture_of
+from eigengs_dr.plugins import environment_of, gaussians_of, keep_in_bounds, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -235,11 +235,6 @@ class TestMistakes:
             for function in (gaussians_of, keep_in_bounds):
                 with pytest.raises(ValueError, match=f"no {name}.mean .* mitsuba.traverse"):
                     function(parameters, name, gaussians())
-
-    def test_no_scene_to_follow_in(self):
-        sensor = mi.load_dict({"type": "perspective"})
-        with pytest.raises(TypeError, match=r"follow: scene is a .*; give a loaded one"):
-            follow(sensor, sensor)
 
     def test_none_stands_for_the_default(self):
         """It ends the process in Mitsuba."""
