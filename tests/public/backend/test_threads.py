@@ -24,12 +24,6 @@ IMAGE = smooth_pixels(32, 32)
 FEW = {"gaussians": 40, "iterations": 4}
 
 
-def assert_whole(code):
-    """Run a program that may hang, or end with its process, and prints "whole" at its end."""
-    process = run_python(code, PYTHONPATH=python_path())
-    assert process.stdout == "whole\n", process.stderr
-
-
 def test_fits_in_four_threads_have_the_bits_of_fits_one_by_one(backend):
     def fit_one(number):
         found = eg.fit(np.roll(IMAGE, number, axis=0), backend=backend, **FEW)
@@ -153,7 +147,8 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_programs_that_must_not_hang_or_end_the_process(name):
-    assert_whole(PROGRAMS[name])
+    process = run_python(PROGRAMS[name], PYTHONPATH=python_path())
+    assert process.stdout == "whole\n", process.stderr
 
 
 def test_errors_leave_the_lock_and_keep_their_type(backend):

@@ -4,20 +4,15 @@ import json
 import os
 import pty
 import signal
-import subprocess
-import sys
 import termios
 from contextlib import suppress
+from subprocess import PIPE
 
 import pytest
 
 import eigengs_dr as eg
 from _helpers.command import main, said
-from _helpers.process import python_path, run_python
-
-ENVIRONMENT = os.environ | {"PYTHONPATH": python_path()}
-
-PROGRAM = [sys.executable, "-m", "eigengs_dr"]
+from _helpers.process import python_path, run_python, start
 
 
 @pytest.mark.parametrize("command", [None, *main.commands])
@@ -70,9 +65,8 @@ main({command.split()})
 
 def test_closed_standard_error(photo, tmp_path):
     """As in a service, or after ``2>&-``: no bar is shown."""
-    words = ["fit", photo, "-o", tmp_path / "x.npz", "--gaussians", "64", "--iterations", "1"]
-    closed = ["bash", "-c", 'exec "$@" 2>&-', "", *PROGRAM, *words]
-    subprocess.run(closed, env=ENVIRONMENT, check=True, stdout=subprocess.DEVNULL)
+    words = ("fit", photo, "-o", tmp_path / "x.npz", "--gaussians", 64, "--iterations", 1)
+    assert start(*words, preexec_fn=lambda: os.close(2)).wait() == 0
     assert (tmp_path / "x.npz").exists()
 
 
@@ -84,16 +78,9 @@ def test_in_an_import(tmp_path, module, sent):
     """NumPy would blame its installation for an interrupt."""
     code = f"import os, time\nos.kill(os.getpid(), {int(sent)})\ntime.sleep(60)"
     (tmp_path / f"{module}.py").write_text(code)
-    path = {"PYTHONPATH": os.pathsep.join([str(tmp_path), python_path()])}
-    ended = subprocess.run(
-        [*PROGRAM, "info", "natural"],
-        env=os.environ | path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    expected = (130, "", "eigengs-dr: interrupted\n")
-    assert (ended.returncode, ended.stdout, ended.stderr) == expected
+    ended = start("info", "natural", folder=tmp_path, stdout=PIPE, stderr=PIPE)
+    told = ended.communicate()
+    assert (ended.returncode, *told) == (130, "", "eigengs-dr: interrupted\n")
 
 
 def test_fit_writes_the_best_so_far_and_shows_a_bar(photo, tmp_path):
@@ -102,7 +89,7 @@ def test_fit_writes_the_best_so_far_and_shows_a_bar(photo, tmp_path):
     words = ["fit", photo, *outputs, "--gaussians", 64, "--iterations", 10_000_000]
     terminal, stderr = pty.openpty()
     termios.tcsetwinsize(stderr, (24, 100))  # rows and columns
-    process = subprocess.Popen([*PROGRAM, *map(str, words)], env=ENVIRONMENT, stderr=stderr)
+    process = start(*words, stderr=stderr)
     os.close(stderr)
     shown, stopped = "", False
     with suppress(OSError):  # the terminal is closed when the process has ended

@@ -5,7 +5,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.command import SMALL, assert_refused, run, succeeded
 from _helpers.photos import random_fields
-from _helpers.process import python_path
+from _helpers.process import start
 
 LONG = (*SMALL, "--preset", "eigengs", "--iterations", 1500)
 """A training that takes seconds."""
@@ -94,11 +93,7 @@ def test_a_target_needs_held_out_images(tmp_path):
 def stop(folder, sent, *options, file="basis.npz", wait=0.5):
     """Send a signal to a training, soon after a file is in its checkpoint."""
     output = folder.parent / "m.npz"
-    words = [sys.executable, "-m", "eigengs_dr", "train", folder, "-o", output, *options]
-    environment = {**os.environ, "PYTHONPATH": python_path()}
-    with subprocess.Popen(
-        list(map(str, words)), env=environment, stderr=subprocess.PIPE, text=True
-    ) as process:
+    with start("train", folder, "-o", output, *options, stderr=subprocess.PIPE) as process:
         while process.poll() is None and not (folder.parent / "m.npz.checkpoint" / file).exists():
             time.sleep(0.005)
         time.sleep(wait)

@@ -13,15 +13,6 @@ from _helpers.photos import coffee
 from _helpers.waves import METHODS
 
 
-def test_two_colours_take_few():
-    image = np.full((SIDE, SIDE, 3), 0.4, np.float32)
-    image[:, SIDE // 2 :] = (0.9, 0.2, 0.1)
-    result = eg.fit(image, target_psnr=32, iterations=300)
-    assert result.stopped == "met"
-    assert len(result.gaussians) <= 12
-    assert eg.psnr(image, result.image) >= 32
-
-
 def test_noise_is_out_of_reach():
     """With as many parameters as the image has numbers; in at most a quarter more than twice the
     steps."""
@@ -65,31 +56,11 @@ def test_progress_counts_up_to_its_total():
     assert {"gaussians", "psnr_rgb", "psnr_ycbcr", "seconds"} <= seen[-1][2].keys()
 
 
-def test_interrupted_while_it_settles_it_keeps_the_goal_with_fewer():
-    """Also by an error, as in a thread or at a second Ctrl-C."""
-    whole = eg.fit(picture(), target_psnr=28, iterations=200)
-    assert whole.stopped == "met"
-    best = [row["gaussians"] for row in whole.trace if row["psnr_rgb"] >= 28]
+def interrupted(image, when, **options):
+    """What a search of 200 steps returns after the press of Ctrl-C."""
 
     def press(iteration, iterations, row):
-        if row["psnr_rgb"] >= 28:  # the search has met its goal, and settles
-            raise KeyboardInterrupt
-
-    with pytest.raises(eg.Interrupted) as interruption:
-        eg.fit(picture(), target_psnr=28, iterations=200, progress=press)
-    found = interruption.value.result
-    assert found.stopped == "interrupted"
-    assert found.iterations < whole.iterations
-    assert len(found.gaussians) <= best[0]
-    assert found.psnr_rgb >= 28
-    assert found.psnr_rgb == pytest.approx(eg.psnr(picture(), found.image), abs=1e-3)
-
-
-def interrupted(image, step, **options):
-    """What a search of 200 steps returns after the press of Ctrl-C at a step."""
-
-    def press(iteration, iterations, row):
-        if iteration == step:
+        if when(iteration, row):
             signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(eg.Interrupted) as interruption:
@@ -97,15 +68,29 @@ def interrupted(image, step, **options):
     return interruption.value.result
 
 
+def test_interrupted_while_it_settles_it_keeps_the_goal_with_fewer():
+    whole = eg.fit(picture(), target_psnr=28, iterations=200)
+    assert whole.stopped == "met"
+    best = [row["gaussians"] for row in whole.trace if row["psnr_rgb"] >= 28]
+    found = interrupted(picture(), lambda step, row: row["psnr_rgb"] >= 28, target_psnr=28)
+    assert found.stopped == "interrupted"
+    assert found.iterations < whole.iterations
+    assert len(found.gaussians) <= best[0]
+    assert found.psnr_rgb >= 28
+    assert found.psnr_rgb == pytest.approx(eg.psnr(picture(), found.image), abs=1e-3)
+
+
 @pytest.mark.parametrize("goal", [26, 28, 30])
 def test_interrupted_after_half_its_time_it_is_near_its_goal(goal):
     """The sets of its estimates may be decibels above."""
-    assert goal <= interrupted(picture(), 200, target_psnr=goal).psnr_rgb < goal + 1
+    found = interrupted(picture(), lambda step, row: step == 200, target_psnr=goal)
+    assert goal <= found.psnr_rgb < goal + 1
 
 
 def test_interrupted_it_has_no_more_than_it_may():
     """Although the fit has a surplus."""
-    found = interrupted(coffee(64), 100, target_psnr=eg.Goal(60, max_gaussians=100))
+    goal = eg.Goal(60, max_gaussians=100)
+    found = interrupted(coffee(64), lambda step, row: step == 100, target_psnr=goal)
     assert len(found.gaussians) == max(row["gaussians"] for row in found.trace) == 100
 
 

@@ -392,8 +392,6 @@ SQUARES = {"loss": squares, "size": (8, 8)}
     [
         ({"loss": squares}, "needs an image, or a loss and the size"),
         (SQUARES | {"target_psnr": 30}, "no PSNR"),
-        (SQUARES | {"gaussians": 65}, "takes 1 to 64"),
-        (SQUARES | {"space": {"a": "hsv"}}, "'hsv' is unknown"),
         (SQUARES | {"size": (8.0, 8.0)}, r"give \(width, height\) in whole pixels"),
         (SQUARES | {"gaussians": [2, 4]}, "levels are for the squared error"),
         (SQUARES | {"weight": np.ones((8, 9))}, "9x8 pixels, but size is"),
@@ -431,11 +429,6 @@ def test_parts_that_do_not_fit_are_refused(options, message):
     with pytest.raises(TypeError if options.get("target") == "x" else kind, match=message):
         eg.Loss(**{"function": squares, **options})
     assert eg.Loss(squares, bounds=np.array([0, 1])).bounds == (0, 1)
-
-
-def test_many_images_take_no_loss():
-    with pytest.raises(TypeError, match="fit_many takes no loss; call eigengs_dr"):
-        eg.fit_many([IMAGE], loss=squares)
 
 
 # --- Interruptions ------------------------------------------------------------------------------

@@ -109,7 +109,6 @@ def test_packing(tmp_path):
     packed = eg.pack(result, tmp_path / "m.egs", images(), max_psnr_drop=0.5)
     assert 0 < packed.psnr_drop <= 0.5
     result.save(tmp_path / "m.npz")
-    assert packed.bytes == (tmp_path / "m.egs").stat().st_size
     assert packed.bytes < (tmp_path / "m.npz").stat().st_size
     loaded = eg.Gaussians.load(tmp_path / "m.egs")
     assert [m[:3] for m in loaded.maps] == [m[:3] for m in result.gaussians.maps]
@@ -118,8 +117,6 @@ def test_packing(tmp_path):
         psnr = eg.psnr(picture, images()[name])
         assert psnr == pytest.approx(packed.psnr[name], abs=0.05)
         assert psnr > before[name] - 2.5  # so few Gaussians share the loss unevenly
-    eg.pack(result.gaussians["albedo"], tmp_path / "a.egs", images()["albedo"])
-    assert eg.Gaussians.load(tmp_path / "a.egs").maps == ()
     assert min(eg.pack(result, tmp_path / "n.egs").psnr.values()) > 25
     with pytest.raises(ValueError, match="has maps; give the images of albedo, roughness, normal"):
         eg.pack(result, tmp_path / "b.egs", images()["albedo"])
@@ -146,10 +143,8 @@ ROUGH, WHITE = SMALL["roughness"], SMALL["albedo"]
         ({"albedo": eg.Map(WHITE, weight="x")}, {}, "'albedo': weight is 'x'; it must be a"),
         (SMALL | {"ao": eg.Map(ROUGH, goal=30)}, {}, "map 'albedo' has no goal; give each map one"),
         ({"ao": eg.Map(ROUGH, goal=np.nan)}, {}, "map 'ao': target_psnr is nan"),
-        (SMALL, {"target_psnr": 30, "gaussians": 9}, "exclude each other"),
         (SMALL, {"space": "linear"}, "maps take no start and no space; a Map says the space"),
         (SMALL, {"weight": np.ones((8, 9))}, "map 'albedo': weight is for 9x8 pixels, but the im"),
-        (SMALL, {"method": METHODS["eigengs"]}, "this method starts from a model"),
     ],
 )
 def test_mistakes(maps, settings, words):

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import eigengs_dr as eg
-from _helpers.command import assert_refused, run
 from _helpers.errors import file_refused
 from _helpers.files import members_of
 from _helpers.materials import material
@@ -74,12 +73,6 @@ def test_materials_come_back(path):
     again = eg.Gaussians.load(path)
     assert again.maps == m.maps
     check_equal(again, m.to_arrays())
-
-
-def test_an_image_has_no_map_to_read(path):
-    material()["albedo"].save(path)
-    result = run("render", path, "-o", path.with_suffix(".png"), "--map", "albedo")
-    assert_refused(result, path, "holds one image and no maps; leave out --map")
 
 
 def test_what_cannot_be_loaded_is_not_saved(path):

@@ -230,12 +230,6 @@ def test_bounds_hold_after_any_step(backend, values):
     check_equal(bounded.bounded(), arrays)
 
 
-def test_bounds_leave_alone_what_is_inside(backend):
-    scene = random_scene()
-    scene = scene._replace(mean=np.clip(scene.mean, 0, SIZE))
-    check_equal(scene.on(backend).bounded(), arrays_of(scene))
-
-
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 def test_what_replaces_numbers_that_are_not_finite(backend, value):
     """A mean by the middle, a factor by its bound, a colour by 0."""

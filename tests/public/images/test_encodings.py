@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 import eigengs_dr as eg
-from _helpers.command import assert_refused, run, said
+from _helpers.command import assert_refused, run
 from _helpers.errors import refused
 from _helpers.light import to_coded, to_linear
 from _helpers.lit_spheres import directions, photos
@@ -98,19 +98,6 @@ def test_codes_under_lights_are_named(codes):
         eg.Relightable.fit(np.rint(255 * codes), LIGHTS, **SMALL)
     with refused(ValueError, "encoding 'light'"):
         eg.Relightable.fit(codes, LIGHTS, encoding="light", **SMALL)
-
-
-def test_linear_integers_are_light_on_the_command_line(codes, tmp_path):
-    lines = [str(len(LIGHTS))]
-    for k, direction in enumerate(LIGHTS):
-        whole = np.rint(65535 * to_linear(codes[k])) / 65535
-        eg.save_image(tmp_path / f"{k}.tif", whole, bits=16)
-        lines.append(f"{k}.tif " + " ".join(map(str, direction)))
-    (tmp_path / "dirs.lp").write_text("\n".join(lines))
-    few = ["--gaussians", "100", "--components", "8", "--iterations", "30", "--encoding", "linear"]
-    said("train", tmp_path, "-o", tmp_path / "m.npz", "--lights", tmp_path / "dirs.lp", *few)
-    model = eg.Relightable.load(tmp_path / "m.npz")
-    assert np.abs(shown(model) - codes[3]).mean() < 0.02
 
 
 @pytest.mark.parametrize("kind", ["one tensor", "bitmaps"])

@@ -24,7 +24,6 @@ def nested(depth, start="[", end="]"):
 DEEP = {
     "lists": nested(100_000),
     "objects": nested(100_000, '{"a":', "}").replace(":}", ":1}"),
-    "a value of a row": f'{{"status": "done", "name": "p0", "options": {nested(800)}}}',
     "an option": f'{{"settings": {{"seed": {nested(800)}}}, "files": ["a"]}}',
     "an address": f'{{"address": {nested(800)}}}',
 }

@@ -205,14 +205,6 @@ def test_a_smaller_picture_is_the_average_of_the_native_one(backend, times):
     assert errors[0] < 0.1 * average.std()
 
 
-@pytest.mark.parametrize("asked", [{}, {"width": SIZE[0], "height": 40}, {"width": 100}])
-def test_nothing_is_averaged_where_pixels_are_not_larger(backend, asked):
-    gaussians = random_scene(6).on(backend)
-    np.testing.assert_array_equal(
-        eg.render(gaussians, **asked), eg.render(gaussians, **asked, filter=False)
-    )
-
-
 @pytest.mark.parametrize("scale", [(1, 1), (2, 2), (0.5, 0.5), (0.25, 3)])
 def test_a_region_is_the_crop_of_the_whole(backend, scale):
     gaussians = random_scene(7, size=(24, 16)).on(backend)
