@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.recording import guest
-from eigengs_dr.backend.types import Float, Mask, UInt
+from eigengs_dr.backend.types import Float, Mask, Texture, UInt
 from eigengs_dr.gaussian.covariance import max_deviation
 from eigengs_dr.raster.evaluate import widen
 from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
@@ -31,7 +31,6 @@ from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_covariance
 from eigengs_dr.relight.directions import LatLong
 
 from .color import brightness, keep_finite, shown_channels
-from .versions import Texture
 
 RESOLVED = 0.65
 """Smallest standard deviation of a Gaussian that points resolve, in spacings of the points."""

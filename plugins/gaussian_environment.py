@@ -24,8 +24,7 @@ from . import properties
 from .color import luminance, unpolarized, upsample
 from .cone import PIXEL, no_metric
 from .emission import Spacing, emission_of, make_survey
-from .memory import resident_bytes
-from .sums import plugin_of_sums
+from .sums import plugin_of_sums, resident_bytes
 
 FAR = 1e8
 """Distance that stands for infinity where the bounds of the scene are unknown."""

@@ -10,14 +10,13 @@ import numpy as np
 
 from eigengs_dr.backend.arrays import rsqrt, upload
 from eigengs_dr.backend.recording import collector_off, guest
-from eigengs_dr.backend.types import Float, Mask
+from eigengs_dr.backend.types import Float, Mask, Texture
 from eigengs_dr.image.color import clamp, to_linear
 from eigengs_dr.relight.directions import Octahedron
 
 from . import properties
 from .color import luminance, unpolarized, upload_table, upsample
 from .gaussian_texture import gaussian_texture
-from .versions import Texture
 
 GRID = Octahedron(32)
 """Directions on which factors of planes are tabulated."""

@@ -19,8 +19,8 @@ import numpy as np
 
 from eigengs_dr.backend.arrays import indices_of, scope, upload
 from eigengs_dr.backend.types import Bool, Float, Record
-from eigengs_dr.raster.binning.lists import TileLists
 from eigengs_dr.raster.evaluate import inverted
+from eigengs_dr.raster.lists import TileLists
 from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.coding import Coding, encode_rows
 from eigengs_dr.raster.lookup.footprint import bound_covariance

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from functools import cache, partial
+from operator import methodcaller
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +15,6 @@ from eigengs_dr.backend.recording import keep_objects
 from .gaussian_environment import gaussian_environment
 from .gaussian_relightable import gaussian_relightable
 from .gaussian_texture import gaussian_texture
-from .versions import register
 
 PLUGINS: dict[str, tuple[str, Callable[[], type]]] = {
     "gaussian_texture": ("texture", gaussian_texture),
@@ -72,3 +73,37 @@ def _refuse(name: str, props: mi.Properties) -> None:
         f"{name} does not support the variant {mi.variant()}; "
         "use mi.set_variant('llvm_ad_rgb') or another variant of llvm, cuda or metal"
     )
+
+
+def register(kind: str, name: str, create: Callable[[mi.Properties], Any]) -> None:
+    """Register a plugin ("texture", "emitter" or "bsdf") with the current variant."""
+    getattr(mi, f"register_{kind}")(name, reason_first(create))
+
+
+_ended: Generator[None] = (_ for _ in ())
+_ended.close()  # its method `throw` raises an error, and adds no traceback
+
+
+def reason_first(create: Callable[[mi.Properties], Any]) -> type:
+    """Return a class that calls `create` and raises its errors without a traceback.
+
+    Mitsuba prints an error of a plugin as nanobind does: the traceback, then what went wrong. Every
+    Python function that an error passes adds to the traceback. So `__new__` returns the error, and
+    ``__init__``, which runs no Python code, raises it.
+    """
+
+    class Created:
+        made = create
+
+        def __new__(cls, props: mi.Properties) -> Any:
+            try:
+                return create(props)
+            except Exception as error:
+                refusal = object.__new__(cls)
+                refusal.end = partial(_ended.throw, error.with_traceback(None))
+                return refusal
+
+        end: Callable[[], None]
+        __init__ = property(methodcaller("end"))
+
+    return Created

@@ -25,8 +25,8 @@ from ..backend.doors import check_fields
 from ..backend.recording import record
 from ..backend.types import Bool, Float, Rows, UInt
 from ..gaussian.gaussians import Gaussians, concatenate, take, whole
-from ..raster.binning.lists import TileLists
 from ..raster.kernels import channel_sums, sum_by_image
+from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape
 from ..raster.render import bin_gaussians, to_tiles
 from .objective import Part, Pixels, Quadratic

@@ -19,8 +19,8 @@ from ..backend.arrays import ArrayTypes, make_divisor, types_of, upload
 from ..backend.types import Float, FloatLike, Mask, UInt
 from ..gaussian.gaussians import Gaussians, take, whole
 from ..raster.adjoint import adjoint_pieces, sum_pieces
-from ..raster.binning.lists import TileLists
 from ..raster.kernels import sum_lanes
+from ..raster.lists import TileLists
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import bin_gaussians
 from .method import Method

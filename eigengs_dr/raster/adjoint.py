@@ -6,11 +6,11 @@ import drjit as dr
 
 from ..backend.arrays import types_of
 from ..backend.types import Float, FloatLike, Mask, UInt
-from .binning.lists import Pieces, TileLists
-from .binning.tiles import granularity_of
 from .evaluate import weights, weights_vjp
 from .kernels import shares_of
+from .lists import Pieces, TileLists
 from .parameters import NUM_SHAPE_PARAMS, gather_index, gather_run, unpack_parameters
+from .tiles import granularity_of
 
 
 def adjoint(

@@ -16,10 +16,10 @@ import drjit as dr
 
 from ..backend.arrays import ArrayTypes, in_pairs, types_of
 from ..backend.types import Float, UInt
-from .binning.lists import TileLists
-from .binning.tiles import Grid, granularity_of
 from .evaluate import weights
+from .lists import TileLists
 from .parameters import NUM_SHAPE_PARAMS, gather_index, gather_run, unpack_parameters
+from .tiles import Grid, granularity_of
 
 
 class _Blocks(NamedTuple):

@@ -21,9 +21,8 @@ from ..gaussian.covariance import add_variances
 from ..gaussian.file import MAX_CUTOFF, Region, check_index_range, check_region
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
 from .adjoint import adjoint
-from .binning.lists import TileLists, build_lists, update_exact_exp
-from .binning.tiles import TILE, Grid
 from .kernels import channel_sums, forward
+from .lists import TileLists, build_lists, update_exact_exp
 from .parameters import (
     EXP2_SCALE,
     KernelParameters,
@@ -33,6 +32,7 @@ from .parameters import (
     kernel_shape,
     pack_parameters,
 )
+from .tiles import TILE, Grid
 
 
 @door

@@ -19,8 +19,8 @@ import drjit as dr
 from ...backend.arrays import ArrayTypes, make_divisor
 from ...backend.recording import record
 from ...backend.types import Float, Rows, UInt
-from ...raster.binning.tiles import TILE, Grid, TileLayout
 from ...raster.parameters import gather_run
+from ...raster.tiles import TILE, Grid, TileLayout
 from ..solve import for_channels
 
 SIDE = TILE[0]

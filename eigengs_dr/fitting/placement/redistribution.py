@@ -26,8 +26,8 @@ from ...backend.arrays import rcp, types_of
 from ...backend.recording import record
 from ...backend.types import Float, Singles
 from ...gaussian.gaussians import Gaussians, whole
-from ...raster.binning.lists import TileLists
 from ...raster.kernels import image_of, sum_by_image
+from ...raster.lists import TileLists
 from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ...raster.render import batch_to_tiles, bin_gaussians
 from ..objective import Pixels, Quadratic

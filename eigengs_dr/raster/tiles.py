@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
-from ...backend.types import Bool, Float, FloatLike, UInt
+from ..backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
+from ..backend.types import Bool, Float, FloatLike, UInt
 
 
 class Granularity(NamedTuple):

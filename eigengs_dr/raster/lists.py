@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
-from ...backend.arrays import ArrayTypes, make_divisor, sorting_index, types_of, upload
-from ...backend.recording import record
-from ...backend.types import Bool, FloatLike, UInt
-from ..evaluate import is_steep
+from ..backend.arrays import ArrayTypes, make_divisor, sorting_index, types_of, upload
+from ..backend.recording import record
+from ..backend.types import Bool, FloatLike, UInt
+from .evaluate import is_steep
 from .tiles import (
     TILE,
     Grid,
@@ -154,7 +154,7 @@ def build_lists(
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        As for `eigengs_dr.raster.binning.tiles.tile_columns`.
+        As for `eigengs_dr.raster.tiles.tile_columns`.
     radius : float
         Cutoff in the units of the factor.
     grid : Grid
@@ -595,32 +595,14 @@ def order_lanes(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray
     ndarray of uint32, shape (lanes,)
         By window, then by descending length; packets without work are spread among the others.
     """
-    order = _descending(length, window)
+    # NumPy sorts 16 bits fastest; a longer list than that is like the longest.
+    falling = 65535 - np.minimum(length, 65535).astype(np.uint16)
+    order = np.lexsort((falling, window.astype(np.uint16))).astype(np.uint32)
     in_packets = len(order) // PACKET * PACKET
     packets = order[:in_packets].reshape(-1, PACKET)
     full = (length[packets[:, 0]] > 0) | (length[packets[:, -1]] > 0)
-    place = np.empty(len(packets), np.uint16)  # NumPy sorts 16 bits fastest
+    place = np.empty(len(packets), np.uint16)
     for kind in (full, ~full):
         place[kind] = np.linspace(0, 65535, kind.sum())
     packets = packets[np.argsort(place, kind="stable")]
     return np.concatenate([packets.ravel(), order[in_packets:]])
-
-
-def _descending(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray[np.uint32]:
-    """Return the stable order by window, then by descending length.
-
-    A counting sort. The number of keys of a window is one more than the number of entries of its
-    longest list: except for one per window, there are no more keys than entries of lists.
-    """
-    # The lanes of one window come in runs, the rows of its tiles.
-    changes = np.flatnonzero(window[1:] != window[:-1]) + 1
-    bounds = np.concatenate([[0], changes, [len(window)]])
-    owner = window[bounds[:-1]]
-    longest = np.zeros(int(owner.max()) + 1, np.int32)
-    np.maximum.at(longest, owner, np.maximum.reduceat(length, bounds[:-1]))
-    empty = np.cumsum(longest + 1, dtype=np.int32) - 1  # keys of lanes without work
-    keys = np.repeat(empty[owner], np.diff(bounds)) - length
-    starts = np.arange(len(keys) + 1, dtype=np.int32)
-    keys = keys.astype(np.int32, copy=False)
-    order: NDArray[np.int32] = transpose_pattern(keys, starts, int(empty[-1]) + 1).indices
-    return order.view(np.uint32)
