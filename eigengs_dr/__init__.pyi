@@ -6,7 +6,6 @@ from .backend.executor import ClusterError as ClusterError
 from .backend.interrupts import Interrupted as Interrupted
 from .backend.recording import exclusive as exclusive
 from .backend.selection import BackendError as BackendError
-from .codec.packing import pack as pack
 from .eigenbasis.basis import Eigenbasis as Eigenbasis
 from .eigenbasis.eigengs import EigenGS as EigenGS
 from .fitting.coarse import COARSE_TO_FINE as COARSE_TO_FINE
@@ -34,6 +33,8 @@ from .many.fit_large import LargeFit as LargeFit
 from .many.fit_large import fit_large as fit_large
 from .many.fit_many import fit_many as fit_many
 from .many.images import ImageRow as ImageRow
+from .packing.pack import load as load
+from .packing.pack import pack as pack
 from .plugins import register_plugins as register_plugins
 from .raster.render import picture_of as picture_of
 from .raster.render import render as render
@@ -70,6 +71,7 @@ __all__ = [
     "fit_many",
     "from_tensors",
     "level_counts",
+    "load",
     "load_image",
     "ms_ssim",
     "pack",

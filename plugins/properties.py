@@ -12,12 +12,12 @@ import numpy as np
 
 from eigengs_dr.backend.selection import backend_of
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.gaussian.file import MAX_CUTOFF
+from eigengs_dr.gaussian.file import LIGHTS, MAX_CUTOFF, kind_of
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
 from eigengs_dr.relight.lights import LightTable, check_table
-from eigengs_dr.relight.model import Relightable, check_brightest, holds_lights
+from eigengs_dr.relight.model import Relightable, check_brightest
 from eigengs_dr.storage.npz import BadValue
 
 from .lookup import MEMORIES, Memory
@@ -78,7 +78,7 @@ def source_of(props: mi.Properties) -> Source:
         )
     backend = backend_of(mi.variant())
     lit = given[0] == "model" and props.plugin_name() == "gaussian_texture"
-    if lit and holds_lights(path(props, "model")):
+    if lit and kind_of(path(props, "model")) == LIGHTS:
         model = Relightable.load(path(props, "model"), backend)
         return LightSource(model, np.array(props.get("light", UP), np.float32).ravel())
     if given[0] == "model":

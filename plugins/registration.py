@@ -1,8 +1,8 @@
-"""Registration of the plugins with the variants of Mitsuba, and of the objects of all scenes."""
+"""Registration of the plugins with the variants of Mitsuba."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from functools import cache, partial
 from operator import methodcaller
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend import recording
+from eigengs_dr.backend.recording import keep_objects
 
 from .gaussian_environment import gaussian_environment
 from .gaussian_relightable import gaussian_relightable
@@ -22,6 +22,9 @@ PLUGINS: dict[str, tuple[str, Callable[[], type]]] = {
     "gaussian_relightable": ("bsdf", gaussian_relightable),
 }
 """The kind of each plugin, and what makes its class for the current variant."""
+
+KINDS = ("BSDF", "Emitter", "Medium", "PhaseFunction", "Sensor", "Shape", "Texture")
+"""Classes with virtual calls; another thread may drop their objects while one renders."""
 
 
 def register_plugins() -> None:
@@ -53,13 +56,14 @@ def register_plugins() -> None:
 
 @cache  # a second callback would register everything twice
 def _follow() -> None:
-    recording.find_shared = living_objects
     mi.detail.add_variant_callback(lambda old, new: _register(new))
 
 
 @cache  # once for each variant
 def _register(variant: str) -> None:
     scalar = variant.startswith("scalar")
+    if not scalar:
+        keep_objects(getattr(mi, f"{kind}Ptr") for kind in KINDS)
     for name, (kind, create) in PLUGINS.items():
         register(kind, name, partial(_refuse, name) if scalar else create())
 
@@ -103,42 +107,3 @@ def reason_first(create: Callable[[mi.Properties], Any]) -> type:
         __init__ = property(methodcaller("end"))
 
     return Created
-
-
-# --- The objects of all scenes: another thread may drop them while one records a rendering -------
-
-KINDS = ("BSDF", "Emitter", "Medium", "PhaseFunction", "Sensor", "Shape", "Texture")
-"""Classes with virtual calls. Dr.Jit records a call for all objects of a class in the process, one
-after the other, and ends the process or reads freed memory if one is freed meanwhile. Mitsuba
-renders without Python's lock, so another thread that drops a scene does not wait for it."""
-
-NONE = 0xFFFFFFFF
-"""A number that no object has."""
-
-
-def living_objects() -> list[object]:
-    """Return the objects of all scenes of the current variant."""
-    if not mi.variant() or mi.variant().startswith("scalar"):
-        return []
-    return [one for kind in KINDS for one in _living(getattr(mi, f"{kind}Ptr"))]
-
-
-def _living(pointer: type) -> Iterator[object]:
-    """Yield the objects of a class. Dr.Jit numbers them from 1; some numbers are free."""
-
-    def known(number: int) -> object:
-        return dr.reinterpret_array(pointer, mi.UInt32(number))[0]
-
-    try:
-        known(NONE)  # raises, unless there never was an object
-        return
-    except RuntimeError:
-        number = 1
-    while True:
-        try:
-            one = known(number)
-        except RuntimeError:  # that was the last one
-            return
-        if one is not None:
-            yield one
-        number += 1

@@ -17,11 +17,11 @@ from eigengs_dr.backend.arrays import types_of, upload
 from eigengs_dr.backend.types import Record
 from eigengs_dr.eigenbasis.eigengs import EigenGS
 from eigengs_dr.gaussian.channels import slices
-from eigengs_dr.gaussian.file import file_errors
 from eigengs_dr.gaussian.gaussians import Gaussians, from_tensors, to_tensors
 from eigengs_dr.raster.parameters import EXP2_SCALE, KernelParameters
 from eigengs_dr.raster.render import decode_parameters
 from eigengs_dr.relight.model import Relightable, or_camera
+from eigengs_dr.storage.npz import file_errors
 
 from .emission import outside_of_recordings
 from .lookup import Memory, Table, list_gaussians, make_table

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.types import Arrays, Record, Singles
-from ..gaussian.file import CUTOFF, SetData, check, file_errors
+from ..gaussian.file import CUTOFF, SetData, check
 from ..gaussian.gaussians import Gaussians
 from ..image.space import FAMILY_SPACES, space_of
 from ..storage import npz
-from ..storage.npz import BadValue, Field
+from ..storage.npz import BadValue, Field, file_errors
 
 BASIS_FORMAT, BASIS_VERSION = "eigengs_dr.eigenbasis", 2
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,17 +10,19 @@ import numpy as np
 
 from ..backend.messages import printable, shown
 from ..backend.types import Arrays
+from ..codec.egs import EgsContent, is_packed, read_egs, read_egs_head, write_egs
+from ..codec.quantization import dequantize
 from ..image.color import MAX_CHANNELS
 from ..image.formats import SUFFIXES
 from ..image.space import DATA, SPACES, Space, space_of
 from ..storage import npz
-from ..storage.npz import BadValue, Field
-from . import packed
-from .channels import MAX_MAP_CHANNELS, TextureMap, check_maps, find_map
+from ..storage.npz import BadValue, Field, file_errors
+from .channels import MAX_MAP_CHANNELS, TextureMap, channel_weights, check_maps, find_map
 
 FORMAT = "eigengs_dr.gaussians"
 MATERIAL = "eigengs_dr.material"
-"""Formats of a file without maps and with maps."""
+LIGHTS = "eigengs_dr.relightable"
+"""Formats of a file without maps, with maps, and of planes with a table of lights."""
 
 VERSIONS = {FORMAT: 2, MATERIAL: 1}
 """Versions of the formats."""
@@ -202,19 +202,6 @@ def read_head(path: Path) -> tuple[int, SetData]:
     return shape[0], head._replace(space=space, maps=maps)
 
 
-@contextmanager
-def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the name of a file before error messages, about its values or of the system."""
-    try:
-        yield
-    except BadValue as error:
-        raise ValueError(printable(f"{path}: {error}")) from None
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{printable(str(path))}: no such file; check the path") from None
-    except IsADirectoryError:
-        raise IsADirectoryError(f"{printable(str(path))}: is a folder; give a file in it") from None
-
-
 def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
     """Return the format of an ``.npz`` file, its version, and its arrays."""
     if npz.format_of(path) == MATERIAL:
@@ -237,9 +224,20 @@ def _properties(members: Arrays) -> tuple[tuple[int, int], Space, float, tuple[T
     return size, DATA, cutoff, maps
 
 
+def kind_of(path: str | os.PathLike[str]) -> str:
+    """Return the format of a file that this package wrote; of a packed one, that of its content."""
+    if not is_packed(path):
+        return npz.format_of(path)
+    head = read_egs_head(path)
+    return LIGHTS if head.lights else MATERIAL if head.maps else FORMAT
+
+
 def maps_of(path: Path) -> tuple[TextureMap, ...]:
     """Return the maps of an ``.npz`` or ``.egs`` file, () for one image; errors: see `read_set`."""
-    return packed.read_head(path)[0] if packed.is_packed(path) else read_head(path)[1].maps
+    if not is_packed(path):
+        return read_head(path)[1].maps
+    with file_errors(path):
+        return _maps_in(read_egs_head(path))
 
 
 def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
@@ -290,14 +288,37 @@ def read_figures(path: Path) -> FitFigures | None:
 def read_set(path: Path, sections: int | None = None) -> SetData:
     """Read and check a set; parameters and errors as for `eigengs_dr.Gaussians.load`."""
     with file_errors(path):
-        if packed.is_packed(path):
-            data = SetData(*packed.read_set(path, sections))
+        if is_packed(path):
+            data = packed_data(read_egs(path, sections))
         elif sections is not None:
             raise BadValue("has no sections; pass sections for .egs files only")
         else:
             members = npz.read(path, *_layout_of(path))
             data = SetData({name: members[name] for name in ARRAYS}, *_properties(members))
         return check(data)
+
+
+def packed_data(content: EgsContent) -> SetData:
+    """Return the set of a packed file, in single precision; only its maps are checked."""
+    values = {**dequantize(content.all_symbols(), content.steps), "background": content.background}
+    with np.errstate(over="ignore"):
+        arrays = {name: value.astype(np.float32) for name, value in values.items()}
+    maps = _maps_in(content)
+    scale = np.array(channel_weights(maps) or 1, np.float32)
+    arrays |= {name: arrays[name] / scale for name in ("color", "background")}
+    return SetData(arrays, content.size, _known(content.space), content.cutoff, maps)
+
+
+def _maps_in(content: EgsContent) -> tuple[TextureMap, ...]:
+    """Return the maps of a packed file, or raise `BadValue` if they are invalid."""
+    return check_maps(content.maps, len(content.background)) if content.maps else ()
+
+
+def write_packed(path: str | os.PathLike[str], content: EgsContent) -> int:
+    """Write a packed file; return its number of bytes; errors as for `write_set`."""
+    with file_errors(path):
+        check(packed_data(content))
+    return write_egs(path, content)
 
 
 def check(data: SetData) -> SetData:

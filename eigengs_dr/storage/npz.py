@@ -44,6 +44,19 @@ class Field(NamedTuple):
     max_count: int = MAX_ENTRIES
 
 
+@contextmanager
+def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Put the name of a file before error messages, about its values or of the system."""
+    try:
+        yield
+    except BadValue as error:
+        raise ValueError(printable(f"{path}: {error}")) from None
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{printable(str(path))}: no such file; check the path") from None
+    except IsADirectoryError:
+        raise IsADirectoryError(f"{printable(str(path))}: is a folder; give a file in it") from None
+
+
 def write(
     path: str | os.PathLike[str],
     name: str,
@@ -176,7 +189,9 @@ def _check_format(archive: zipfile.ZipFile, name: str, version: int) -> None:
     """Raise `BadValue` for another format or version."""
     stored = str(_read_array(archive, "format", Field("U", 0)))
     if stored != name:
-        raise BadValue(f"format is {stored[:40]!r}, expected {name!r}")
+        known = stored.startswith("eigengs_dr.")
+        advice = "; eigengs_dr.load reads files of all formats" if known else ""
+        raise BadValue(f"format is {stored[:40]!r}, expected {name!r}{advice}")
     number = int(_read_array(archive, "version", Field("i8", 0)))
     if number != version:
         advice = "upgrade eigengs-dr" if number > version else "make the file again"

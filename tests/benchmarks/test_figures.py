@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from _helpers.benchmarks import lines_of, row
 from eigengs_bench import inverse, kodak, pareto, rate, stability
-from eigengs_bench.sky import psnr_without_noise
+from eigengs_bench.alike import psnr_without_noise
 
 
 @given(st.lists(st.tuples(st.floats(0.1, 9), st.one_of(st.floats(0, 50), st.just(np.nan)))))
