@@ -21,16 +21,6 @@ from .version import __version__ as __version__
 # is set.
 select_libllvm()
 
-
-# Folders that know nothing of the viewer use it through this function.
-def _make_html(value: object) -> str:
-    from .viewer.view import html_of
-
-    return html_of(value)
-
-
-messages.make_html = _make_html
-
 _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 

@@ -2,10 +2,10 @@
 
 from . import paper as paper
 from . import plugins as plugins
-from .backend.executor import ClusterError as ClusterError
 from .backend.interrupts import Interrupted as Interrupted
 from .backend.recording import exclusive as exclusive
 from .backend.selection import BackendError as BackendError
+from .cluster import ClusterError as ClusterError
 from .eigenbasis.basis import Eigenbasis as Eigenbasis
 from .eigenbasis.eigengs import EigenGS as EigenGS
 from .fitting.coarse import COARSE_TO_FINE as COARSE_TO_FINE
@@ -42,6 +42,7 @@ from .raster.render import tile_lists as tile_lists
 from .relight.model import Relightable as Relightable
 from .scene.fit_scene import fit_for_scene as fit_for_scene
 from .version import __version__ as __version__
+from .viewer.view import to_html as to_html
 from .viewer.view import view as view
 
 __all__ = [
@@ -83,6 +84,7 @@ __all__ = [
     "save_image",
     "ssim",
     "tile_lists",
+    "to_html",
     "to_tensors",
     "view",
 ]

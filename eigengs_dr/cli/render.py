@@ -114,8 +114,7 @@ def _render(
     **choices: Any,
 ) -> Path:
     """Render one set to a file, and return its name."""
-    from ..gaussian.file import LIGHTS, kind_of, read_map
-    from ..gaussian.region import check_region
+    from ..gaussian.file import LIGHTS, check_region, kind_of, read_map
     from ..image.formats import TIFF_SUFFIXES
     from ..many.draw import save_region
 

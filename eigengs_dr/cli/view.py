@@ -106,5 +106,4 @@ def _load(
         gaussians = eg.Gaussians.from_data(set_file.read_map(file, name, "--map"), backend)
         if levels is not None:
             return gaussians, eg.level_counts(len(gaussians), levels)
-    has_levels = len(sections) > 1 and not set_file.maps_of(file)
-    return gaussians, list(accumulate(sections)) if has_levels else []
+    return gaussians, list(accumulate(sections)) if len(sections) > 1 else []

@@ -51,22 +51,20 @@ def max_deviation(a: Floats, b: Floats, c: Floats) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(middle + root), np.float64)
 
 
-def outline(factor: Floats, points: int = 25) -> NDArray[np.float64]:
+def outline(factor: Floats) -> NDArray[np.float64]:
     """Return points of the ellipses at one standard deviation, relative to the mean.
 
     Parameters
     ----------
     factor : ndarray, shape (N, 3)
         a, b, c.
-    points : int, optional
-        Number of points per Gaussian; the last point repeats the first.
 
     Returns
     -------
-    ndarray of float64, shape (N, points, 2)
-        x, y with ``|F (x, y)| = 1``; not finite if a or c is zero.
+    ndarray of float64, shape (N, 25, 2)
+        x, y with ``|F (x, y)| = 1``, the first point twice; not finite if a or c is zero.
     """
-    turn = np.linspace(0, 2 * np.pi, points)
+    turn = np.linspace(0, 2 * np.pi, 25)
     a, b, c = np.asarray(factor, np.float64).T[:, :, None]
     with np.errstate(all="ignore"):
         y = np.sin(turn) / c

@@ -78,7 +78,7 @@ def load(path: PathLike, backend: str | None = None) -> Content:
     >>> type(eg.load("natural")).__name__
     'EigenGS'
     """
-    file = SHIPPED.get(os.fspath(path), path)
+    file = SHIPPED.get(str(path), path)
     kind = kind_of(file)
     if kind not in READERS:
         raise ValueError(f"{file}: format is {kind[:40]!r}, expected one of {', '.join(READERS)}")

@@ -18,9 +18,8 @@ from ..backend.doors import door
 from ..backend.types import Float, FloatLike, Tensor, UInt, Values
 from ..gaussian.channels import slices
 from ..gaussian.covariance import add_variances
-from ..gaussian.file import MAX_CUTOFF, check_index_range
+from ..gaussian.file import MAX_CUTOFF, Region, check_index_range, check_region
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
-from ..gaussian.region import Region, check_region
 from .adjoint import adjoint
 from .kernels import channel_sums, forward
 from .lists import TileLists, build_lists, update_exact_exp

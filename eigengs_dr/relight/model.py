@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of
 from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
-from ..backend.messages import to_html
+from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..codec.egs import is_packed, read_egs
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
-from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, packed_data
+from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats
@@ -89,7 +89,7 @@ class Relightable:
     psnr_held_out: float = float("nan")
     brightest: float = 1.0
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     @classmethod
     @shows_progress
@@ -237,11 +237,8 @@ class Relightable:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
-        data, table = self.planes.data(), self.table
-        arrays = {name: values.astype(np.float32) for name, values in data.arrays.items()}
-        arrays |= {
-            "size": np.array(data.size, np.int64),
-            "cutoff": np.array(data.cutoff, np.float64),
+        table = self.table
+        arrays = members_of(self.planes.data()) | {
             "lights": table.lights.astype(np.float32),
             "values": table.values.astype(np.float32),
             "kind": np.array(table.kind),

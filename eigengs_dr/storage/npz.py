@@ -44,6 +44,16 @@ class Field(NamedTuple):
     max_count: int = MAX_ENTRIES
 
 
+def check_values(arrays: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise `BadValue` unless arrays have these shapes, and all floats are finite."""
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise BadValue(f"{name} has shape {arrays[name].shape}, expected {shape}")
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise BadValue(f"{name} holds values that are not finite")
+
+
 @contextmanager
 def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     """Put the name of a file before error messages, about its values or of the system."""

@@ -1,11 +1,9 @@
-"""Two pixels, files that Pillow does not write, and the arrays of a file."""
+"""Files that Pillow does not write, and the arrays of a file."""
 
 import struct
 import zlib
 
 import numpy as np
-
-BYTES = np.array([[[0, 51, 102], [255, 204, 153]]], np.uint8)
 
 
 def members_of(path):
@@ -39,21 +37,15 @@ def exif(orientation):
     return b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, orientation, 0, 0)
 
 
-def tiff(width, height, bits, samples, photometric, data, compression=1):
-    """Make a TIFF of one strip by hand: tifffile writes no odd numbers of bits."""
-    tags = {256: width, 257: height, 258: None, 259: compression, 262: photometric, 273: None}
-    tags |= {277: samples, 278: height, 279: len(data)}
-    start = 8 + 2 + 12 * len(tags) + 4
-    tags[258], tags[273] = start, start + 2 * samples + 8
+def tiff(width, height, data):
+    """Make a TIFF of bytes of RGB in one strip that zlib has packed; it may lie about its size."""
+    tags = {256: width, 257: height, 258: 122, 259: 8, 262: 2, 273: 128}
+    tags |= {277: 3, 278: height, 279: len(data)}
     entries = b"".join(
-        struct.pack("<HHII", tag, 3 if tag == 258 else 4, samples if tag == 258 else 1, value)
-        if tag != 258 or samples > 2
-        else struct.pack("<HHIHH", tag, 3, samples, bits, bits)
+        struct.pack("<HHII", tag, *((3, 3) if tag == 258 else (4, 1)), value)
         for tag, value in tags.items()
     )
-    depths = struct.pack(f"<{samples}H", *[bits] * samples) + bytes(8)
-    head = b"II*\0" + struct.pack("<IH", 8, len(tags))
-    return head + entries + bytes(4) + depths + data
+    return b"II*\0" + struct.pack("<IH", 8, 9) + entries + bytes(4) + b"\x08\0" * 3 + data
 
 
 def rewrite(path, **changed):

@@ -1,13 +1,10 @@
-"""Photos to fit, folders of pictures to train on, and small settings of a training."""
+"""Photos to fit, and folders of pictures to train on."""
 
 import numpy as np
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 import eigengs_dr as eg
-
-SMALL = {"size": (32, 32), "components": 6, "gaussians": 60}
-"""Settings of a training that takes a second."""
 
 
 def random_fields(folder, count, seed=0, channels=3, size=32):

@@ -45,6 +45,13 @@ def run_python(code, seconds=200, **environment):
     )
 
 
+def start(*words, folder="", **options):
+    """Start the command line in a process of its own, which imports from a folder first."""
+    program = [sys.executable, "-m", "eigengs_dr", *map(str, words)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), python_path()])}
+    return subprocess.Popen(program, env=environment, text=True, **options)
+
+
 def python_path():
     """Return where such programs find the package and the helpers of the tests."""
     root = Path(eigengs_dr.__file__).parents[1]

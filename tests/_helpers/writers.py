@@ -99,8 +99,9 @@ def fill(folder, limit):
         if limit < 0:
             write(out)
             longest += 0 if out.is_dir() else out.stat().st_size
-        before = set(folder.rglob("*"))
+        old, before = out.read_bytes() if out.is_file() else None, set(folder.rglob("*"))
         with shortened(max(longest, 0)):
             error = refused(write, out)
+        assert old is None or out.read_bytes() == old, name
         said[name] = error, [str(path) for path in sorted({*folder.rglob("*")} - before)]
     return said

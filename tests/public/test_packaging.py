@@ -37,13 +37,6 @@ def test_in_the_root_of_a_checkout():
     assert shown.strip() == str(ROOT / "eigengs_dr" / "plugins" / "__init__.py")
 
 
-def test_all_folders_are_packages():
-    """Others would be missing in a wheel."""
-    listed = re.findall(r'^    "(eigengs_dr[\w.]*)",$', (ROOT / "pyproject.toml").read_text(), re.M)
-    made = {path.parent.relative_to(ROOT) for path in ROOT.glob("eigengs_dr/**/*.py")}
-    assert {".".join(folder.parts) for folder in made} | {"eigengs_dr.plugins"} == {*listed}
-
-
 @pytest.fixture(scope="module")
 def published(tmp_path_factory):
     """A folder with the source distribution and the wheel that is built from it."""

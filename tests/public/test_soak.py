@@ -16,6 +16,7 @@ import mitsuba as mi
 
 mi.set_variant("llvm_ad_rgb")
 eg.register_plugins()
+from _helpers.poster import camera, scene_of
 from eigengs_dr.plugins import environment_of, photo_loss, texture_of
 
 end = time.monotonic() + {seconds}
@@ -28,24 +29,13 @@ light = eg.Gaussians.from_arrays(
     [[8, 4]], [[0.3, 0, 0.3]], [[0.5] * 3], [1.0] * 3, size=(16, 8), space="radiance"
 )
 GREY = np.full((8, 8, 3), 0.5)
-CONSTANT = {{"type": "constant"}}
-FILM = {{"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb"}}
-
-
-def wall(texture, sky=CONSTANT, integrator="direct"):
-    # Load a wall that a camera sees.
-    view = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
-    bsdf = {{"type": "diffuse", "reflectance": texture}}
-    scene = {{"type": "scene", "integrator": {{"type": integrator}}, "sky": sky}}
-    scene["sensor"] = {{"type": "perspective", "film": FILM, "to_world": view}}
-    return mi.load_dict(scene | {{"wall": {{"type": "rectangle", "bsdf": bsdf}}}})
+EYE = camera([0, 0, 3], 8, pixel_format="rgb")
 
 
 def grey_wall(number):
-    # A wall with a bitmap; every other one under a sky of Gaussians.
-    bitmap = {{"type": "bitmap", "data": mi.TensorXf(GREY), "raw": True}}
-    sky = environment_of(light) if number % 2 else CONSTANT
-    return wall(bitmap, sky, ("direct", "prb", "path")[number % 3])
+    # A poster of a bitmap; every other one under a sky of Gaussians.
+    sky = {{"lamp": environment_of(light)}} if number % 2 else {{}}
+    return scene_of(EYE, integrator={{"type": ("direct", "prb", "path")[number % 3]}}, **sky)
 
 
 def fit():
@@ -61,7 +51,7 @@ def render():
 
 def scene():
     with eg.exclusive():
-        shown = wall(texture_of(results[-1].gaussians))
+        shown = scene_of(EYE, texture=texture_of(results[-1].gaussians))
         assert np.isfinite(mi.render(shown, spp=2).numpy()).all()
         loaded.extend([shown, grey_wall(counts["scene"])])
 
@@ -69,7 +59,7 @@ def scene():
 def recover():
     with eg.exclusive():
         seen = grey_wall(counts["recover"])
-    loss = photo_loss(seen, "wall.bsdf.reflectance", [GREY])
+    loss = photo_loss(seen, "poster.bsdf.reflectance", [GREY])
     found = eg.fit(loss=loss, size=(8, 8), gaussians=4, iterations=8, progress=False)
     assert np.isfinite(found.image).all()
 

@@ -24,12 +24,6 @@ IMAGE = smooth_pixels(32, 32)
 FEW = {"gaussians": 40, "iterations": 4}
 
 
-def assert_whole(code):
-    """Run a program that may hang, or end with its process, and prints "whole" at its end."""
-    process = run_python(code, PYTHONPATH=python_path())
-    assert process.stdout == "whole\n", process.stderr
-
-
 def test_fits_in_four_threads_have_the_bits_of_fits_one_by_one(backend):
     def fit_one(number):
         found = eg.fit(np.roll(IMAGE, number, axis=0), backend=backend, **FEW)
@@ -98,24 +92,6 @@ def test_calls_wait_for_the_block_of_another_thread():
     assert sorted(done) == sorted(CALLS)
 
 
-EAGER_THREADS = """
-import sys, threading
-import eigengs_dr as eg
-from _helpers.command import smooth_pixels
-
-def fits():
-    for _ in range(6):
-        eg.fit(smooth_pixels(32, 32), 40, iterations=3, progress=False)
-
-sys.setswitchinterval(1e-6)
-threads = [threading.Thread(target=fits, daemon=True) for _ in range(2)]
-for thread in threads:
-    thread.start()
-for thread in threads:
-    thread.join()
-print("whole")
-"""
-
 LITTER = """
 import gc
 import drjit as dr
@@ -162,8 +138,6 @@ print("whole")
 """
 
 PROGRAMS = {
-    # Python changes threads as often as it may, as it does once a minute on a loaded machine.
-    "threads that drop results": EAGER_THREADS,
     # Dr.Jit 1.5 ends the process if an array that shares NumPy's memory is freed in a recording.
     "garbage in cycles": LITTER,
     # Dr.Jit 1.5 ends the process where it replays a kernel that was compiled again.
@@ -173,7 +147,8 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_programs_that_must_not_hang_or_end_the_process(name):
-    assert_whole(PROGRAMS[name])
+    process = run_python(PROGRAMS[name], PYTHONPATH=python_path())
+    assert process.stdout == "whole\n", process.stderr
 
 
 def test_errors_leave_the_lock_and_keep_their_type(backend):

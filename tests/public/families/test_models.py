@@ -248,16 +248,22 @@ def test_wrong_arguments(backend):
         {"colors": "projected", "target_psnr": 20},
     ],
 )
-def test_series_are_encoded_as_images_alone(backend, options):
+def test_series_are_encoded_as_images_alone(backend, tmp_path, options):
+    """Rows have the PSNRs of the pictures, also those of files; a set without the mean is none."""
     model = small_model(backend)
     images = [*OTHERS[:3], family(1, 40, seed=4)[0][:30]]
     rows = model.encode_many(images, **options)
+    kept, again = (model.encode_many(images, tmp_path, **options) for _ in range(2))
     assert [row.status for row in rows] == ["done"] * 4
-    for row, image in zip(rows, images, strict=True):
+    for place, (row, image) in enumerate(zip(rows, images, strict=True)):
         alone, found = model.encode(image, **options), row.result
         assert (found.width, found.height) == (alone.width, alone.height)
         check_equal(found, alone.to_arrays())
         assert row.gaussians == len(alone) and row.seconds > 0
+        for space in ("rgb", "ycbcr"):
+            psnr = None if "mean" in options else eg.psnr(eg.render(found).numpy(), image, space)
+            found_psnrs = [vars(some[place])[f"psnr_{space}"] for some in (rows, kept, again)]
+            assert found_psnrs == [psnr] * 3
 
 
 def test_files_a_bad_one_and_resuming(backend, tmp_path):

@@ -5,18 +5,16 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 
 import eigengs_dr as eg
-from _helpers.command import assert_refused, run, succeeded
+from _helpers.command import SMALL, assert_refused, run, succeeded
 from _helpers.photos import random_fields
-from _helpers.process import python_path
+from _helpers.process import start
 
-SMALL = ("--size", "32x32", "--components", 6, "--gaussians", 60)
 LONG = (*SMALL, "--preset", "eigengs", "--iterations", 1500)
 """A training that takes seconds."""
 
@@ -43,7 +41,6 @@ def test_end_to_end(folder):
     # Components that are as smooth as these are rendered well by 60 splats.
     assert report["psnr_init"] == pytest.approx(report["psnr_pca"], abs=0.5)
     assert report["psnr_solved"] > report["psnr_pca"] + 5
-    assert 0 < report["pca_seconds"] <= report["seconds"]
     assert len(model.held_out) == 19
     assert model.held_out[-1] == pytest.approx(report["psnr_pca"], abs=1e-3)
     assert sorted(path.name for path in folder.parent.iterdir()) == ["m.json", "m.npz", "photos"]
@@ -55,7 +52,7 @@ def test_end_to_end(folder):
         ("--preset", "eigengs", "--iterations", 3),
         ("--frequency-aware", "yes"),
         ("--space", "rgb"),
-        ("--energy", 0.5),
+        ("--energy", 0.5, "--components", "6,5,4", "--seed", 3),
         ("--gaussians", 1024),
         ("--gaussians", 1),
     ],
@@ -67,6 +64,8 @@ def test_other_settings(folder, options):
     assert report["psnr_solved"] > report["psnr_init"] > 15 or "1" in map(str, options)
     assert report["frequency_aware"] == ("yes" in options)
     assert (report["components"][0] < 6) == ("--energy" in options)
+    assert report["most_components"] == ([6, 5, 4] if "--seed" in options else 6)
+    assert report["seed"] == (3 if "--seed" in options else 0)
 
 
 def test_images_of_other_sizes_and_unreadable_ones(folder):
@@ -79,21 +78,6 @@ def test_images_of_other_sizes_and_unreadable_ones(folder):
     assert report["images"] == 21
     assert report["psnr_solved"] > report["psnr_init"] > 15
     assert model.mean_image.shape == (3, 12, 20)
-    for path in folder.iterdir():
-        path.write_bytes(b"no picture")
-    failed = run("train", folder, "-o", folder.parent / "n.npz", *SMALL)
-    assert failed.exit_code == 2 and "none of 22 images" in failed.stderr
-    assert not list(folder.parent.glob("n.*"))
-
-
-def test_a_target_keeps_the_fewest_components(folder):
-    model = train(folder)[2]
-    counts = model.truncation_curve().counts[8].tolist()
-    target = float(model.held_out[8]) - 1e-6
-    report, _, few = train(folder, "--target-psnr", target)
-    np.testing.assert_allclose(few.held_out, model.held_out[:9], atol=1e-6)
-    assert report["psnr_pca"] == pytest.approx(target, abs=1e-3)
-    assert report["components"] == list(few.components) == counts
 
 
 def test_a_target_needs_held_out_images(tmp_path):
@@ -109,11 +93,7 @@ def test_a_target_needs_held_out_images(tmp_path):
 def stop(folder, sent, *options, file="basis.npz", wait=0.5):
     """Send a signal to a training, soon after a file is in its checkpoint."""
     output = folder.parent / "m.npz"
-    words = [sys.executable, "-m", "eigengs_dr", "train", folder, "-o", output, *options]
-    environment = {**os.environ, "PYTHONPATH": python_path()}
-    with subprocess.Popen(
-        list(map(str, words)), env=environment, stderr=subprocess.PIPE, text=True
-    ) as process:
+    with start("train", folder, "-o", output, *options, stderr=subprocess.PIPE) as process:
         while process.poll() is None and not (folder.parent / "m.npz.checkpoint" / file).exists():
             time.sleep(0.005)
         time.sleep(wait)
@@ -168,14 +148,6 @@ def test_a_stopped_training_goes_on_with_the_same_bits(whole, stopped):
     assert json.loads((stopped / "m.json").read_text())["resumed"]
     assert_same_models(whole / "m.npz", stopped / "m.npz")
     assert not (stopped / "m.npz.checkpoint").exists()
-
-
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signal")
-def test_a_killed_training_goes_on_with_the_same_bits(whole, folder):
-    assert stop(folder, signal.SIGKILL, *LONG)[0] == -signal.SIGKILL
-    succeeded(go_on(folder.parent))
-    assert_same_models(whole / "m.npz", folder.parent / "m.npz")
-    assert sorted(os.listdir(folder.parent)) == ["m.npz", "photos"]
 
 
 def test_other_settings_than_the_checkpoint_are_refused(stopped):

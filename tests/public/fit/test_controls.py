@@ -86,15 +86,6 @@ def test_a_redistribution_places_all_anew():
     assert found.psnr_rgb > plain.psnr_rgb
 
 
-@pytest.mark.slow
-def test_chosen_gaussians_stay_where_they_fit():
-    """Where half of the set has no error, no redistribution is better."""
-    start = eg.fit(PHOTO, 150, 300, space="rgb")
-    watch, _ = watched(CONTROLS["Redistribute"], PHOTO, None, 200, start=start)
-    [(before, after)] = watch.sets
-    assert len(after) == 150 and stays(before, after).mean() > 0.7
-
-
 @pytest.mark.parametrize("factor", [1, 1000])
 def test_a_retreat_returns_where_the_error_has_risen(factor):
     """To the set at which the optimiser started, with the rates times the factor."""

@@ -57,12 +57,13 @@ def test_one_map_of_one_channel_and_data_above_1():
     assert np.abs(result.image["height"] - height).mean() < 0.1
 
 
-def test_equal_channels_of_data_become_one_and_spaces_are_the_users():
+def test_equal_channels_of_data_become_one_and_spaces_are_of_names_or_the_users():
     grey = np.repeat(images()["roughness"], 3, axis=2)
     glow = eg.Map(images()["albedo"], space="rgb")
-    result = eg.fit({"roughness": grey, "albedo": grey, "glow": glow}, 30, iterations=0)
+    maps = {"Roughness": grey, "Base_Color": grey, "glow": glow}
+    result = eg.fit(maps | {"NORMAL": images()["normal"]}, 30, iterations=0)
     kinds = [(m.space, m.channels) for m in result.gaussians.maps]
-    assert kinds == [("data", 1), ("linear", 3), ("rgb", 3)]
+    assert kinds == [("data", 1), ("linear", 3), ("rgb", 3), ("normal", 3)]
 
 
 def test_goals_of_maps_are_met_by_few():
@@ -87,12 +88,14 @@ def test_the_goal_of_a_fit_is_that_of_maps_without_their_own():
     assert color > 25.9 and shown["normal"] > 25.5
 
 
+@pytest.mark.slow
 def test_levels_are_materials_too():
     result = eg.fit(images(), [40, 160], iterations=40)
     level = eg.picture_of(result.gaussians[:40])
     assert eg.psnr(level["albedo"], images()["albedo"]) > 22
 
 
+@pytest.mark.slow
 def test_maps_by_another_method():
     result = eg.fit(images(), 60, iterations=30, method=METHODS["gaussianimage"])
     assert list(result.image) == list(images())
@@ -106,7 +109,6 @@ def test_packing(tmp_path):
     packed = eg.pack(result, tmp_path / "m.egs", images(), max_psnr_drop=0.5)
     assert 0 < packed.psnr_drop <= 0.5
     result.save(tmp_path / "m.npz")
-    assert packed.bytes == (tmp_path / "m.egs").stat().st_size
     assert packed.bytes < (tmp_path / "m.npz").stat().st_size
     loaded = eg.Gaussians.load(tmp_path / "m.egs")
     assert [m[:3] for m in loaded.maps] == [m[:3] for m in result.gaussians.maps]
@@ -115,8 +117,6 @@ def test_packing(tmp_path):
         psnr = eg.psnr(picture, images()[name])
         assert psnr == pytest.approx(packed.psnr[name], abs=0.05)
         assert psnr > before[name] - 2.5  # so few Gaussians share the loss unevenly
-    eg.pack(result.gaussians["albedo"], tmp_path / "a.egs", images()["albedo"])
-    assert eg.Gaussians.load(tmp_path / "a.egs").maps == ()
     assert min(eg.pack(result, tmp_path / "n.egs").psnr.values()) > 25
     with pytest.raises(ValueError, match="has maps; give the images of albedo, roughness, normal"):
         eg.pack(result, tmp_path / "b.egs", images()["albedo"])
@@ -143,10 +143,8 @@ ROUGH, WHITE = SMALL["roughness"], SMALL["albedo"]
         ({"albedo": eg.Map(WHITE, weight="x")}, {}, "'albedo': weight is 'x'; it must be a"),
         (SMALL | {"ao": eg.Map(ROUGH, goal=30)}, {}, "map 'albedo' has no goal; give each map one"),
         ({"ao": eg.Map(ROUGH, goal=np.nan)}, {}, "map 'ao': target_psnr is nan"),
-        (SMALL, {"target_psnr": 30, "gaussians": 9}, "exclude each other"),
         (SMALL, {"space": "linear"}, "maps take no start and no space; a Map says the space"),
         (SMALL, {"weight": np.ones((8, 9))}, "map 'albedo': weight is for 9x8 pixels, but the im"),
-        (SMALL, {"method": METHODS["eigengs"]}, "this method starts from a model"),
     ],
 )
 def test_mistakes(maps, settings, words):

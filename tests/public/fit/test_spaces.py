@@ -6,19 +6,8 @@ import pytest
 import eigengs_dr as eg
 from _helpers.errors import one_line
 from _helpers.families import small_model
+from _helpers.light import to_coded, to_linear
 from _helpers.waves import SPLATS, check_sound, figures, methods, picture
-
-
-def to_coded(light):
-    """sRGB codes of linear light."""
-    light = np.asarray(light, np.float64)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-
-
-def to_linear(codes):
-    """Linear light of sRGB codes."""
-    codes = np.asarray(codes, np.float64)
-    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
 
 
 def fit(image, gaussians=SPLATS, iterations=60, **options):
@@ -115,7 +104,7 @@ def test_light_above_1(light):
         assert result.gaussians.space == space
         shown = eg.render(result.gaussians).numpy()
         assert shown.max() == pytest.approx(light.max(), rel=0.1)
-        reached.append(eg.psnr(to_coded(light).astype(np.float32), result.image, "pu21"))
+        reached.append(eg.psnr(to_coded(light), result.image, "pu21"))
         assert result.psnr_ycbcr == pytest.approx(reached[-1], abs=1)
         np.testing.assert_allclose(
             result.image, to_coded(np.maximum(shown, 0)), rtol=1e-4, atol=1e-5
@@ -130,7 +119,7 @@ def test_light_above_1(light):
 def test_what_the_encoding_says(light):
     """Light is decoded once, or becomes sRGB; an array counts as sRGB."""
     dim = np.minimum(light, 1)
-    codes = to_coded(dim).astype(np.float32)
+    codes = to_coded(dim)
     for image, encoding, mean in (
         (dim, "linear", dim.mean()),
         (codes, None, dim.mean()),
@@ -145,6 +134,8 @@ def test_what_the_encoding_says(light):
     one_line(error)
     with pytest.raises(ValueError, match="encoding 'raw' is unknown"):
         fit(light, encoding="raw")
+    with pytest.raises(eg.ImageError, match="scale it first"):
+        fit(np.full((2, 2), 1e10), 4, encoding="linear")
 
 
 # --- Data in any unit ---------------------------------------------------------------------------

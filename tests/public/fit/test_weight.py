@@ -17,17 +17,6 @@ def disc():
     return np.clip(12 - np.hypot(x - 16, y - 16), 0, 1).astype(np.float32)
 
 
-def weighted_psnr(rendered, weight, space):
-    """The PSNR of squared errors with weights (H, W); rgb is that of 8 bits."""
-    pixels, weights = [], []
-    for row in range(SIDE):  # the PSNR of a part, for each pixel on its own
-        for column in np.flatnonzero(weight[row]):
-            part = np.s_[row : row + 1, column : column + 1]
-            pixels.append(10 ** (-eg.psnr(IMAGE[part], rendered[part], space) / 10))
-            weights.append(weight[row, column])
-    return -10 * np.log10(np.average(pixels, weights=weights))
-
-
 @pytest.mark.parametrize("layers", [0, pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("space", ["ycbcr", "rgb", "linear", "data"])
 def test_psnrs_are_weighted(space, layers):
@@ -39,9 +28,9 @@ def test_psnrs_are_weighted(space, layers):
     best = max(found.trace, key=lambda row: row["psnr_ycbcr"])
     assert (found.psnr_ycbcr, found.psnr_rgb) == (best["psnr_ycbcr"], best["psnr_rgb"])
     assert found.psnr_ycbcr > found.trace[0]["psnr_ycbcr"]
-    assert found.psnr_rgb == pytest.approx(weighted_psnr(found.image, disc(), "rgb"), abs=2e-3)
+    assert found.psnr_rgb == pytest.approx(eg.psnr(IMAGE, found.image, "rgb", disc()), abs=2e-3)
     if space != "data":
-        expected = weighted_psnr(found.image, disc(), "ycbcr")
+        expected = eg.psnr(IMAGE, found.image, "ycbcr", disc())
         assert found.psnr_ycbcr == pytest.approx(expected, abs=1e-3)
 
 
@@ -49,7 +38,7 @@ def test_psnrs_are_weighted(space, layers):
 def test_gaussians_go_where_the_weight_is(space):
     """The disc gains over a fit of the whole image."""
     plain, found = (eg.fit(IMAGE, space=space, weight=w, **QUICK) for w in (None, disc()))
-    gain = [weighted_psnr(r.image, disc(), "ycbcr") for r in (plain, found)]
+    gain = [eg.psnr(IMAGE, r.image, "ycbcr", disc()) for r in (plain, found)]
     assert gain[1] > gain[0] + 0.7
 
 
@@ -63,7 +52,7 @@ def test_pixels_without_weight_may_be_anything():
     for other in found[1:]:
         np.testing.assert_array_equal(other.image, found[0].image)
     assert (hidden == -7).any()  # the image of the caller stays as it is
-    assert weighted_psnr(found[0].image, disc(), "ycbcr") > 30
+    assert eg.psnr(IMAGE, found[0].image, "ycbcr", disc()) > 30
     hidden[16, 16] = np.nan  # a pixel of little weight is a pixel
     with pytest.raises(ValueError, match="not finite"):
         eg.fit(hidden, 9, 0, weight=disc())
@@ -96,7 +85,7 @@ def test_a_goal_with_weights_takes_fewer():
     few, many = (eg.fit(IMAGE, iterations=100, target_psnr=44, weight=w) for w in (disc(), None))
     assert (few.stopped, many.stopped) == ("met", "met")
     assert len(few.gaussians) < 0.8 * len(many.gaussians)
-    assert weighted_psnr(few.image, disc(), "rgb") > 43.99
+    assert eg.psnr(IMAGE, few.image, "rgb", disc()) > 43.99
 
 
 def test_levels_with_weights():
@@ -130,9 +119,7 @@ def test_data_without_weight_do_not_set_the_range():
     ("weight", "words"),
     [
         (np.zeros((SIDE, SIDE)), "weight is 0 for all pixels; at least one must count"),
-        (-np.eye(SIDE), "finite and at least 0"),
         (np.ma.masked_less(np.eye(SIDE), 1), "weight holds masked values; expected real"),
-        (np.ones(SIDE), r"weight has shape \(32,\); expected \(H, W\)"),
         ("x", "weight holds <U1; expected real numbers"),
         ([[1, 2], [3]], "weight: not an array"),
         (np.ones((SIDE, SIDE + 1)), "weight is for 33x32 pixels, but the image has shape"),

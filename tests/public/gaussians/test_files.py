@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import eigengs_dr as eg
-from _helpers.command import assert_refused, run
 from _helpers.errors import file_refused
 from _helpers.files import members_of
 from _helpers.materials import material
@@ -76,12 +75,6 @@ def test_materials_come_back(path):
     check_equal(again, m.to_arrays())
 
 
-def test_an_image_has_no_map_to_read(path):
-    material()["albedo"].save(path)
-    result = run("render", path, "-o", path.with_suffix(".png"), "--map", "albedo")
-    assert_refused(result, path, "holds one image and no maps; leave out --map")
-
-
 def test_what_cannot_be_loaded_is_not_saved(path):
     """One check decides for reading and for writing."""
     good = random_scene().on("llvm")
@@ -92,15 +85,6 @@ def test_what_cannot_be_loaded_is_not_saved(path):
         with file_refused(path, words):
             bad.save(path)
     assert not path.exists()
-
-
-@pytest.mark.parametrize("size", [(37838, 37838), (65536, 65536)])
-def test_pictures_too_large_for_indices_are_refused_in_one_line(size):
-    with pytest.raises(ValueError, match=r"has [\d,]+ values, the limit is 4,294,967,295") as found:
-        eg.render(random_scene().on("llvm"), *size)
-    message = str(found.value)
-    assert f"{size[0]}x{size[1]} pixels and 3 channels" in message
-    assert "scale it down" in message and "\n" not in message
 
 
 # --- Files made by hand -------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import eigengs_dr as eg
 from _helpers.sets import NAMES, check_equal, random_scene
 
 
-@pytest.mark.parametrize("bits", [32, 64])
+@pytest.mark.parametrize("bits", [32, pytest.param(64, marks=pytest.mark.slow)])
 def test_there_and_back(backend, bits):
     scene = random_scene()
     g = scene.on(backend, bits=bits)

@@ -40,21 +40,6 @@ def test_floats_keep_rows_columns_and_channels(dtype, tmp_path):
         np.testing.assert_array_equal(found, image.astype(np.float32))
 
 
-def test_a_fit_decodes_what_an_encoding_says():
-    """A flat image of light is fitted in codes."""
-    for image, encoding, expected in ((0.214041, "linear", 0.5), (0.3, "srgb", 0.3)):
-        pixels = np.full((32, 32, 3), image, np.float32)
-        picture = eg.fit(pixels, 4, iterations=0, encoding=encoding).image
-        np.testing.assert_allclose(picture, expected, atol=1e-3)
-
-
-def test_the_image_of_a_caller_is_not_changed():
-    image = np.random.default_rng(0).random((32, 32, 3)).astype(np.float32)
-    before = image.copy()
-    eg.fit(image, 4, iterations=1)
-    np.testing.assert_array_equal(image, before)
-
-
 @pytest.mark.parametrize(
     ("image", "complaint"),
     [
@@ -93,12 +78,3 @@ def test_masked_pixels_are_not_dropped_in_silence():
             call(masked)
     unmasked = np.ma.array(np.eye(64)[..., None])
     assert eg.psnr(unmasked, np.eye(64)[..., None]) == np.inf
-
-
-def test_light_has_a_bound_and_an_encoding_a_name():
-    with refused(eg.ImageError, "pass encoding='linear' for light"):
-        eg.fit(np.full((4, 4), 5000.0), 4, iterations=0)
-    with pytest.raises(eg.ImageError, match="scale it first"):
-        eg.fit(np.full((2, 2), 1e10), 4, iterations=0, encoding="linear")
-    with refused(ValueError, "encoding 'gamma' is unknown"):
-        eg.fit(np.ones((4, 4)), 4, iterations=0, encoding="gamma")

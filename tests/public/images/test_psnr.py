@@ -8,20 +8,12 @@ from PIL import Image
 from skimage import color, metrics
 
 import eigengs_dr as eg
+from _helpers.light import to_coded, to_linear
 
 
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)
-
-
-def linear(codes):
-    """Light of sRGB codes."""
-    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
-
-
-def coded(light):
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def pu21(light):
@@ -39,7 +31,7 @@ SPACES = {
     "rgb": lambda image: np.rint(np.clip(image, 0, 1) * 255) / 255,
     "ycbcr": lambda image: color.rgb2ycbcr(image) / 255,
     "data": lambda image: image,
-    "pu21": lambda image: pu21(linear(image)),
+    "pu21": lambda image: pu21(to_linear(image)),
 }
 """What `psnr` compares, by the space."""
 
@@ -89,7 +81,7 @@ def test_rgb_sees_eight_bits_only():
 
 def test_pu21_sees_light_above_white():
     light = np.full((4, 5, 3), 8.0)
-    codes, brighter = coded(light), coded(1.1 * light)
+    codes, brighter = to_coded(light), to_coded(1.1 * light)
     assert eg.psnr(codes, brighter, space="rgb") == np.inf  # both are white
     expected = -20 * np.log10(pu21(1.1 * light) - pu21(light))[0, 0, 0]
     assert eg.psnr(codes, brighter, space="pu21") == pytest.approx(expected)

@@ -14,7 +14,7 @@ import tifffile
 from PIL import Image
 
 import eigengs_dr as eg
-from _helpers.errors import one_line, refused
+from _helpers.errors import refused
 from _helpers.files import png
 from _helpers.process import python_path, run_python
 
@@ -63,20 +63,13 @@ def test_grey_may_stay_one_channel_and_opaque_alpha_is_no_news(tmp_path, mode, c
     np.testing.assert_array_equal(kept, np.repeat(grey[..., None], channels, axis=2) / 255)
 
 
-@pytest.mark.parametrize(
-    ("names", "words"),
-    [("Z", "holds one channel, not R, G and B"), ("RGBXYZ", "holds the channels R, G, B, X, Y, Z")],
-)
-def test_exr_files_of_other_channels(tmp_path, names, words):
-    pixels = np.zeros((2, 3, len(names)), np.float32)
-    image, path = oiio.ImageBuf(pixels), tmp_path / "a.exr"
-    image.specmod().channelnames = tuple(names)
+def test_an_exr_file_of_another_channel(tmp_path):
+    image, path = oiio.ImageBuf(np.zeros((2, 3, 1), np.float32)), tmp_path / "a.exr"
+    image.specmod().channelnames = ("Z",)
     assert image.write(str(path))
-    with pytest.raises(eg.ImageError, match=words) as error:
+    with refused(eg.ImageError, r"a\.exr: holds one channel, not R, G and B"):
         eg.load_image(path)
-    assert "a.exr" in one_line(error)
-    if names == "Z":
-        assert eg.load_image(path, keep_grey=True).shape == (2, 3, 1)
+    assert eg.load_image(path, keep_grey=True).shape == (2, 3, 1)
 
 
 # --- Names ---
@@ -166,18 +159,12 @@ def test_folders_take_images_by_their_names(tmp_path):
     for name in ("b.JPG", "a.png", "notes.txt", ".hidden.png", "c.dng", "c.JXL", "sub.png/d.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
-    few = {"gaussians": 4, "iterations": 0}
     with pytest.warns(UserWarning) as caught:
-        rows = eg.fit_many(tmp_path, **few)
+        rows = eg.fit_many(tmp_path, gaussians=4, iterations=0)
     assert [row.input.name for row in rows] == ["a.png", "b.JPG"]
     texts = [str(warning.message) for warning in caught]
     assert any(re.search(r"left out, such as sub\.png.d\.png; .*recursive=True", t) for t in texts)
     assert any(re.search(r"2 files of .* left out: c\.JXL, c\.dng", text) for text in texts)
-    with pytest.warns(UserWarning, match="left out"):
-        rows = eg.fit_many(tmp_path, recursive=True, **few)
-    assert [row.input.name for row in rows] == ["a.png", "b.JPG", "d.png"]
-    with pytest.raises(eg.ImageError, match=r"recursive is for a folder; write \*\* into"):
-        eg.fit_many(f"{tmp_path}/*.png", recursive=True, **few)
 
 
 # --- PIL images ---

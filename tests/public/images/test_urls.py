@@ -28,12 +28,6 @@ def test_a_url_is_no_path_of_an_image(reader, tmp_path):
     assert str(error.value).endswith(": is a URL; download it first, and give the file")
 
 
-def test_one_url_of_many_images_is_one_row(tmp_path):
-    [bad, good] = eg.fit_many(iter([URL, PIXELS]), gaussians=4, iterations=0)
-    assert (bad.status, good.status) == ("failed", "done")
-    assert bad.error.startswith(f"{URL}: is a URL")
-
-
 @pytest.mark.parametrize(
     "command",
     [

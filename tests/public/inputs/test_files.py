@@ -10,6 +10,7 @@ import pytest
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, succeeded
 from _helpers.process import python_path, run_python
+from _helpers.sets import check_equal
 from _helpers.writers import OUTPUTS, refused, writers
 
 QUICK = ("--gaussians", 4, "--iterations", 1, "--quiet")
@@ -23,7 +24,6 @@ def nested(depth, start="[", end="]"):
 DEEP = {
     "lists": nested(100_000),
     "objects": nested(100_000, '{"a":', "}").replace(":}", ":1}"),
-    "a value of a row": f'{{"status": "done", "name": "p0", "options": {nested(800)}}}',
     "an option": f'{{"settings": {{"seed": {nested(800)}}}, "files": ["a"]}}',
     "an address": f'{{"address": {nested(800)}}}',
 }
@@ -153,7 +153,7 @@ def test_results_of_a_folder_that_are_read_only_stay(photos, tmp_path):
 def test_what_is_changed_in_place_changes_no_later_load():
     photo, model = eg.sample("chelsea"), eg.EigenGS.load("natural")
     before = photo.copy(), [weights.copy() for weights in model.weights]
-    color = model.gaussians.to_arrays()["color"]
+    color, encoded = model.gaussians.to_arrays()["color"], model.encode(photo).to_arrays()
     for array in (photo, model.mean_image, *model.weights):
         array[...] = 0
     model.gaussians.color *= 0
@@ -161,16 +161,7 @@ def test_what_is_changed_in_place_changes_no_later_load():
     np.testing.assert_array_equal(eg.sample("chelsea"), before[0])
     assert all(np.array_equal(a, b) for a, b in zip(again.weights, before[1], strict=True))
     np.testing.assert_array_equal(again.gaussians.to_arrays()["color"], color)
-    assert again.mean_image.any()
-
-
-def test_an_encoding_follows_no_model_that_was_loaded_before():
-    photo, model = eg.sample("chelsea")[100:132, 150:182], eg.EigenGS.load("natural")
-    expected = model.encode(photo).to_arrays()["color"]
-    for weights in model.weights:
-        weights[...] = 0
-    found = eg.EigenGS.load("natural").encode(photo).to_arrays()["color"]
-    np.testing.assert_array_equal(found, expected)
+    check_equal(again.encode(eg.sample("chelsea")), encoded)
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """Folders of results: a run goes on by its files, refuses other options, survives kills."""
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 
 import eigengs_dr as eg
 from _helpers.clusters import QUICK, files_of
-from _helpers.process import run_python
 
 OTHER = {"gaussians": 10, "iterations": 0}
 
@@ -102,28 +100,6 @@ def test_a_file_that_is_no_set_is_never_replaced(photos, output, kind):
     assert not (output.parent / "new").exists()
     path.unlink()
     assert statuses(eg.fit_many(photos, output, **QUICK)).count("done") == 1
-
-
-def test_a_run_that_is_killed(photos, output):
-    """It leaves whole files alone, no lock, and what is half goes when it is old."""
-    code = f"""
-import os, eigengs_dr as eg
-def kill(done, total, row):
-    if done == 2:
-        os.kill(os.getpid(), 9)
-eg.fit_many({str(photos)!r}, {str(output)!r}, gaussians=20, iterations=2, progress=kill)
-"""
-    assert run_python(code).returncode == -9
-    assert (output / ".lock").exists()
-    half = output / ".eigengs_dr-0123456789abcdef.npz"
-    half.write_bytes(b"half")
-    os.utime(half, (0, 0))
-    partial = files_of(output)  # reads each: all are whole
-    assert {"00.npz", "01.npz"} <= set(partial)
-    rows = eg.fit_many(photos, output, **QUICK)
-    assert statuses(rows)[:2] == ["skipped", "skipped"] and "done" in statuses(rows)
-    assert [path.name for path in sorted(output.iterdir())] == list(files_of(output))
-    assert partial.items() <= files_of(output).items()
 
 
 def test_two_runs_into_one_folder(photos, output):

@@ -88,25 +88,6 @@ print(eg.paper.__name__, eg.plugins.__name__, "__version__" in dir(eg))
     assert last == "eigengs_dr.paper eigengs_dr.plugins True"
 
 
-@pytest.mark.slow
-def test_libllvm_is_chosen_before_names_are_imported_at_once():
-    """With EAGER_IMPORT, `lazy_loader` imports all names, and so Dr.Jit, with the package."""
-    code = """
-import os, sys
-chosen = []
-class Watch:
-    def find_spec(self, name, path=None, target=None):
-        if name == "drjit":
-            chosen.append(os.environ.get("DRJIT_LIBLLVM_PATH"))
-sys.meta_path.insert(0, Watch())
-import eigengs_dr
-print(chosen[0] == os.environ.get("DRJIT_LIBLLVM_PATH"), bool(chosen[0]))
-"""
-    pytest.importorskip("mitsuba", reason="all names need mitsuba")
-    process = run_python(code, EAGER_IMPORT="1", DRJIT_LIBLLVM_PATH=None)
-    assert process.stdout.split() == ["True", "True"], process.stderr
-
-
 def test_without_mitsuba_its_users_say_what_to_install():
     code = """
 import sys

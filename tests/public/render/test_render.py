@@ -99,19 +99,6 @@ def test_renderings_are_bit_equal_and_leave_the_set_as_it_was(backend):
     assert (gaussians.width, gaussians.height) == SIZE
 
 
-@few
-@given(scene=scenes())
-def test_set_split_in_two_and_summed(backend, scene):
-    gaussians = scene.on(backend)
-    first, second = gaussians[: COUNT // 2], gaussians[COUNT // 2 :]
-    together = eg.render(gaussians, cutoff=SMOOTH).numpy()
-    parts = [eg.render(g, cutoff=SMOOTH).numpy() for g in (first, second)]
-    limit = bound(scene, 1e-5)
-    assert (np.abs(sum(parts) - scene.background - together) <= limit).all()
-    joined = eg.render(eg.concatenate([first, second]), cutoff=SMOOTH).numpy()
-    assert (np.abs(joined - sum(parts)) <= limit).all()
-
-
 # --- Numbers without a place or an end ---------------------------------------------------------
 
 spoil = pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -216,14 +203,6 @@ def test_a_smaller_picture_is_the_average_of_the_native_one(backend, times):
     ]
     assert errors[0] < 0.25 * errors[1]
     assert errors[0] < 0.1 * average.std()
-
-
-@pytest.mark.parametrize("asked", [{}, {"width": SIZE[0], "height": 40}, {"width": 100}])
-def test_nothing_is_averaged_where_pixels_are_not_larger(backend, asked):
-    gaussians = random_scene(6).on(backend)
-    np.testing.assert_array_equal(
-        eg.render(gaussians, **asked), eg.render(gaussians, **asked, filter=False)
-    )
 
 
 @pytest.mark.parametrize("scale", [(1, 1), (2, 2), (0.5, 0.5), (0.25, 3)])

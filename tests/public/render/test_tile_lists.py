@@ -37,7 +37,12 @@ def step(gaussians, lists, size):
 
 
 @pytest.mark.parametrize(
-    ("size", "dtype"), [((), np.float32), ((), np.float64), ((9, 11), np.float32)]
+    ("size", "dtype"),
+    [
+        ((), np.float32),
+        pytest.param((), np.float64, marks=pytest.mark.slow),
+        ((9, 11), np.float32),
+    ],
 )
 def test_a_frozen_rendering_and_its_gradient(backend, size, dtype):
     """The bits of plain ones, in the recording, in replays, and with other values."""
