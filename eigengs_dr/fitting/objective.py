@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..backend.arrays import ArrayTypes, types_of, upload
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.channels import TextureMap
-from ..gaussian.gaussians import Gaussians, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows
 from ..image.color import exposed
 from ..image.space import DATA, Affine, Extent, Space
 from ..raster.kernels import channel_sums, forward, pixels_inside, residual
@@ -420,7 +420,9 @@ class Pixels:
     def minus(self, gaussians: Gaussians) -> Pixels:
         """Return the objective for Gaussians that are added to these, which stay as they are."""
         lists = bin_gaussians(gaussians, adjoint=False)
-        packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
+        packed = pack_parameters(
+            [*detached_shape(gaussians), *broadcast_rows(gaussians.color, gaussians)]
+        )
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
         rendering = forward(packed, background, lists, radius)
         pixel = dr.arange(self.types.UInt, dr.width(rendering)) // self.channels

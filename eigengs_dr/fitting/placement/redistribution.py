@@ -25,7 +25,7 @@ import drjit as dr
 from ...backend.arrays import rcp, types_of
 from ...backend.recording import record
 from ...backend.types import Float, Singles
-from ...gaussian.gaussians import Gaussians, whole
+from ...gaussian.gaussians import Gaussians, broadcast_rows
 from ...raster.kernels import image_of, sum_by_image
 from ...raster.lists import TileLists
 from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
@@ -144,14 +144,17 @@ def error_by_pixel(
     """
     if lists is None:
         lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    colors = whole(dr.detach(gaussians.color), gaussians), list(dr.detach(gaussians.background))
+    colors = (
+        broadcast_rows(dr.detach(gaussians.color), gaussians),
+        list(dr.detach(gaussians.background)),
+    )
     return _squares(detached_shape(gaussians), colors, objective.model, lists, gaussians.cutoff)
 
 
 def squares_by_channel(gaussians: Gaussians, objective: Pixels) -> list:
     """Return ``sum h (p - t)^2`` over the pixels for each channel, a Float (images,)."""
     lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    colors = whole(gaussians.color, gaussians), list(gaussians.background)
+    colors = broadcast_rows(gaussians.color, gaussians), list(gaussians.background)
     shape, cutoff = detached_shape(gaussians), gaussians.cutoff
     with dr.suspend_grad():
         return apply(shape, colors, lists, cutoff, objective.model)[1]
