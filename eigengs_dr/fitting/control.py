@@ -731,7 +731,7 @@ def _core(objective: Pixels, part: Part) -> Float:
     width, height = objective.size
     core = np.zeros((height, width, objective.channels), np.float32)
     core[part.core] = 1
-    return to_tiles(objective.types, core, objective.grid)
+    return to_tiles(objective.types, core)
 
 
 @record

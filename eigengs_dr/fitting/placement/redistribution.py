@@ -29,7 +29,7 @@ from ...gaussian.gaussians import Gaussians, broadcast_rows
 from ...raster.kernels import image_of, sum_by_image
 from ...raster.lists import TileLists
 from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
-from ...raster.render import batch_to_tiles, bin_gaussians
+from ...raster.render import bin_gaussians, to_tiles
 from ..objective import Pixels, Quadratic
 from ..solve import Unknowns, apply, correlate, for_channels, solve, spread
 from .adaptive import place_adaptive, planes_of, shrunk
@@ -240,8 +240,8 @@ def redistribute(
                 small = replace(gaussians, mean=mean, factor=factor, width=width, height=height)
                 parts = Owners.of(small, images)
                 less = shrunk(planes_of(error, objective.grid)[:, 0], times)
-                seen = batch_to_tiles(objective.types, less[..., None])
-            bending = batch_to_tiles(objective.types, default[..., None])
+                seen = to_tiles(objective.types, less[..., None])
+            bending = to_tiles(objective.types, default[..., None])
             return planes_of(target_density(parts, seen, bending), parts.lists.grid)[:, 0]
 
         placed = place_adaptive(objective, count, gaussians.cutoff, density, seed)
