@@ -24,7 +24,7 @@ from ..backend.arrays import make_divisor, types_of
 from ..backend.doors import check_fields
 from ..backend.recording import record
 from ..backend.types import Bool, Float, Rows, UInt
-from ..gaussian.gaussians import Gaussians, concatenate, take, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows, concatenate, take
 from ..raster.kernels import channel_sums, sum_by_image
 from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape
@@ -318,7 +318,7 @@ class Perturb:
         curvature = objective.model.mean_curvature(objective.grid, objective.channels)
         error = squares / (curvature * dr.opaque(type(squares), max(1, len(movable))))
         seed = int(np.random.SeedSequence([key, step]).generate_state(1)[0])
-        color = whole(gaussians.color, gaussians)
+        color = broadcast_rows(gaussians.color, gaussians)
         mean, factor = perturb(
             gaussians.mean, gaussians.factor, color, movable, error, strength, seed, images
         )
@@ -520,7 +520,7 @@ def _compare(gaussians: Gaussians, objective: Pixels, lists: TileLists | None) -
     if lists is None:
         lists = bin_gaussians(gaussians, images=objective.grid.images)
     shape = detached_shape(gaussians)
-    colors = whole(gaussians.color, gaussians), list(gaussians.background)
+    colors = broadcast_rows(gaussians.color, gaussians), list(gaussians.background)
     dr.eval(shape, colors)
     return _Comparison(shape, colors, lists, gaussians.cutoff, objective.model)
 
@@ -699,7 +699,7 @@ def exchange(
         # What takes their places
         peaks = scene.peaks(slope, leaving - dropped)
         pair = gaussians.mean, gaussians.factor
-        mean, factor = (type(rows)(whole(rows, gaussians)) for rows in pair)
+        mean, factor = (type(rows)(broadcast_rows(rows, gaussians)) for rows in pair)
         if dr.width(peaks.rank):
             slot = peaks.image * dr.opaque(types.UInt, leaving) + peaks.rank
             slot = dr.gather(types.UInt, moved, slot)
@@ -731,7 +731,7 @@ def _core(objective: Pixels, part: Part) -> Float:
     width, height = objective.size
     core = np.zeros((height, width, objective.channels), np.float32)
     core[part.core] = 1
-    return to_tiles(objective.types, core, objective.grid)
+    return to_tiles(objective.types, core)
 
 
 @record

@@ -17,7 +17,7 @@ import drjit as dr
 from ..backend.arrays import rcp, release_memory, types_of
 from ..backend.recording import record
 from ..backend.types import Float, UInt
-from ..gaussian.gaussians import Gaussians, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows
 from ..raster.adjoint import adjoint
 from ..raster.kernels import channel_sums, difference, image_of, sum_by_image
 from ..raster.lists import TileLists
@@ -116,7 +116,7 @@ def _first(
     """Return the first unknowns: those of the set, or zero and the mean of each image."""
     types = types_of(gaussians.mean)
     if warm:
-        color, free = whole(gaussians.color, gaussians), list(gaussians.background)
+        color, free = broadcast_rows(gaussians.color, gaussians), list(gaussians.background)
     else:
         color = [dr.zeros(types.Float, len(gaussians)) for _ in range(gaussians.channels)]
         free = objective.model.mean_target(objective.grid, gaussians.channels)

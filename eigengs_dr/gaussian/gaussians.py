@@ -383,13 +383,13 @@ def take(gaussians: Gaussians, index: UInt) -> Gaussians:
     Float = types_of(gaussians.mean).Float
 
     def pick(rows: Rows) -> Rows:
-        return type(rows)([dr.gather(Float, row, index) for row in whole(rows, gaussians)])
+        return type(rows)([dr.gather(Float, row, index) for row in broadcast_rows(rows, gaussians)])
 
     mean, factor, color = map(pick, (gaussians.mean, gaussians.factor, gaussians.color))
     return replace(gaussians, mean=mean, factor=factor, color=color)
 
 
-def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
+def broadcast_rows(rows: Rows, gaussians: Gaussians) -> list[Float]:
     """Return rows with one entry per Gaussian; a row of length 1 is broadcast."""
     return [row + dr.zeros(type(row), len(gaussians)) for row in rows]
 
@@ -432,7 +432,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         return first
 
     def join(name: str) -> Rows:
-        parts = zip(*(whole(getattr(g, name), g) for g in sets), strict=True)
+        parts = zip(*(broadcast_rows(getattr(g, name), g) for g in sets), strict=True)
         return type(getattr(first, name))([dr.concat(part) for part in parts])
 
     joined = replace(
@@ -526,7 +526,7 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     tensors = {}
     for name in FIELDS:
         rows = getattr(gaussians, name)
-        rows = settle(list(rows) if name == "background" else whole(rows, gaussians))
+        rows = settle(list(rows) if name == "background" else broadcast_rows(rows, gaussians))
         joint = dr.ravel(types.FloatX(rows), order="F")
         tensors[name] = types.Tensor(joint, (dr.width(joint) // len(rows), len(rows)))
     tensors["background"] = tensors["background"][0]

@@ -25,11 +25,11 @@ import drjit as dr
 from ...backend.arrays import rcp, types_of
 from ...backend.recording import record
 from ...backend.types import Float, Singles
-from ...gaussian.gaussians import Gaussians, whole
+from ...gaussian.gaussians import Gaussians, broadcast_rows
 from ...raster.kernels import image_of, sum_by_image
 from ...raster.lists import TileLists
 from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
-from ...raster.render import batch_to_tiles, bin_gaussians
+from ...raster.render import bin_gaussians, to_tiles
 from ..objective import Pixels, Quadratic
 from ..solve import Unknowns, apply, correlate, for_channels, solve, spread
 from .adaptive import place_adaptive, planes_of, shrunk
@@ -144,14 +144,17 @@ def error_by_pixel(
     """
     if lists is None:
         lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    colors = whole(dr.detach(gaussians.color), gaussians), list(dr.detach(gaussians.background))
+    colors = (
+        broadcast_rows(dr.detach(gaussians.color), gaussians),
+        list(dr.detach(gaussians.background)),
+    )
     return _squares(detached_shape(gaussians), colors, objective.model, lists, gaussians.cutoff)
 
 
 def squares_by_channel(gaussians: Gaussians, objective: Pixels) -> list:
     """Return ``sum h (p - t)^2`` over the pixels for each channel, a Float (images,)."""
     lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    colors = whole(gaussians.color, gaussians), list(gaussians.background)
+    colors = broadcast_rows(gaussians.color, gaussians), list(gaussians.background)
     shape, cutoff = detached_shape(gaussians), gaussians.cutoff
     with dr.suspend_grad():
         return apply(shape, colors, lists, cutoff, objective.model)[1]
@@ -237,8 +240,8 @@ def redistribute(
                 small = replace(gaussians, mean=mean, factor=factor, width=width, height=height)
                 parts = Owners.of(small, images)
                 less = shrunk(planes_of(error, objective.grid)[:, 0], times)
-                seen = batch_to_tiles(objective.types, less[..., None])
-            bending = batch_to_tiles(objective.types, default[..., None])
+                seen = to_tiles(objective.types, less[..., None])
+            bending = to_tiles(objective.types, default[..., None])
             return planes_of(target_density(parts, seen, bending), parts.lists.grid)[:, 0]
 
         placed = place_adaptive(objective, count, gaussians.cutoff, density, seed)
