@@ -11,46 +11,15 @@ from .backend import interrupts
 if interrupts.is_program():  # before the imports, which take half a second
     interrupts.end_at_signals()
 
-from pathlib import Path
-from typing import TYPE_CHECKING
-
 import lazy_loader
 
 from .backend import messages
 from .backend.selection import import_drjit, select_libllvm
-from .gaussian import packed
 from .version import __version__ as __version__
-
-if TYPE_CHECKING:
-    from .gaussian.channels import TextureMap
-    from .gaussian.file import SetData
 
 # Dr.Jit looks for libLLVM once, while it is imported; lazy_loader imports it here if EAGER_IMPORT
 # is set.
 select_libllvm()
-
-
-# Folders that know nothing of the codec and the viewer use them through these functions.
-def _make_html(value: object) -> str:
-    from .viewer.view import html_of
-
-    return html_of(value)
-
-
-def _read_packed(path: Path, sections: int | None) -> SetData:
-    from .codec.egs import read_egs
-
-    return read_egs(path, sections).set_data()
-
-
-def _packed_head(path: Path) -> tuple[tuple[TextureMap, ...], bytes]:
-    from .codec.egs import read_egs_head
-
-    return read_egs_head(path)
-
-
-messages.make_html = _make_html
-packed.read_set, packed.read_head = _read_packed, _packed_head
 
 _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

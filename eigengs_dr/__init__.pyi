@@ -2,11 +2,10 @@
 
 from . import paper as paper
 from . import plugins as plugins
-from .backend.executor import ClusterError as ClusterError
 from .backend.interrupts import Interrupted as Interrupted
 from .backend.recording import exclusive as exclusive
 from .backend.selection import BackendError as BackendError
-from .codec.packing import pack as pack
+from .cluster import ClusterError as ClusterError
 from .eigenbasis.basis import Eigenbasis as Eigenbasis
 from .eigenbasis.eigengs import EigenGS as EigenGS
 from .fitting.coarse import COARSE_TO_FINE as COARSE_TO_FINE
@@ -34,6 +33,8 @@ from .many.fit_large import LargeFit as LargeFit
 from .many.fit_large import fit_large as fit_large
 from .many.fit_many import fit_many as fit_many
 from .many.images import ImageRow as ImageRow
+from .packing.pack import load as load
+from .packing.pack import pack as pack
 from .plugins import register_plugins as register_plugins
 from .raster.render import picture_of as picture_of
 from .raster.render import render as render
@@ -41,6 +42,7 @@ from .raster.render import tile_lists as tile_lists
 from .relight.model import Relightable as Relightable
 from .scene.fit_scene import fit_for_scene as fit_for_scene
 from .version import __version__ as __version__
+from .viewer.view import to_html as to_html
 from .viewer.view import view as view
 
 __all__ = [
@@ -70,6 +72,7 @@ __all__ = [
     "fit_many",
     "from_tensors",
     "level_counts",
+    "load",
     "load_image",
     "ms_ssim",
     "pack",
@@ -81,6 +84,7 @@ __all__ = [
     "save_image",
     "ssim",
     "tile_lists",
+    "to_html",
     "to_tensors",
     "view",
 ]

@@ -13,13 +13,18 @@ except ImportError as error:
     ) from error
 
 from ..backend.messages import no_attribute
-from .cone import pixel_angle
-from .environment import bake_environment, environment_of
-from .follow import follow
-from .memory import resident_bytes
-from .parameters import gaussians_of, keep_in_bounds, material_of, texture_of
+from .cone import follow, pixel_angle
+from .parameters import (
+    bake_environment,
+    environment_of,
+    gaussians_of,
+    keep_in_bounds,
+    material_of,
+    texture_of,
+)
 from .photos import photo_loss
 from .registration import register_plugins
+from .sums import resident_bytes
 
 __all__ = [
     "bake_environment",

@@ -26,9 +26,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from eigengs_dr.backend.arrays import upload
-from eigengs_dr.backend.types import Float
-
-from .versions import Texture
+from eigengs_dr.backend.types import Float, Texture
 
 STEP = 5.0
 """Distance of the samples in nm, as in Mitsuba's tables of D65 and the matching functions. Products

@@ -22,15 +22,15 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.recording import guest
-from eigengs_dr.backend.types import Float, Mask, UInt
+from eigengs_dr.backend.types import Float, Mask, Texture, UInt
 from eigengs_dr.gaussian.covariance import max_deviation
 from eigengs_dr.raster.evaluate import widen
 from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.points import Packed, sum_at_points, value_terms
 from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_covariance
+from eigengs_dr.relight.directions import LatLong
 
 from .color import brightness, keep_finite, shown_channels
-from .versions import Texture
 
 RESOLVED = 0.65
 """Smallest standard deviation of a Gaussian that points resolve, in spacings of the points."""
@@ -87,7 +87,7 @@ def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
     """
     with dr.suspend_grad():
         table, size = dr.detach(texture.table), (texture.width, texture.height)
-        parameters = texture.parameters()
+        parameters = texture.source.parameters()
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
         dr.eval(shape, color)
         smallest = _smallest_deviation(shape, color)
@@ -226,7 +226,7 @@ def emission_of(survey: Survey, over_sphere: bool = False) -> Emission:
     """Return the distribution of emission for a survey, of a square or of a sphere."""
     density = np.maximum(survey.brightness.numpy()[..., 0], 0)
     if over_sphere:
-        density *= np.sin((np.arange(len(density)) + 0.5) * (np.pi / len(density)))[:, None]
+        density *= LatLong(*density.shape[::-1]).areas()[:, None]
     floor = DARKEST * density.mean() or 1.0
     density = np.maximum(density, floor)
     relative = density / density.mean(dtype=np.float64).astype(np.float32)

@@ -18,13 +18,13 @@ from eigengs_dr.backend.arrays import rcp
 from eigengs_dr.backend.recording import collector_off, guest
 from eigengs_dr.backend.types import Float, Mask
 from eigengs_dr.raster.lookup.points import axes_of, fold
+from eigengs_dr.relight.directions import LatLong
 
 from . import properties
 from .color import luminance, unpolarized, upsample
 from .cone import PIXEL, no_metric
 from .emission import Spacing, emission_of, make_survey
-from .memory import resident_bytes
-from .sums import plugin_of_sums
+from .sums import plugin_of_sums, resident_bytes
 
 FAR = 1e8
 """Distance that stands for infinity where the bounds of the scene are unknown."""
@@ -95,6 +95,7 @@ def gaussian_environment() -> type:
             self.m_flags = mi.EmitterFlags.Infinite | mi.EmitterFlags.SpatiallyVarying
             self.read(props, WRAP, False)
             properties.check_light(self.source.start, self.plugin)
+            self.sphere = LatLong(self.width, self.height, pole_to_pole=True)
             self.to_world = self.world_transform()
             self.scale = dr.opaque(mi.Float, properties.light_scale(props))
             properties.check_known(props)
@@ -150,29 +151,24 @@ def gaussian_environment() -> type:
 
         def _uv(self, d: mi.Vector3f) -> mi.Point2f:
             """Return the point of the picture that lies in a direction of the world."""
-            d = dr.normalize(self.to_world.inverse() @ d)
-            u = dr.atan2(d.x, -d.z) * dr.inv_two_pi
-            return mi.Point2f(u - dr.floor(u), dr.safe_acos(d.y) * dr.inv_pi)
+            return mi.Point2f(*self.sphere.uv(*dr.normalize(self.to_world.inverse() @ d)))
 
         def _direction(self, uv: mi.Point2f) -> tuple[mi.Vector3f, Float]:
             """Return the direction of a point of the picture, and the density of uv over it."""
-            (sine, cosine), (east, south) = (
-                dr.sincos(uv.y * dr.pi),
-                dr.sincos(uv.x * dr.two_pi),
-            )
-            d = self.to_world @ mi.Vector3f(east * sine, cosine, -south * sine)
-            return d, rcp(2 * dr.pi**2 * dr.maximum(sine, dr.epsilon(mi.Float)))
+            d, sine = self.sphere.direction(uv.x, uv.y)
+            area = self.sphere.area(dr.maximum(sine, dr.epsilon(mi.Float)))
+            return self.to_world @ mi.Vector3f(*d), rcp(area)
 
         def point(self, uv: mi.Point2f) -> tuple:
             """Return x and y in pixels with the slopes 1; whether uv is finite."""
             one, (wrap_x, wrap_y) = mi.Float(1), axes_of(WRAP)
             x, _ = fold(uv.x * self.width, self.width, wrap_x)
-            y, _ = fold(dr.fma(uv.y, self.height - 1, 0.5), self.height, wrap_y)
+            y, _ = fold(self.sphere.row(uv.y), self.height, wrap_y)
             return (x, one), (y, one), dr.isfinite(uv.x) & dr.isfinite(uv.y)
 
         def spans(self) -> NDArray[np.float64]:
             """Return the columns and rows of texels that the unit square of uv spans."""
-            return np.array([self.width, self.height - 1], np.float64)
+            return np.array([self.width, self.sphere.rows], np.float64)
 
         def _footprint(self, uv: mi.Point2f) -> tuple | None:
             """Return the metric of a round footprint, in widths and heights of the picture."""
@@ -183,7 +179,7 @@ def gaussian_environment() -> type:
                 return no_metric(self.label())
             sharp = rcp(PIXEL * angle)
             along = 2 * dr.pi * dr.sin(uv.y * dr.pi) * sharp
-            down = (dr.pi * self.height / (self.height - 1)) * sharp
+            down = (dr.pi * self.height / self.sphere.rows) * sharp
             return [along * along, mi.Float(0), down * down], mi.Bool(True)
 
         def _light(

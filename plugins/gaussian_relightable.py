@@ -10,17 +10,16 @@ import numpy as np
 
 from eigengs_dr.backend.arrays import rsqrt, upload
 from eigengs_dr.backend.recording import collector_off, guest
-from eigengs_dr.backend.types import Float, Mask
+from eigengs_dr.backend.types import Float, Mask, Texture
 from eigengs_dr.image.color import clamp, to_linear
-from eigengs_dr.relight.planes import directions
+from eigengs_dr.relight.directions import Octahedron
 
 from . import properties
 from .color import luminance, unpolarized, upload_table, upsample
 from .gaussian_texture import gaussian_texture
-from .versions import Texture
 
-RESOLUTION = 32
-"""Directions along each side of the octahedron on which factors of planes are tabulated."""
+GRID = Octahedron(32)
+"""Directions on which factors of planes are tabulated."""
 
 UNIFORM = 0.5
 """Share of the samples that are uniform over the hemisphere; the others go with the cosine, whose
@@ -74,7 +73,8 @@ def gaussian_relightable() -> type:
             self.scale = dr.opaque(mi.Float, properties.light_scale(props))
             self.planes = texture(planes)
             properties.check_known(props)
-            table = lights.at(directions(RESOLUTION)).reshape(RESOLUTION, RESOLUTION, -1)
+            side = GRID.resolution
+            table = lights.at(GRID.directions()).reshape(side, side, -1)
             self.factors = mi.Texture2f(
                 upload(mi.TensorXf, table.astype(np.float32)),
                 use_accel=False,
@@ -112,8 +112,8 @@ def gaussian_relightable() -> type:
                 scale *= cos_theta(wo) / dr.select(active, cos_theta(si.wi), 1)
                 towards = si.wi
             x, y = light_axes(si, self.planes)
-            light = mi.Vector3f(dr.dot(x, towards.xy), dr.dot(y, towards.xy), towards.z)
-            table = self.factors.eval(place_of(light), active)
+            light = dr.dot(x, towards.xy), dr.dot(y, towards.xy), towards.z
+            table = self.factors.eval(mi.Point2f(*GRID.uv(*light)), active)
             factors = [table[c * len(planes) : (c + 1) * len(planes)] for c in range(3)]
             codes = [sum(f * p for f, p in zip(fs, planes, strict=True)) for fs in factors]
             color = mi.Color3f(*(to_linear(clamp(code, self.brightest)) for code in codes)) * scale
@@ -200,15 +200,6 @@ def light_axes(si: mi.SurfaceInteraction3f, planes: Texture) -> tuple[mi.Vector2
 
 TINY = 1e-30
 """Square of a length that counts as 0: uv that is constant along a surface has no direction."""
-
-
-def place_of(light: mi.Vector3f) -> mi.Point2f:
-    """Return where an upper direction lies in the table, see `relight.planes.directions`."""
-    length = dr.abs(light.x) + dr.abs(light.y) + dr.maximum(light.z, 0)
-    scale = 0.5 * (RESOLUTION - 1) / RESOLUTION / dr.maximum(length, 1e-20)
-    # The first and the last direction lie at the centres of the outer texels.
-    turned = mi.Point2f(light.x + light.y, light.y - light.x)
-    return turned * scale + 0.5
 
 
 def density(wo: mi.Vector3f) -> Float:

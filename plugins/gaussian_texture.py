@@ -16,8 +16,7 @@ from .color import STEP, luminance, slope_of, upsample
 from .cone import FOOTPRINT_INPUTS, metric, no_metric
 from .emission import Emission, Survey, emission_of, make_survey, outside_of_recordings
 from .lookup import reused
-from .memory import resident_bytes
-from .sums import plugin_of_sums
+from .sums import plugin_of_sums, resident_bytes
 
 
 def gaussian_texture() -> type:

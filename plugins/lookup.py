@@ -18,9 +18,9 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.arrays import indices_of, scope, upload
-from eigengs_dr.backend.types import Bool, Float
-from eigengs_dr.raster.binning.lists import TileLists
+from eigengs_dr.backend.types import Bool, Float, Record
 from eigengs_dr.raster.evaluate import inverted
+from eigengs_dr.raster.lists import TileLists
 from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.coding import Coding, encode_rows
 from eigengs_dr.raster.lookup.footprint import bound_covariance
@@ -39,7 +39,6 @@ from eigengs_dr.raster.lookup.size_classes import SizeClasses, classify_by_size
 from eigengs_dr.raster.parameters import KernelParameters, kernel_radius
 
 from .color import keep_finite
-from .parameters import Arrays, SharedFile, derived
 
 
 @dataclass(frozen=True)
@@ -135,8 +134,8 @@ class Table:
 def make_table(
     lists: Lists,
     cutoff: float,
-    inputs: Arrays,
-    decode: Callable[[Arrays], KernelParameters],
+    inputs: Record,
+    decode: Callable[[Record], KernelParameters],
     coded_for: tuple[int, int] | None = None,
 ) -> Table:
     """Compute what lookups read; derivatives flow back to the `inputs` of `decode`.
@@ -149,13 +148,13 @@ def make_table(
         shape, size = decode(dr.detach(inputs)).shape, (sizes.width, sizes.height)
         finest = list_finest(shape, *size, kernel_radius(cutoff), derivatives)
 
-    def compute(inputs: Arrays) -> Arrays:
+    def compute(inputs: Record) -> Record:
         parameters = decode(inputs)
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
         coded = None if derivatives else coded_for
         rows, coding = _rows(cells, shape, color, bool(sizes), coded)
         background = [keep_finite(b) for b in parameters.background]
-        arrays: Arrays = {"packed": rows, "background": background}
+        arrays: Record = {"packed": rows, "background": background}
         arrays |= {"coding": coding} if coding else {}
         dr.eval(arrays)
         if sizes is not None and finest is not None:
@@ -189,26 +188,6 @@ def _rows(
         return cells.pack(*(invert(shape, color) if filtered else (shape, color))), None
     coding, words = encoded
     return cells.pack_rows(words, coding.blank), coding
-
-
-def table_of_file(
-    file: SharedFile, cutoff: float, wrap: str, filtered: bool, memory: Memory
-) -> Table:
-    """Return the table of all channels of a file; the first call for these settings makes it.
-
-    While Dr.Jit computes it, its thread may make another texture, which then is the first.
-    """
-    key = (cutoff, wrap, filtered, memory)
-    table: Table | None = file.tables.get(key)
-    if table is None:
-        parameters, size = file.parameters(), (file.like.width, file.like.height)
-        lists = list_gaussians(parameters.shape, size, *key)
-        coded_for = size if memory.coded else None
-        table = make_table(lists, cutoff, {}, lambda _: parameters, coded_for)
-        table = file.tables.setdefault(key, replace(table, lists=lists))
-        if table.packed.coding is not None:
-            file.forget_tensors()
-    return table
 
 
 class _Lookups(threading.local):
@@ -321,3 +300,63 @@ def sum_over_footprint(
     )
     sums = [dr.select(distant, f, n) for f, n in zip(far, sharp, strict=True)]
     return [dr.select(blind, m, s) for m, s in zip(table.average, sums, strict=True)]
+
+
+# ---------------------------------------------------------------------------------------------
+#  What lookups read, one operation of the graph of derivatives
+#
+#  `mitsuba.render` differentiates the renderer as one operation whose inputs are the parameters.
+#  In forward mode, the derivatives of all that textures have computed from them must be known by
+#  then. Dr.Jit walks from the parameters to the operations in the order in which these were made.
+#  So one operation, made before the rendering, must lead from the parameters to all that lookups
+#  read: of a chain of several, only the first would come before the renderer, and the derivative
+#  be 0.
+# ---------------------------------------------------------------------------------------------
+
+
+def derived(inputs: Record, compute: Callable[[Record], Record]) -> Record:
+    """Return ``compute(inputs)``; derivatives flow through one operation, in both modes.
+
+    Parameters
+    ----------
+    inputs : dict of str to TensorXf
+    compute : callable
+        Returns a dict of arrays.
+    """
+    if not dr.grad_enabled(inputs):
+        return compute(inputs)
+    return dr.custom(_Derived, inputs, compute)
+
+
+class _Derived(dr.CustomOp):
+    """The operation of `derived`: it keeps its own graph and walks it in both modes."""
+
+    def eval(self, inputs: Record, compute: Callable[[Record], Record]) -> Record:
+        """Compute the arrays; `inputs` come without their derivatives."""
+        self.inputs = {name: type(value)(value) for name, value in inputs.items()}
+        with dr.resume_grad():
+            dr.enable_grad(self.inputs)
+            self.outputs = compute(self.inputs)
+        return dr.detach(self.outputs)
+
+    def forward(self) -> None:
+        """Push the derivatives of the parameters through the graph."""
+        if "values" in self.outputs:  # loops of a pyramid, which Dr.Jit 1.5 walks backward only
+            raise RuntimeError(
+                "no forward mode of Gaussians with a prefilter; use drjit.backward, or "
+                "prefilter = 0"
+            )
+        dr.set_grad(self.inputs, self.grad_in("inputs"))
+        self.set_grad_out(self._walk(dr.ADMode.Forward, self.inputs, self.outputs))
+
+    def backward(self) -> None:
+        """Pull the derivatives of the results back."""
+        dr.set_grad(self.outputs, self.grad_out())
+        self.set_grad_in("inputs", self._walk(dr.ADMode.Backward, self.outputs, self.inputs))
+
+    def _walk(self, mode: dr.ADMode, source: Record, target: Record) -> Record:
+        dr.enqueue(mode, source)
+        dr.traverse(mode, dr.ADFlag.ClearInterior | dr.ADFlag.ClearInput)
+        derivatives = dr.grad(target)
+        dr.clear_grad(target)
+        return derivatives

@@ -24,8 +24,8 @@ from eigengs_dr.image.notes import series
 from eigengs_dr.image.pixels import ImageError, check_encoding, reason_of
 from eigengs_dr.image.space import space_of
 
-from .environment import texels_of
-from .follow import check_scene, sensor_of
+from .cone import check_scene, sensor_of
+from .parameters import texels_of
 
 
 @door

@@ -12,19 +12,20 @@ import numpy as np
 
 from eigengs_dr.backend.selection import backend_of
 from eigengs_dr.eigenbasis.eigengs import EigenGS
-from eigengs_dr.gaussian.file import MAX_CUTOFF
+from eigengs_dr.gaussian.file import LIGHTS, MAX_CUTOFF, kind_of
 from eigengs_dr.gaussian.gaussians import FIELDS, Gaussians, to_tensors
 from eigengs_dr.image.formats import SUFFIXES
 from eigengs_dr.image.space import SPACES
 from eigengs_dr.relight.lights import LightTable, check_table
-from eigengs_dr.relight.model import Relightable, check_brightest, holds_lights
+from eigengs_dr.relight.model import Relightable, check_brightest
 from eigengs_dr.storage.npz import BadValue
 
 from .lookup import MEMORIES, Memory
-from .parameters import (
-    TextureParameters,
-    light_source,
-    model_source,
+from .sources import (
+    FamilySource,
+    FileSource,
+    LightSource,
+    Source,
     read_planes,
     shared_file,
     without_arrays,
@@ -57,7 +58,7 @@ def _read(props: mi.Properties, key: str, default: object, kind: type, must: str
     return kind(value)
 
 
-def source_of(props: mi.Properties) -> TextureParameters:
+def source_of(props: mi.Properties) -> Source:
     """Read the Gaussians from the properties ``filename``, ``model`` or ``mean``, ...
 
     Of a ``gaussian_relightable``, they are those of its model, under ``planes``.
@@ -77,19 +78,19 @@ def source_of(props: mi.Properties) -> TextureParameters:
         )
     backend = backend_of(mi.variant())
     lit = given[0] == "model" and props.plugin_name() == "gaussian_texture"
-    if lit and holds_lights(path(props, "model")):
+    if lit and kind_of(path(props, "model")) == LIGHTS:
         model = Relightable.load(path(props, "model"), backend)
-        return light_source(model, np.array(props.get("light", UP), np.float32).ravel())
+        return LightSource(model, np.array(props.get("light", UP), np.float32).ravel())
     if given[0] == "model":
         coefficients = props.get("coefficients", None)
         if coefficients is not None:
             coefficients = np.array(coefficients)
             if coefficients.dtype.kind not in "fiu" or not np.isfinite(coefficients).all():
                 raise ValueError(f"{props.plugin_name()}: coefficients must be finite numbers")
-        return model_source(EigenGS.load(path(props, "model"), backend), coefficients)
+        return FamilySource(EigenGS.load(path(props, "model"), backend), coefficients)
     if given[0] == "planes":
         shared = shared_file(path(props, "planes"), backend, None, memory(props).coded, read_planes)
-        return shared.source(None)
+        return FileSource(shared, None)
     if given[0] == "filename":
         first = _read(props, "first", 0, int, "a number of Gaussians")
         if first < 0:
@@ -103,10 +104,10 @@ def source_of(props: mi.Properties) -> TextureParameters:
                 f"give the image to the plugin {bitmap}"
             )
         shared = shared_file(file, backend, first or None, memory(props).coded)
-        source = shared.source(name or None)
+        source: Source = FileSource(shared, name or None)
     else:
         gaussians = _from_arrays(props, backend)
-        source = TextureParameters(without_arrays(gaussians), to_tensors(gaussians))
+        source = Source(without_arrays(gaussians), to_tensors(gaussians))
     if source.start.channels > 3 and not raw(props):
         raise ValueError(
             f"{props.plugin_name()}: the set has {source.start.channels} channels; "

@@ -1,19 +1,20 @@
-"""Registration of the plugins with the variants of Mitsuba, and of the objects of all scenes."""
+"""Registration of the plugins with the variants of Mitsuba."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from functools import cache, partial
+from operator import methodcaller
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend import recording
+from eigengs_dr.backend.recording import keep_objects
 
 from .gaussian_environment import gaussian_environment
 from .gaussian_relightable import gaussian_relightable
 from .gaussian_texture import gaussian_texture
-from .versions import register
 
 PLUGINS: dict[str, tuple[str, Callable[[], type]]] = {
     "gaussian_texture": ("texture", gaussian_texture),
@@ -21,6 +22,9 @@ PLUGINS: dict[str, tuple[str, Callable[[], type]]] = {
     "gaussian_relightable": ("bsdf", gaussian_relightable),
 }
 """The kind of each plugin, and what makes its class for the current variant."""
+
+KINDS = ("BSDF", "Emitter", "Medium", "PhaseFunction", "Sensor", "Shape", "Texture")
+"""Classes with virtual calls; another thread may drop their objects while one renders."""
 
 
 def register_plugins() -> None:
@@ -52,13 +56,14 @@ def register_plugins() -> None:
 
 @cache  # a second callback would register everything twice
 def _follow() -> None:
-    recording.find_shared = living_objects
     mi.detail.add_variant_callback(lambda old, new: _register(new))
 
 
 @cache  # once for each variant
 def _register(variant: str) -> None:
     scalar = variant.startswith("scalar")
+    if not scalar:
+        keep_objects(getattr(mi, f"{kind}Ptr") for kind in KINDS)
     for name, (kind, create) in PLUGINS.items():
         register(kind, name, partial(_refuse, name) if scalar else create())
 
@@ -70,40 +75,35 @@ def _refuse(name: str, props: mi.Properties) -> None:
     )
 
 
-# --- The objects of all scenes: another thread may drop them while one records a rendering -------
-
-KINDS = ("BSDF", "Emitter", "Medium", "PhaseFunction", "Sensor", "Shape", "Texture")
-"""Classes with virtual calls. Dr.Jit records a call for all objects of a class in the process, one
-after the other, and ends the process or reads freed memory if one is freed meanwhile. Mitsuba
-renders without Python's lock, so another thread that drops a scene does not wait for it."""
-
-NONE = 0xFFFFFFFF
-"""A number that no object has."""
+def register(kind: str, name: str, create: Callable[[mi.Properties], Any]) -> None:
+    """Register a plugin ("texture", "emitter" or "bsdf") with the current variant."""
+    getattr(mi, f"register_{kind}")(name, reason_first(create))
 
 
-def living_objects() -> list[object]:
-    """Return the objects of all scenes of the current variant."""
-    if not mi.variant() or mi.variant().startswith("scalar"):
-        return []
-    return [one for kind in KINDS for one in _living(getattr(mi, f"{kind}Ptr"))]
+_ended: Generator[None] = (_ for _ in ())
+_ended.close()  # its method `throw` raises an error, and adds no traceback
 
 
-def _living(pointer: type) -> Iterator[object]:
-    """Yield the objects of a class. Dr.Jit numbers them from 1; some numbers are free."""
+def reason_first(create: Callable[[mi.Properties], Any]) -> type:
+    """Return a class that calls `create` and raises its errors without a traceback.
 
-    def known(number: int) -> object:
-        return dr.reinterpret_array(pointer, mi.UInt32(number))[0]
+    Mitsuba prints an error of a plugin as nanobind does: the traceback, then what went wrong. Every
+    Python function that an error passes adds to the traceback. So `__new__` returns the error, and
+    ``__init__``, which runs no Python code, raises it.
+    """
 
-    try:
-        known(NONE)  # raises, unless there never was an object
-        return
-    except RuntimeError:
-        number = 1
-    while True:
-        try:
-            one = known(number)
-        except RuntimeError:  # that was the last one
-            return
-        if one is not None:
-            yield one
-        number += 1
+    class Created:
+        made = create
+
+        def __new__(cls, props: mi.Properties) -> Any:
+            try:
+                return create(props)
+            except Exception as error:
+                refusal = object.__new__(cls)
+                refusal.end = partial(_ended.throw, error.with_traceback(None))
+                return refusal
+
+        end: Callable[[], None]
+        __init__ = property(methodcaller("end"))
+
+    return Created

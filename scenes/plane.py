@@ -33,6 +33,15 @@ CROP = (1 / 10, 1 / 2, 3 / 10, 7 / 10)
 """Top, bottom, left and right of the crops, as shares of the picture's side."""
 
 
+def write_sets():
+    """Fit the floor in linear and in coded colours, and draw its bitmap, ``floor.exr``."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    linear = fitted(FOLDER, "floor", floor(), 4000, "linear")
+    fitted(FOLDER, "floor-coded", floor(), 4000, "ycbcr")
+    texels = np.clip(eg.render(eg.Gaussians.load(linear), width=TEXELS).numpy(), 0, 1)
+    mi.Bitmap(texels).write(str(FOLDER / "floor.exr"))
+
+
 def load(name, resolution, bitmap=False, prefilter=False):
     """Load the scene of the plane.
 
@@ -80,12 +89,7 @@ def main(resolution, reference, seeds, strip):
     """Measure the error at one sample per pixel, and print a table."""
     mi.set_variant("cuda_ad_rgb" if "cuda" in select().__name__ else "llvm_ad_rgb")
     eg.register_plugins()
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    linear = fitted(FOLDER, "floor", floor(), 4000, "linear")
-    fitted(FOLDER, "floor-coded", floor(), 4000, "ycbcr")
-    texels = np.clip(eg.render(eg.Gaussians.load(linear), width=TEXELS).numpy(), 0, 1)
-    mi.Bitmap(texels).write(str(FOLDER / "floor.exr"))
-
+    write_sets()
     kinds = {
         "bitmap": ("floor", {"bitmap": True}),
         "Gaussians": ("floor", {}),

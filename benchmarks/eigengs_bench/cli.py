@@ -236,7 +236,7 @@ def relight() -> None:
 @question("scaling")
 @several("--part", "parts", PARTS, "What to vary", PARTS)
 @number("--max-side", "Largest side of an image in pixels, up to 8192.", 4096, 1)
-@number("--iterations", "Fewest steps that a mean is taken over.", 24, 1)
+@number("--iterations", "Fewest steps of a fit.", 100, 1)
 def scaling() -> None:
     """Measure the time of steps and starts, and memory, over sizes.
 
@@ -245,7 +245,7 @@ def scaling() -> None:
     splats   100 to 2,000,000 Gaussians on images of one size
     small    images per second of whole fits of 100 steps, one by one and by fit_many
 
-    Every size runs in its own process. All sizes up to 4096x4096 take about ten minutes and 5 GB.
+    Every size runs in its own process. All up to 4096x4096 take about twenty minutes and 5 GB.
     """
 
 

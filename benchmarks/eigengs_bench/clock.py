@@ -1,26 +1,18 @@
-"""Clocks: a descent that is measured on its way, and programs that are timed in turn."""
+"""Clocks: fits that are measured on their way, and programs that are timed in turn."""
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 import eigengs_dr as eg
-from eigengs_dr.fitting.control import Control, Perturb, Redistribute, Relocate, phase_of
-from eigengs_dr.fitting.fit import begin_fit
-from eigengs_dr.fitting.loop import descend
-from eigengs_dr.fitting.options import FitOptions
-from eigengs_dr.fitting.place import Adaptive
-from eigengs_dr.fitting.problem import problem_of_images
-from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.metrics import MAX_PSNR
 from eigengs_dr.paper.eigengs import EIGENGS
 from eigengs_dr.paper.gaussianimage import GAUSSIANIMAGE
@@ -30,67 +22,27 @@ Image = NDArray[np.float32]  # RGB, shape (H, W, 3), 1 is white
 METHODS = {"default": eg.DEFAULT, "gaussianimage": GAUSSIANIMAGE, "eigengs": EIGENGS}
 """The methods that are compared, by name."""
 
-WARM_STEPS = 10
-"""Steps of a fit that compiles the programs of the fits to be timed."""
-
-SOON: dict[str, Control] = {
-    control.phase: control
-    for control in (Redistribute(after=1), Relocate(every=3), Perturb(every=3))
-}
-"""Controls by phase that act within `WARM_STEPS`."""
-
-
-class Moment(NamedTuple):
-    """A descent after some steps: seconds with the start, and RGB that is not clamped."""
-
-    iteration: int
-    seconds: float
-    gaussians: eg.Gaussians
-    picture: Image
-
-
-def descent(
-    image: Image, iterations: int, marks: Collection[int], **options: Any
-) -> Iterator[Moment]:
-    """Run the descent of a fit to its last step, and yield its state after the steps in `marks`.
-
-    `options` are those of `FitOptions`. The start is that of `eigengs_dr.fit`, which does not
-    expose the state after each step. All steps are taken, and sets are yielded as they are, where
-    `eigengs_dr.fit` stops early and keeps the best. States with more Gaussians than requested,
-    which a descent passes through, are left out. The time of the start counts; the clock stops
-    between moments.
-    """
-    spent, resumed = 0.0, time.perf_counter()
-    chosen = FitOptions(iterations=iterations, **options)
-    problem, method = problem_of_images([image], chosen), chosen.method
-    objective, begun, _ = begin_fit(problem)
-    base = objective.pictures[0].base
-    mean_image = 0.0 if base is None else objective.picture(base).numpy()
-    if begun is None:
-        begun = method.place_and_solve(objective, problem.first_count, chosen.seed)
-    if problem.start is not None or method.place != Adaptive():
-        method = method.without("grows", "places")
-    state = begin(begun)
-    steps = descend(objective, method, state, iterations, chosen.seed)
-    for iteration in range(iterations + 1):
-        if iteration:
-            state = next(steps)
-        if iteration not in marks or state.total != state.count:
-            continue
-        dr.eval(state.gaussians)
-        dr.sync_thread()  # steps run asynchronously
-        spent += time.perf_counter() - resumed
-        yield Moment(iteration, spent, state.gaussians, eg.picture_of(state.gaussians) + mean_image)
-        resumed = time.perf_counter()
-    steps.close()
+WARM_STEPS = 150
+"""Steps of a fit that compiles the programs of the fits to be timed, also those of its controls."""
 
 
 def warm_up(image: Image, iterations: int, **options: Any) -> None:
-    """Compile the programs of a fit, also those of its controls."""
-    method, steps = options.pop("method", eg.DEFAULT), min(WARM_STEPS, iterations)
-    controls = tuple(SOON.get(phase_of(control) or "", control) for control in method.controls)
-    soon = replace(method, controls=controls)
-    list(descent(image, steps, (0, steps), method=soon, **options))
+    """Fit an image in at most `WARM_STEPS`; `options` are those of `eigengs_dr.fit`."""
+    eg.fit(image, iterations=min(WARM_STEPS, iterations), progress=False, **options)
+
+
+def trace_of(
+    image: Image, iterations: int, marks: Collection[int], **options: Any
+) -> list[dict[str, Any]]:
+    """Fit an image, and return the rows of the trace after the steps in `marks`.
+
+    `options` are those of `eigengs_dr.fit`. Rows of more Gaussians than requested, which a fit
+    passes through, are left out. PSNRs are at most `MAX_PSNR`.
+    """
+    result = eg.fit(image, iterations=iterations, progress=False, **options)
+    count = len(result.gaussians)
+    rows = [r for r in result.trace if r["iteration"] in marks and r["gaussians"] == count]
+    return [{k: min(v, MAX_PSNR) if "psnr" in k else v for k, v in row.items()} for row in rows]
 
 
 def decibels(picture: Image, image: Image, space: str) -> float:
@@ -102,12 +54,6 @@ def judge(picture: Image, image: Image) -> dict[str, float]:
     """Return psnr_ycbcr, psnr_rgb, ssim and ms_ssim of a picture."""
     psnr = {f"psnr_{space}": decibels(picture, image, space) for space in ("ycbcr", "rgb")}
     return {**psnr, "ssim": eg.ssim(picture, image), "ms_ssim": eg.ms_ssim(picture, image)}
-
-
-def score(moment: Moment, image: Image) -> dict[str, Any]:
-    """Turn a moment into figures: iteration, seconds, and those of `judge`."""
-    when = {"iteration": moment.iteration, "seconds": moment.seconds}
-    return when | judge(moment.picture, image)
 
 
 def interleaved(

@@ -44,19 +44,13 @@ class Unknown(NamedTuple):
 
     start: dict[str, Any]
     rate: float
-    texels_of: Callable[[Any], dict[str, Any]] = dict
+    texels_of: Callable[[Any], dict[str, Any]]
 
 
-def texels(mi: Any, scene: Scene) -> Unknown:
-    """Describe maps by texels."""
-    start = {name: mi.TensorXf(grey(scene.kind, name)) for name in scene.maps}
-    return Unknown(start, RATES["texels"])
-
-
-def pyramid(mi: Any, scene: Scene) -> Unknown:
-    """Describe texels by a level of them, added to the next coarser sum at twice its size."""
+def levels(mi: Any, scene: Scene, method: str) -> Unknown:
+    """Describe maps by texels; those of a pyramid are added to the next coarser sum at its size."""
     sides, start = [scene.subject.texels], {}
-    while sides[-1] > COARSEST:
+    while method == "pyramid" and sides[-1] > COARSEST:
         sides.append(sides[-1] // 2)
     for name in scene.maps:
         color = grey(scene.kind, name)[0, 0]
@@ -75,7 +69,7 @@ def pyramid(mi: Any, scene: Scene) -> Unknown:
             result[name] = total
         return result
 
-    return Unknown(start, RATES["pyramid"], texels_of)
+    return Unknown(start, RATES[method], texels_of)
 
 
 def fit(mi: Any, scene: Scene, steps: int) -> Row:
@@ -105,7 +99,7 @@ def fit(mi: Any, scene: Scene, steps: int) -> Row:
 
 def descend(mi: Any, scene: Scene, method: str, steps: int) -> Row:
     """Descend by Adam; the seconds leave out the first step, which compiles and records."""
-    unknown = {"texels": texels, "pyramid": pyramid}[method](mi, scene)
+    unknown = levels(mi, scene, method)
     loaded, keys = scene.load(mi), scene.subject.keys
     parameters, values = mi.traverse(loaded), mi.ad.Adam(1.0, unknown.start, beta_1=MOMENTUM)
     photos = [mi.TensorXf(photo) for photo in scene.photos[: scene.cameras]]
@@ -235,20 +229,9 @@ def summarize(rows: Sequence[Row]) -> Section:
 
 def _by_seed(rows: Sequence[Row]) -> dict[tuple, Row]:
     """Return the means of the figures of rows that differ in their seed, and how many seeds."""
-    alike: dict[tuple, list[Row]] = {}
-    for row in rows:
-        job = row["job"]
-        key = job["scene"], job["cameras"], job["spp"], job["method"], job["steps"]
-        alike.setdefault(key, []).append(row)
-    return {
-        key: {
-            name: fmean(row[name] for row in group)
-            for name, value in group[0].items()
-            if isinstance(value, (int, float))
-        }
-        | {"seeds": len(group)}
-        for key, group in alike.items()
-    }
+    groups = fr.frame_of(rows).groupby(["scene", "cameras", "spp", "method", "steps"], sort=False)
+    means = groups.mean(numeric_only=True).assign(seeds=groups.size())
+    return {key: row.dropna().to_dict() for key, row in means.iterrows()}
 
 
 def gain(curves: Curves, figure: str = "psnr_rgb") -> list[float]:
@@ -277,7 +260,7 @@ def _gains(cases: Mapping[Case, Curves]) -> Table:
     for case, curves in cases.items():
         line = cells.setdefault(_title(case), {})
         for (steps, row), decibels in zip(sorted(curves["fit"].items()), gain(curves), strict=True):
-            seeds = "" if row["seeds"] == most else f" ({row['seeds']})"
+            seeds = "" if row["seeds"] == most else f" ({row['seeds']:g})"
             line[steps, case[2]] = f"{decibels:+.1f}{seeds}"
     descents = sorted({d for line in cells.values() for d in line}, key=lambda d: (d[1] != SPP, d))
     lines = [
@@ -286,7 +269,7 @@ def _gains(cases: Mapping[Case, Curves]) -> Table:
     columns = ("photos", *(f"{steps} steps, {spp} spp" for steps, spp in descents))
     caption = "psnr_rgb of fit in dB over the best of texels and pyramid at equal seconds"
     if most > 1:
-        caption += f"; means of {most} seeds, or of as many as brackets say"
+        caption += f"; means of {most:g} seeds, or of as many as brackets say"
     return table(caption, columns, lines, name="gains")
 
 

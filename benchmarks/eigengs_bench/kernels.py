@@ -15,7 +15,7 @@ from eigengs_bench.report import Section, number, table
 from eigengs_bench.rows import Row, Task
 from eigengs_dr.backend.arrays import ArrayTypes, types_in, types_of, upload
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.binning.lists import TileLists
+from eigengs_dr.raster.lists import TileLists
 from eigengs_dr.raster.parameters import NUM_SHAPE_PARAMS, KernelParameters
 from eigengs_dr.raster.render import bin_gaussians, decode_parameters, rasterize
 

@@ -9,7 +9,7 @@ from functools import partial
 
 import eigengs_dr as eg
 from eigengs_bench import report as fr
-from eigengs_bench.clock import WARM_STEPS, Image, decibels
+from eigengs_bench.clock import Image, decibels, warm_up
 from eigengs_bench.images import images_of
 from eigengs_bench.rows import Job, Row, Task
 
@@ -30,7 +30,7 @@ def _jobs(task: Task, names: Sequence[str], targets: Sequence[float]) -> Iterato
 def _search(task: Task, image: Image, target: float) -> Row:
     goal = eg.Goal(target, space="ycbcr")
     search = partial(eg.fit, image, target_psnr=goal, backend=task.backend)
-    search(iterations=min(WARM_STEPS, task.iterations))  # untimed, to compile
+    warm_up(image, task.iterations, target_psnr=goal, backend=task.backend)
     result = search(iterations=task.iterations)
     count = len(result.gaussians)
     usual = eg.fit(image, count, task.iterations, backend=task.backend)

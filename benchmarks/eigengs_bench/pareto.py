@@ -1,7 +1,7 @@
 """Speed against accuracy: fits that differ from the default one in one setting at a time.
 
-The row of a variant has "gaussians", their number, and "trace", a list of `score` at each number of
-steps.
+The row of a variant has "gaussians", their number, and "trace", rows of the trace of
+a fit at each number of steps.
 """
 
 import math
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 import eigengs_dr as eg
 from eigengs_bench import report as fr
-from eigengs_bench.clock import METHODS, Image, descent, score, warm_up
+from eigengs_bench.clock import METHODS, Image, trace_of, warm_up
 from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import SETS
 from eigengs_bench.rows import Job, Row, Task
@@ -87,9 +87,8 @@ def trace(task: Task, fit: Variant, image: Image) -> Row:
     falls = fit.method.decay < 1
     marks = sorted({n for n in (HORIZONS if falls else MARKS) if n < iterations} | {iterations})
     runs = [(n, (n,)) for n in marks] if falls else [(iterations, tuple(marks))]
-    moments = [m for steps, kept in runs for m in descent(image, steps, kept, **options)]
-    scores = [score(moment, image) for moment in moments]
-    return {"gaussians": len(moments[-1].gaussians), "trace": scores}
+    rows = [row for steps, kept in runs for row in trace_of(image, steps, kept, **options)]
+    return {"gaussians": rows[-1]["gaussians"], "trace": rows}
 
 
 # ---------------------------------------------------------------------------------------------

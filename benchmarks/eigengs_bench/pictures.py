@@ -1,7 +1,7 @@
 """The paper's curves with our fits.
 
-A row has "psnr_ycbcr" every `EVERY` steps, of a fit with the size of the model and its number of
-Gaussians.
+A row has "psnr_ycbcr" after the steps in "marks", of a fit with the size of the model and its
+number of Gaussians.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 import eigengs_dr as eg
 from eigengs_bench import report as fr
-from eigengs_bench.clock import METHODS, Image, descent
+from eigengs_bench.clock import METHODS, Image, trace_of
 from eigengs_bench.images import images_of, is_present, model_for
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.image.resize import center_crop
@@ -20,7 +20,7 @@ from eigengs_dr.image.resize import center_crop
 COMPONENTS = 300  # per channel of the models that are trained, as in the paper's comparisons
 PRESETS = ("gaussianimage", "eigengs", "default")
 CURVES = ("faces256", "cats256", "cars256", "natural256", "kodak", "samples")
-EVERY = 50  # iterations between two points of a curve
+EVERY = 100  # iterations between two points of a curve
 
 
 def run(task: Task) -> list[Row]:
@@ -49,8 +49,11 @@ def _jobs(task: Task, name: str) -> Iterator[Job]:
         method = METHODS[preset]
         start = model if method.needs_model else None
         options: Row = {"gaussians": len(shapes), "method": method, "start": start}
-        moments = descent(image, task.iterations, marks, backend=task.backend, **options)
-        return {"psnr_ycbcr": [eg.psnr(m.picture, image, "ycbcr") for m in moments], "marks": marks}
+        rows = trace_of(image, task.iterations, marks, backend=task.backend, **options)
+        return {
+            "psnr_ycbcr": [row["psnr_ycbcr"] for row in rows],
+            "marks": [row["iteration"] for row in rows],
+        }
 
     for file, image in images_of(task, name):
         fitted = center_crop(image, shapes.width, shapes.height)

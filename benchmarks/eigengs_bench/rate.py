@@ -23,7 +23,7 @@ from scipy.interpolate import PchipInterpolator
 
 import eigengs_dr as eg
 from eigengs_bench import report as fr
-from eigengs_bench.clock import Image, judge
+from eigengs_bench.clock import Image, judge, warm_up
 from eigengs_bench.images import images_of
 from eigengs_bench.rows import Job, Row, Task
 from eigengs_dr.image.io import to_8bit
@@ -33,7 +33,6 @@ PIXELS = (256, 128, 64, 32, 16, 8)  # pixels per Gaussian of the fits that are p
 # Decibels that packing may lose: of some numbers below it and some above,
 # these had the best PSNR at equal size on training photos, by little.
 BUDGET = 0.8
-WARM_UP = 6  # untimed steps that compile the programs of a fit
 QUALITIES = (2, 5, 10, 15, 20, 30, 40, 50, 60, 70, 80, 85, 90, 95)
 RATIOS = (200, 120, 80, 60, 48, 40, 32, 26, 20, 16, 13, 10, 8, 6)
 # Decibels of PSNR in 8-bit RGB at which the sizes of files are compared.
@@ -94,20 +93,14 @@ def _jobs(task: Task, name: str, images: list[tuple[str, Image]]) -> Iterator[Jo
             yield {**about, "codec": title}, partial(_coded, image, codec)
 
 
-def fit_and_pack(task: Task, image: Image, count: int, path: Path) -> tuple[int, float]:
-    """Write a packed fit; return its bytes and the seconds, after a short fit that compiles."""
-    fit = partial(eg.fit, image, count, backend=task.backend)
-    fit(iterations=min(WARM_UP, task.iterations))
-    started = time.perf_counter()
-    result = fit(iterations=task.iterations)
-    size = eg.pack(result.gaussians, path, image, BUDGET).bytes
-    return size, time.perf_counter() - started
-
-
 def _packed(task: Task, image: Image, count: int) -> Row:
+    """Pack a fit; `seconds` are those of both."""
+    warm_up(image, task.iterations, gaussians=count, backend=task.backend)
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "fit.egs"
-        size, seconds = fit_and_pack(task, image, count, path)
+        path, started = Path(folder) / "fit.egs", time.perf_counter()
+        result = eg.fit(image, count, task.iterations, backend=task.backend, progress=False)
+        size = eg.pack(result.gaussians, path, image, BUDGET).bytes
+        seconds = time.perf_counter() - started
         eg.picture_of(eg.Gaussians.load(path, task.backend))  # compiles
         started = time.perf_counter()
         picture = eg.picture_of(eg.Gaussians.load(path, task.backend))
@@ -189,8 +182,7 @@ def bd_rate(ours: pd.DataFrame, other: pd.DataFrame) -> float:
     """
     curves = []
     for points in (ours, other):
-        best = points.sort_values("bits_per_pixel")
-        best = best[best.psnr_rgb > best.psnr_rgb.cummax().shift(fill_value=-np.inf)]
+        best = fr.best(points, "bits_per_pixel")
         if len(best) < 2:
             return float("nan")
         curves.append(PchipInterpolator(best.psnr_rgb, np.log(best.bits_per_pixel)))

@@ -258,18 +258,12 @@ STYLES = {
 CODED = tuple(STYLES)[4:]
 
 
-def best(points: pd.DataFrame) -> pd.DataFrame:
-    """Keep the points that no smaller file matches, by their size."""
-    line = points.sort_values("bytes_per_pixel")
-    return line[line.psnr_rgb > line.psnr_rgb.cummax().shift(fill_value=-np.inf)]
-
-
 def at_level(points: pd.DataFrame, level: float) -> tuple[float, float]:
     """Return the bytes per pixel at a PSNR, and how far above it they are.
 
     Beyond the ends of a curve, it is the nearest end, which is not at this PSNR.
     """
-    line = best(points)
+    line = fr.best(points, "bytes_per_pixel")
     low, high = line.psnr_rgb.iloc[0], line.psnr_rgb.iloc[-1]
     if low < level < high:
         return fr.smallest(dict(zip(line.bytes_per_pixel, line.psnr_rgb, strict=True)), level), 0.0
@@ -340,7 +334,8 @@ def _chart(points: pd.DataFrame) -> Figure:
     axes = figure.subplots(down, across, squeeze=False).ravel()
     for axis, name in zip(axes, names, strict=False):
         for method, (color, style) in STYLES.items():
-            line = best(points[(points.set == name) & (points.method == method)])
+            some = points[(points.set == name) & (points.method == method)]
+            line = fr.best(some, "bytes_per_pixel")
             x, y = line.bytes_per_pixel, line.psnr_rgb
             axis.plot(x, y, style, color=color, ms=4, label=method)
         axis.set_title(name, fontsize=8)

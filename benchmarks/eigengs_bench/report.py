@@ -138,6 +138,12 @@ def counted(images: pd.Series) -> str:
     return f"{images.nunique()} image" + "s" * (images.nunique() != 1)
 
 
+def best(points: pd.DataFrame, size: str) -> pd.DataFrame:
+    """Keep the points whose `psnr_rgb` no smaller one reaches, by the column of their size."""
+    line = points.sort_values(size)
+    return line[line.psnr_rgb > line.psnr_rgb.cummax().shift(fill_value=-math.inf)]
+
+
 def smallest(curve: Mapping[Any, float], target: float) -> float:
     """Interpolate the size at a PSNR, which is assumed linear in the logarithm of the size.
 

@@ -1,8 +1,8 @@
 """The cost of size: seconds and memory of a fit over pixels and Gaussians, and of small fits.
 
-The row of a descent has place_seconds and solve_seconds, step_ms (median of steps on their own,
-most of which build no lists) and mean_ms (of steps in a row, with lists), and peak_gib, the memory
-of its process with the interpreter and its libraries. The row of whole fits has images_per_second
+The row of a fit has start_seconds, of placing Gaussians and solving for their colours; step_ms, the
+mean of its last steps with one row of the trace; and peak_gib, the memory of its process with the
+interpreter and its libraries. The row of whole fits has images_per_second
 one by one, and many_per_second by `fit_many`.
 """
 
@@ -10,25 +10,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from itertools import cycle, islice
+from functools import partial
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import drjit as dr
 import numpy as np
 
 import eigengs_dr as eg
-from eigengs_bench.clock import Image
+from eigengs_bench.clock import WARM_STEPS, Image
 from eigengs_bench.rows import Job, Row, Task, alone, peak_gib
-from eigengs_dr.backend.arrays import ArrayTypes, types_in
-from eigengs_dr.backend.selection import select
-from eigengs_dr.fitting.loop import descend
-from eigengs_dr.fitting.objective import Pixels
-from eigengs_dr.fitting.placement.adaptive import place_adaptive
-from eigengs_dr.fitting.solve import solve
-from eigengs_dr.fitting.state import begin
 from eigengs_dr.image.resize import center_crop
-from eigengs_dr.image.space import YCBCR
 
 if TYPE_CHECKING:  # the processes that are measured load neither pandas nor matplotlib
     import pandas as pd
@@ -39,7 +30,6 @@ if TYPE_CHECKING:  # the processes that are measured load neither pandas nor mat
 # The mosaic: the middles of photos as squares of this side in pixels, alternating and rotated.
 PHOTOS, CELL = ("astronaut", "chelsea", "coffee", "motorcycle", "rocket"), 256
 DENSITY = 0.0763  # Gaussians per pixel where the number of pixels varies: 5,000 on 256x256
-WARM_UP = 8  # steps that compile programs and settle
 # Small images take up to so many times more steps, for about as many pixels in total.
 MORE_STEPS, PIXELS_IN_ALL = 4, 1 << 27
 # Steps of whole fits, fewest seconds for all of a size, and images along a side of the mosaic.
@@ -82,65 +72,27 @@ def _jobs(task: Task, parts: Sequence[str], max_side: int) -> Iterator[Job]:
                     MORE_STEPS * task.iterations, PIXELS_IN_ALL // (case.width * case.height)
                 )
                 steps = FIT_STEPS if part == "small" else max(task.iterations, max_steps)
-                work = measure_fits if part == "small" else measure_descent
+                work = measure_fits if part == "small" else measure_fit
                 title = f"{case.width}x{case.height}, {case.gaussians:,} Gaussians"
                 job = {"part": part, **case._asdict(), "iterations": steps}
                 yield job, alone(title, work, case, steps, task.backend)
 
 
-def measure_descent(case: Case, steps: int, backend: str | None) -> Row:
-    """Place Gaussians, solve for their colours, and take steps without relocation."""
-    types, image = types_in(select(backend)), mosaic(case.width, case.height)
-    _place(image[:CELL, :CELL], 1, types)  # imports
-    objective, placed, place_seconds = _place(image, case.gaussians, types)
-    solve(placed, objective, 1)  # compiles
-    started = time.perf_counter()
-    start = solve(placed, objective)
-    dr.sync_thread()
-    solve_seconds = time.perf_counter() - started
-    del placed
-    step_ms, mean_ms = time_steps(objective, start, steps)
+def measure_fit(case: Case, steps: int, backend: str | None) -> Row:
+    """Fit an image twice, at first to compile; the last rows of the trace time the steps."""
+    image = mosaic(case.width, case.height)
+    fit = partial(eg.fit, image, case.gaussians, backend=backend, progress=False)
+    fit(iterations=min(WARM_STEPS, steps))
+    result = fit(iterations=steps)
+    before, last = result.trace[-2:]
+    taken = last["iteration"] - before["iteration"]
+    step_ms = 1e3 * (last["seconds"] - before["seconds"]) / taken
     return {
-        "place_seconds": place_seconds,
-        "solve_seconds": solve_seconds,
+        "start_seconds": result.seconds_init,
         "step_ms": step_ms,
-        "mean_ms": mean_ms,
-        "ns_a_pixel": mean_ms * 1e6 / (case.width * case.height),
+        "ns_a_pixel": step_ms * 1e6 / (case.width * case.height),
         "peak_gib": peak_gib(),
     }
-
-
-def _place(image: Image, count: int, types: ArrayTypes) -> tuple[Pixels, eg.Gaussians, float]:
-    """Upload an image and place Gaussians; also return the seconds of each."""
-    values = YCBCR.values_of(image)
-    started = time.perf_counter()
-    objective = Pixels.of(values, YCBCR, types)
-    placed = place_adaptive(objective, count)
-    dr.sync_thread()
-    return objective, placed, time.perf_counter() - started
-
-
-def time_steps(objective: Pixels, start: eg.Gaussians, steps: int) -> tuple[float, float]:
-    """Return milliseconds per step: the median of single steps, and the mean of `steps` in a row.
-
-    Steps run asynchronously: a mean waits for its last step only, a median for each.
-    """
-    single = max(5, steps // 3)
-    method, total = replace(eg.DEFAULT, controls=()), WARM_UP + steps + single
-    states = descend(objective, method, begin(start), total)
-
-    def spend(count: int) -> float:
-        started = time.perf_counter()
-        for _ in islice(states, count):
-            pass
-        dr.sync_thread()
-        return 1e3 * (time.perf_counter() - started) / count
-
-    spend(WARM_UP)
-    mean_ms = spend(steps)
-    median_ms = float(np.median([spend(1) for _ in range(single)]))
-    states.close()
-    return median_ms, mean_ms
 
 
 def measure_fits(case: Case, steps: int, backend: str | None, enough: float = FIT_SECONDS) -> Row:
@@ -188,10 +140,8 @@ def mosaic(width: int, height: int) -> Image:
 STYLES = ("o-", "s--", "^:", "D-.")
 FIGURES = {
     "step, ms": "step_ms",
-    "with lists, ms": "mean_ms",
     "ns per pixel": "ns_a_pixel",
-    "placing, s": "place_seconds",
-    "colour solve, s": "solve_seconds",
+    "start, s": "start_seconds",
     "peak, GiB": "peak_gib",
 }
 RATES = {
@@ -235,7 +185,7 @@ def _chart(part: pd.DataFrame, x: str) -> Figure:
     from eigengs_bench import report as fr
 
     figure = fr.new_figure(8, 3.4)
-    labels = {"mean_ms": "a step with lists / ms", "peak_gib": "peak of memory / GiB"}
+    labels = {"step_ms": "a step / ms", "peak_gib": "peak of memory / GiB"}
     for axis, (column, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
         for (name, some), style in zip(part.groupby("line", sort=False), STYLES, strict=False):
             axis.plot(some[x], some[column], style, ms=4, label=name)

@@ -1,7 +1,7 @@
 """The paper's tables on sets of images: every method on every image, step by step.
 
-A row has "job" with set, image, iterations, gaussians and the fields of `Method`, and "moments", a
-list of `score`.
+A row has "job" with set, image, iterations, gaussians and the fields of `Method`, and "moments",
+rows of the trace of a fit.
 
 Tai et al., "EigenGS Representation", CVPR 2025: tables 1 (FFHQ) and 3 (ablation).
 """
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from eigengs_bench import report as fr
-from eigengs_bench.clock import METHODS, Image, descent, score, warm_up
+from eigengs_bench.clock import METHODS, Image, trace_of, warm_up
 from eigengs_bench.images import images_of, is_trained, model_for
 from eigengs_bench.names import NATURAL, SETS, TABLES
 from eigengs_bench.rows import Job, Row, Task
@@ -76,8 +76,7 @@ def _jobs(task: Task, name: str, compared: Sequence[Method]) -> Iterator[Job]:
         return options
 
     def work(method: Method, image: Image) -> Row:
-        moments = descent(image, task.iterations, marks, **options_of(method))
-        return {"moments": [score(moment, image) for moment in moments]}
+        return {"moments": trace_of(image, task.iterations, marks, **options_of(method))}
 
     shared = {"set": name, "iterations": task.iterations, "gaussians": SETS[name].gaussians}
     for file, image in pictures:

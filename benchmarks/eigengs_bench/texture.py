@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 import eigengs_dr as eg
-from eigengs_bench import poster, sky
+from eigengs_bench import alike
 from eigengs_bench.clock import interleaved_apart
 from eigengs_bench.names import TEXTURE_PARTS
 from eigengs_bench.report import Section, Table, table
@@ -36,18 +36,18 @@ def run(task: Task, parts: Sequence[str] = TEXTURE_PARTS) -> list[Row]:
     """Time a material ball with each texture in turn; every figure is a median.
 
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_filtered_N` with
-    the prefilter, `ratio_prefiltered` that of 5,000, `ratio_step` picture and gradient of all
+    the prefilter, `ratio_step` picture and gradient of all
     parameters by `prb`, `ratio_step_filtered` these with the prefilter, and `ratio_step_drawn`
     these by a bitmap that `eg.render` draws in each step. Each scene has a process of its own, as
     beside others Mitsuba takes longer.
     `bytes_N` is what a texture holds in memory, `held_N` that over the arrays of its file.
-    For the other rows see `eigengs_bench.poster` and `eigengs_bench.sky`.
+    For the other rows see `eigengs_bench.alike`.
     """
     variant = f"{task.backend}_ad_rgb"
     ball: Row = {"variant": variant, "at": time.time()}  # each call measures anew
     jobs: dict[str, Iterable[Job]] = {
-        "posters": poster.jobs(variant, task.data),
-        "lights": sky.jobs(variant),
+        "posters": alike.jobs_of_posters(variant, task.data),
+        "lights": alike.jobs_of_lights(variant),
         "ball": [(ball, partial(measure, variant, task.progress))],
     }
     return [row for part in parts for row in task.measure("texture", jobs[part], part)]
@@ -80,8 +80,8 @@ def _posters(posters: Sequence[Row]) -> Table:
     """Lay out the bitmaps and the Gaussians whose pictures of posters are equally good."""
     caption = (
         "kB of the smallest bitmap of 8 bits, and of the fewest Gaussians, with which a poster "
-        f"of {poster.TEXELS:,} x {poster.TEXELS:,} texels, seen aslant on a film of "
-        f"{poster.PIXELS} x {poster.PIXELS} pixels, keeps 40 dB; the text 30 dB"
+        f"of {alike.TEXELS:,} x {alike.TEXELS:,} texels, seen aslant on a film of "
+        f"{alike.PIXELS} x {alike.PIXELS} pixels, keeps 40 dB; the text 30 dB"
     )
     columns = ["poster", "side, texels", "Gaussians", "bitmap", "points", "prefilter", "small"]
     columns += ["points over bitmap", "small over bitmap"]
@@ -102,10 +102,10 @@ def _posters(posters: Sequence[Row]) -> Table:
 def _lights(lights: Sequence[Row]) -> Table:
     """Lay out what lights of Gaussians differ by from their bitmaps, and what they cost."""
     caption = (
-        f"A fit of logarithms for {sky.GOAL:g} dB beside the envmap of a bitmap of {2 * sky.ROWS} "
-        f"x {sky.ROWS} texels: PSNR of lookups in even directions, and of pictures without noise; "
-        "largest difference of the mean of a channel; variance at equal samples and time of a "
-        "picture, over those with the envmap; memory"
+        f"A fit of logarithms for {alike.GOAL:g} dB beside the envmap of a bitmap of "
+        f"{2 * alike.ROWS} x {alike.ROWS} texels: PSNR of lookups in even directions, and of "
+        "pictures without noise; largest difference of the mean of a channel; variance at equal "
+        "samples and time of a picture, over those with the envmap; memory"
     )
     columns = ["light", "Gaussians", "lookups", "pictures", "mean", "variance", "time"]
     columns += ["Gaussians hold", "envmap holds"]
@@ -123,9 +123,6 @@ def _lights(lights: Sequence[Row]) -> Table:
     return table(caption, columns, lines, name="lights")._replace(rows=lights)
 
 
-FIGURES = ("prefiltered", "step", "step_filtered")
-
-
 def _figures(balls: Sequence[Row], posters: Sequence[Row], lights: Sequence[Row]) -> dict[str, str]:
     """Return figures for sentences: of the last ball, memory of photos, and time of lights."""
     small = [row["ratio_small"] for row in posters if row["kind"] == "photo"]
@@ -135,7 +132,8 @@ def _figures(balls: Sequence[Row], posters: Sequence[Row], lights: Sequence[Row]
     for row in balls[-1:]:
         held = [row[f"held_{count}"] for count in HELD]
         figures["held"] = f"{min(held):.1f} to {max(held):.1f}"
-        figures |= {name: f"{row[f'ratio_{name}']:.2f}" for name in FIGURES}
+        figures |= {name: f"{row[f'ratio_{name}']:.2f}" for name in ("step", "step_filtered")}
+        figures["prefiltered"] = f"{row[f'ratio_filtered_{SETTLED}']:.2f}"
     return figures
 
 
@@ -180,7 +178,7 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
     for count in counts:
         sets[count] = eg.fit(picture, count, STEPS).gaussians
         progress("fits", len(sets), len(counts))
-    angle = pixel_angle(mi.load_dict(camera(mi, SIDE, SPP)))
+    angle = pixel_angle(mi.load_dict(alike.camera(mi, SIDE, SPP)))
     with TemporaryDirectory() as folder:
         files = {count: Path(folder) / f"{count}.npz" for count in counts}
         for count, path in files.items():
@@ -199,7 +197,6 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         **{f"{name}_ms": ms for name, ms in timed.items()},
         **{f"ratio_{n}": timed[f"gaussians_{n}"] / timed["bitmap"] for n in counts},
         **{f"ratio_filtered_{n}": timed[f"filtered_{n}"] / timed["bitmap"] for n in CHANGED},
-        "ratio_prefiltered": timed[f"filtered_{SETTLED}"] / timed["bitmap"],
         "ratio_step": timed["step_gaussians"] / timed["step_bitmap"],
         "ratio_step_filtered": timed["step_filtered"] / timed["step_bitmap"],
         "ratio_step_drawn": timed["step_drawn"] / timed["step_bitmap"],
@@ -225,7 +222,7 @@ def _picture(
         coded = np.clip(eg.picture_of(eg.Gaussians.load(path), texels, texels), 0, 1)
         data = mi.TensorXf(to_linear(coded).astype(np.float32))
         texture = {"type": "bitmap", "data": data, "raw": True}
-    scene = mi.load_dict(ball(mi, texture, camera(mi, side, samples)))
+    scene = _shown(mi, texture, side, samples)
     return _step(mi, scene) if by_step else partial(mi.render, scene)
 
 
@@ -236,7 +233,7 @@ def _drawn_step(variant: str, side: int, samples: int, path: Path) -> Callable[[
     """
     mi = load_mitsuba(variant, quiet=False)
     blank = {"type": "bitmap", "data": dr.zeros(mi.TensorXf, (TEXELS, TEXELS, 3)), "raw": True}
-    scene = mi.load_dict(ball(mi, blank, camera(mi, side, samples)))
+    scene = _shown(mi, blank, side, samples)
     gaussians, parameters = eg.Gaussians.load(path), mi.traverse(scene)
     integrator = mi.load_dict({"type": "prb", "max_depth": 5})
     (data,) = (name for name, _ in parameters if name.endswith("base_color.data"))
@@ -252,30 +249,14 @@ def _drawn_step(variant: str, side: int, samples: int, path: Path) -> Callable[[
     return step
 
 
-def camera(mi: Any, side: int, samples: int) -> dict[str, Any]:
-    """Describe the camera that sees the ball."""
-    place = mi.ScalarTransform4f().look_at([0, 1.2, 4.2], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": side, "height": side}
-    sampler = {"type": "independent", "sample_count": samples}
-    kind = {"type": "perspective", "fov": 32, "to_world": place}
-    return kind | {"film": film, "sampler": sampler}
-
-
-def ball(mi: Any, texture: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
-    """Describe a ball with a textured coat on a grey floor, under a lamp and the sky."""
-    at = mi.ScalarTransform4f()
-    coat = {"type": "principled", "base_color": texture, "roughness": 0.3}
-    floor = at.translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)
+def _shown(mi: Any, texture: dict[str, Any], side: int, samples: int) -> Any:
+    """Load the ball with a texture, under a lamp and the sky."""
     light = {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 5},
-        "sensor": sensor,
-        "ball": {"type": "sphere", "bsdf": coat},
-        "floor": {"type": "rectangle", "to_world": floor},
+    emitters = {
         "lamp": {"type": "sphere", "center": [3, 4, 3], "emitter": light},
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.4}},
     }
+    return mi.load_dict(alike.ball(mi, texture, alike.camera(mi, side, samples), emitters))
 
 
 def _step(mi: Any, scene: Any) -> Callable[[], Any]:

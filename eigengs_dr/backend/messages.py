@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 SKIPPED_MODULES = ("eigengs_dr", "contextlib", "functools")
 """Modules whose frames a warning skips to reach the caller's line."""
@@ -47,10 +47,8 @@ def shown(value: object) -> str:
     return text if short else f"of the type {type(value).__name__}"
 
 
-make_html: Callable[[object], str] = repr
-"""`eigengs_dr.viewer.view.html_of`, a layer above, which `eigengs_dr` assigns here."""
+def notebook_html(value: object) -> str:
+    """Return HTML, by the public name of its function, which lies above."""
+    import eigengs_dr as eg
 
-
-def to_html(value: object) -> str:
-    """Return pictures and figures of a set, a fit, a basis or a model as HTML."""
-    return make_html(value)
+    return eg.to_html(value)

@@ -22,10 +22,11 @@ import gc
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import cache, wraps
+from itertools import count
 from typing import Any
 
 import drjit as dr
@@ -106,7 +107,7 @@ def exclusive() -> Iterator[None]:
     _users.add(threading.get_ident())
     with _LOCK:
         _clear_retired()
-        kept = find_shared() if _blocks == 0 and len(_users) > 1 else []
+        kept = _living() if _blocks == 0 and len(_users) > 1 else []
         _blocks += 1
         try:
             yield
@@ -120,12 +121,40 @@ def exclusive() -> Iterator[None]:
             _clear_retired()
 
 
-def find_shared() -> list[object]:
-    """Return what other threads must not free during an `exclusive` block, which keeps it.
+_kept: set[type] = set()
+"""Types of pointers to the objects that every `exclusive` block keeps alive."""
 
-    `eigengs_dr.plugins` puts a function here that finds the objects of Mitsuba's scenes.
+NONE = 0xFFFFFFFF
+"""A number that no object has."""
+
+
+def keep_objects(pointers: Iterable[type]) -> None:
+    """Let no thread free an object of a class with virtual calls during an `exclusive` block.
+
+    Dr.Jit records a call for all objects of a class in the process, one after the other, and ends
+    the process or reads freed memory if one is freed meanwhile. Mitsuba renders without Python's
+    lock, so another thread that drops a scene does not wait for it.
+
+    Parameters
+    ----------
+    pointers : iterable of type
+        Dr.Jit's types of pointers to the classes, such as ``mitsuba.BSDFPtr``.
     """
-    return []
+    _kept.update(pointers)
+
+
+def _living() -> list[object]:
+    """Return all objects of the classes of `keep_objects`. Dr.Jit numbers them from 1."""
+    found = []
+    for pointer in tuple(_kept):
+        number_type = dr.uint32_array_t(pointer)
+        try:
+            dr.reinterpret_array(pointer, number_type(NONE))[0]  # fails if there ever was one
+        except RuntimeError:
+            with suppress(RuntimeError):  # after the last one
+                for number in count(1):
+                    found.append(dr.reinterpret_array(pointer, number_type(number))[0])
+    return found  # None for numbers that are free
 
 
 def _first_cause(error: BaseException) -> BaseException:

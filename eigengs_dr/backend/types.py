@@ -35,6 +35,9 @@ Arrays = dict[str, Values]
 Record = dict[str, Any]
 """Numbers, strings and lists by name, as in JSON."""
 
+Texture = Any
+"""A ``mitsuba.Texture`` of the current variant."""
+
 if TYPE_CHECKING:
     import drjit
     from drjit.auto import ad

@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 import click
 
 from ..backend.doors import progress_bar
-from ..backend.executor import ClusterError
 from ..backend.interrupts import INTERRUPTED, NAME, terminate_as_interrupt
 from ..backend.messages import printable
 from ..backend.selection import BackendError
+from ..cluster import ClusterError
 
 Result = TypeVar("Result")
 

@@ -15,12 +15,11 @@ import eigengs_dr as eg
 from ..backend.messages import printable
 from ..backend.selection import select
 from ..backend.types import Record
-from ..gaussian import file as set_file
-from ..gaussian.file import SetData
-from ..gaussian.packed import is_packed
+from ..codec.egs import is_packed, read_egs_head, section_counts
+from ..gaussian.file import SetData, read_figures
 from ..storage import npz
 from . import options
-from .console import exit_if_failed, for_each, prefix_errors, table
+from .console import exit_if_failed, for_each, table
 from .outputs import check_outputs, name_pictures
 from .scene import load_mitsuba, scene_errors
 
@@ -77,28 +76,17 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
 
 def _facts_of(file: Path, picture: Path | None, texture: bool) -> Record:
     """Return what a file holds, and draw it."""
-    from ..eigenbasis.files import MODEL_FORMAT
-    from ..relight.model import FORMAT, holds_lights
-
-    packed = is_packed(file)
-    file_format = set_file.FORMAT if packed else npz.format_of(file)
-    kinds = {set_file.FORMAT: "image", set_file.MATERIAL: "material", MODEL_FORMAT: "model"}
-    kinds[FORMAT] = "lights"
-    if file_format not in kinds:
-        expected = ", ".join(kinds)
-        raise ValueError(f"{file}: format is {file_format[:40]!r}, expected one of {expected}")
-    kind = "material" if packed and set_file.maps_of(file) else kinds[file_format]
-    if packed and holds_lights(file):
-        kind = "lights"
-    facts: Record = {"file": str(file), "kind": kind, "bytes": file.stat().st_size}
-    if kind == "model":
-        facts |= _describe_model(eg.EigenGS.load(file))
-    elif kind == "lights":
-        facts |= _describe_lights(eg.Relightable.load(file))
-    elif packed:
-        facts |= _describe_packed(file)
+    content, packed = eg.load(file), is_packed(file)
+    if isinstance(content, eg.Eigenbasis):
+        raise ValueError(f"{file}: is a basis, which EigenGS.fit takes; give a model")
+    if isinstance(content, eg.EigenGS):
+        kind, found = "model", _describe_model(content)
+    elif isinstance(content, eg.Relightable):
+        kind, found = "lights", _describe_lights(content)
     else:
-        facts |= _describe_fit(file)
+        kind, found = "material" if content.maps else "image", _describe_set(content.data())
+        found |= _packing_of(file) if packed else _fit_of(file) if not content.maps else {}
+    facts: Record = {"file": str(file), "kind": kind, "bytes": file.stat().st_size} | found
     if kind != "model":
         facts["bpp"] = round(8 * facts["bytes"] / (facts["width"] * facts["height"]), 4)
     if texture:
@@ -108,7 +96,7 @@ def _facts_of(file: Path, picture: Path | None, texture: bool) -> Record:
         facts["ledger"] = npz.sizes_of(file)
     if picture:
         options.check_pixels(facts["width"], facts["height"])
-        _draw(file, kind, picture)
+        _draw(content, picture)
     return facts
 
 
@@ -122,29 +110,25 @@ def _describe_set(data: SetData) -> Record:
     return facts | {"space": data.space}
 
 
-def _describe_fit(file: Path) -> Record:
-    """Describe a set and its fit. The set is read completely, to check that it can be loaded."""
-    data = set_file.read_set(file)
-    facts = _describe_set(data)
-    if not data.maps and (figures := set_file.read_figures(file)):
-        for name in ("psnr_ycbcr", "psnr_rgb"):  # JSON has no infinity
-            if (value := getattr(figures, name)) is not None:
-                facts[name] = round(value, 2) if isfinite(value) else str(value)
-        facts |= {"iterations": figures.iterations, "source": figures.source}
+def _fit_of(file: Path) -> Record:
+    """Describe the fit of a set, if its file does."""
+    figures = read_figures(file)
+    if figures is None:
+        return {}
+    facts: Record = {}
+    for name in ("psnr_ycbcr", "psnr_rgb"):  # JSON has no infinity
+        if (value := getattr(figures, name)) is not None:
+            facts[name] = round(value, 2) if isfinite(value) else str(value)
+    facts |= {"iterations": figures.iterations, "source": figures.source}
     return {name: value for name, value in facts.items() if value is not None}
 
 
-def _describe_packed(file: Path) -> Record:
-    """Describe a packed set, with the Gaussians of each section and the quantisation steps."""
-    from ..codec.egs import read_egs
-
-    packed = read_egs(file)
-    data = packed.set_data()
-    with prefix_errors(file):
-        set_file.check(data)
-    facts = _describe_set(data) | {"sections": [len(part.cell) for part in packed.sections]}
-    steps = {f"{name}_step": float(f"{x:.4g}") for name, x in packed.steps._asdict().items()}
-    return facts | steps | ({"psnr": round(packed.psnr, 2)} if isfinite(packed.psnr) else {})
+def _packing_of(file: Path) -> Record:
+    """Describe a packed set: the Gaussians of each section, and the quantisation steps."""
+    head = read_egs_head(file)
+    steps = {f"{name}_step": float(f"{x:.4g}") for name, x in head.steps._asdict().items()}
+    facts = {"sections": section_counts(file)} | steps
+    return facts | ({"psnr": round(head.psnr, 2)} if isfinite(head.psnr) else {})
 
 
 def _describe_model(model: eg.EigenGS) -> Record:
@@ -236,19 +220,19 @@ def _text(truncation: Any = (), maps: Any = (), ledger: Any = (), **facts: Any) 
     return "\n".join(lines)
 
 
-def _draw(file: Path, kind: str, picture: Path) -> None:
+def _draw(content: Any, picture: Path) -> None:
     """Write the picture of a set, of its maps side by side, or of a model."""
     from ..image.sheet import join_pictures
     from ..viewer.pictures import component_sheet
 
     pixels: Any
-    if kind == "model":
-        pixels = component_sheet(eg.EigenGS.load(file))
-    elif kind == "lights":
-        pixels = eg.picture_of(eg.Relightable.load(file).relight((0, 0, 1)))
+    if isinstance(content, eg.EigenGS):
+        pixels = component_sheet(content)
+    elif isinstance(content, eg.Relightable):
+        pixels = eg.picture_of(content.relight((0, 0, 1)))
     else:
-        pixels = eg.picture_of(eg.Gaussians.load(file))
-    if kind == "material":
+        pixels = eg.picture_of(content)
+    if isinstance(pixels, dict):
         in_rgb = [image.repeat(3 // image.shape[2], axis=2) for image in pixels.values()]
         pixels = join_pictures(in_rgb, 1)
     eg.save_image(picture, pixels)

@@ -88,10 +88,10 @@ def _pack(
     levels: int | tuple[int, ...] | None,
 ) -> Record:
     """Pack one set into a file, and return its figures."""
-    from ..relight.model import holds_lights
+    from ..gaussian.file import LIGHTS, kind_of
 
     before = file.stat().st_size
-    if holds_lights(file):
+    if kind_of(file) == LIGHTS:
         if image or maps or levels:
             raise ValueError(f"{file}: a model of lights takes no --image, --map and --levels")
         model = eg.Relightable.load(file, run.backend)

@@ -114,15 +114,13 @@ def _render(
     **choices: Any,
 ) -> Path:
     """Render one set to a file, and return its name."""
-    from ..gaussian.file import read_map
-    from ..gaussian.region import check_region
+    from ..gaussian.file import LIGHTS, check_region, kind_of, read_map
     from ..image.formats import TIFF_SUFFIXES
     from ..many.draw import save_region
-    from ..relight.model import holds_lights
 
     name, region, first = (choices[key] for key in ("name", "region", "first"))
     light = choices["light"]
-    if light is None and holds_lights(file):
+    if light is None and kind_of(file) == LIGHTS:
         raise ValueError(f"{file}: holds a model of lights; give --light, such as 0.3,0.2,0.9")
     if light is not None and name is not None:
         raise ValueError("--light and --map exclude each other; give one of them")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ..backend.plain import parse_json
 from ..backend.selection import backend_of, name_of, select
 from ..backend.types import Record
 from ..storage.atomic import atomic_write
@@ -46,8 +46,8 @@ def integrator(text: str) -> Record:
 def _value(text: str) -> object:
     """Parse a number or a boolean; other text is returned unchanged."""
     try:
-        return parse_json(text)
-    except ValueError:
+        return json.loads(text)
+    except (ValueError, RecursionError):
         return text
 
 

@@ -12,9 +12,8 @@ import eigengs_dr as eg
 
 from ..backend.selection import select
 from ..backend.types import Record
+from ..codec import egs
 from ..gaussian import file as set_file
-from ..gaussian.packed import is_packed
-from ..storage import npz
 from . import options
 from .console import prefix_errors, print_message
 from .outputs import check_outputs, lock_outputs, name_outputs
@@ -86,32 +85,25 @@ def view(
 
 def _load(
     file: Path, name: str | None, levels: int | tuple[int, ...] | None, backend: str | None
-) -> tuple[eg.Gaussians | eg.EigenGS | eg.Relightable, list[int]]:
+) -> tuple[Any, list[int]]:
     """Return the set or the model of a file or a name, and the Gaussians up to each level.
 
     The file need not be trusted: the number of Gaussians is checked before they are read.
     """
-    from ..codec import egs
     from ..eigenbasis.eigengs import SHIPPED
     from ..eigenbasis.files import MODEL_FORMAT
-    from ..relight.model import holds_lights
     from ..viewer.view import check_count
 
     file = SHIPPED.get(str(file), file)
     options.refuse_folder(file)
-    if holds_lights(file):
-        if levels is not None or name is not None:
-            raise ValueError(f"{file}: is a model of lights; leave out --levels and --map")
-        return eg.Relightable.load(file, backend), []
-    sections = egs.section_counts(file) if is_packed(file) else []
-    if not sections and npz.format_of(file) == MODEL_FORMAT:
+    if set_file.kind_of(file) in (MODEL_FORMAT, set_file.LIGHTS):
         if levels is not None or name is not None:
             raise ValueError(f"{file}: is a model; leave out --levels and --map")
-        return eg.EigenGS.load(file, backend), []
+        return eg.load(file, backend), []
+    sections = egs.section_counts(file) if egs.is_packed(file) else []
     with prefix_errors(file):
         check_count(sum(sections) or set_file.read_head(file)[0])
         gaussians = eg.Gaussians.from_data(set_file.read_map(file, name, "--map"), backend)
         if levels is not None:
             return gaussians, eg.level_counts(len(gaussians), levels)
-    has_levels = len(sections) > 1 and not set_file.maps_of(file)
-    return gaussians, list(accumulate(sections)) if has_levels else []
+    return gaussians, list(accumulate(sections)) if len(sections) > 1 else []

@@ -11,6 +11,7 @@ Dask loads this module in the workers of ``local`` before their first task.
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import os
 import re
@@ -38,10 +39,9 @@ from distributed.protocol.pickle import dumps, loads
 from distributed.scheduler import KilledWorker
 from threadpoolctl import threadpool_limits
 
-from ..backend.executor import ClusterError, Done, Function, Task, Value
 from ..backend.interrupts import defer_interrupts, terminate_as_interrupt
-from ..backend.plain import read_json
 from ..backend.recording import exclusive
+from . import ClusterError, Done, Function, Task, Value
 
 CONNECT_TIMEOUT = "distributed.comm.timeouts.connect"
 """Dask setting of the time limit for connecting to the scheduler, and for the first worker."""
@@ -112,8 +112,10 @@ def _client_of(cluster: str) -> Client:
     address = cluster
     if "://" not in cluster:
         try:
-            address = str(read_json(cluster)["address"])
-        except (ValueError, KeyError, TypeError):
+            address = json.loads(Path(cluster).read_bytes())["address"]
+            if not isinstance(address, str):
+                raise TypeError
+        except (ValueError, KeyError, TypeError, RecursionError):
             raise ValueError(
                 f"cluster {cluster!r} is not the file of a scheduler, as 'dask scheduler "
                 "--scheduler-file FILE' writes it"
@@ -153,7 +155,7 @@ def dask_setup(worker: Worker) -> None:
 
 
 class ClusterExecutor:
-    """The `eigengs_dr.backend.executor.Executor` of a Dask client.
+    """The `eigengs_dr.cluster.Executor` of a Dask client.
 
     Parameters
     ----------

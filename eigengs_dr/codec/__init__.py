@@ -1,4 +1,4 @@
-"""Few bytes: the files `.egs`.
+"""The files `.egs`: integers of Gaussians in few bytes.
 
 - ``quantization``: Gaussians as integers
 - ``exact_math``: functions whose results are bit-identical on every machine
@@ -6,6 +6,4 @@
   Gaussians without their order
 - ``gaussian_model``: the probabilities of all other numbers, from neighbours
 - ``egs``: the .egs file with its table of maps and its sections
-- ``packing``: `pack`
-- ``rounding``: the largest steps within a loss, and rounding with error feedback
 """

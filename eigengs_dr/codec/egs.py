@@ -16,25 +16,25 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import BinaryIO, NamedTuple, cast
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.types import Integers
-from ..gaussian.channels import TextureMap, channel_weights, check_maps
-from ..gaussian.file import CUTOFF, SetData, check, file_errors
-from ..gaussian.packed import MAGIC
 from ..image.color import MAX_CHANNELS
-from ..image.space import SPACES, Space
+from ..image.space import SPACES
 from ..storage.atomic import atomic_write
 from ..storage.memory import check_content, open_regular
-from ..storage.npz import BadValue
+from ..storage.npz import BadValue, file_errors
 from .gaussian_model import MIN_RICH_COUNT, GaussianCoder, SectionModel
-from .quantization import Steps, Symbols, dequantize
+from .quantization import Steps, Symbols
 from .range_coder import EVENNESS, MAX_LEVELS, Decoder, Encoder, code_cells, hilbert_encode
 
 SUFFIX = ".egs"
+
+MAGIC = b"\x89EGS"
+"""First bytes of a file. The first byte is not ASCII, so no text file starts with it."""
 
 VERSION, MAPS_VERSION, LIGHTS_VERSION = 5, 6, 7
 """Versions of the format: for a set without maps, with a table of maps, and with a table of lights.
@@ -77,11 +77,11 @@ class EgsContent(NamedTuple):
         One of `eigengs_dr.image.space.SPACES`.
     cutoff : float
         Radius of a Gaussian in standard deviations.
-    maps : tuple of TextureMap
-        The maps of a set, whose colours and background are multiplied by their weights; empty for
-        an image.
+    maps : tuple of (str, str, int, float)
+        The name, space, number of channels and weight of each map of a set, whose colours and
+        background are multiplied by the weights; empty for an image.
     psnr : float
-        PSNR against the image in dB, see `eigengs_dr.codec.packing.PackResult`; NaN if unknown.
+        PSNR against the image in dB, see `eigengs_dr.packing.pack.PackResult`; NaN if unknown.
     lights : bytes
         The table of lights of planes, see `eigengs_dr.relight.model.table_bytes`; else empty.
     """
@@ -90,20 +90,11 @@ class EgsContent(NamedTuple):
     steps: Steps
     background: NDArray[np.float32]
     size: tuple[int, int]
-    space: Space
-    cutoff: float = CUTOFF
-    maps: tuple[TextureMap, ...] = ()
+    space: str
+    cutoff: float
+    maps: tuple[tuple[Any, ...], ...] = ()
     psnr: float = float("nan")
     lights: bytes = b""
-
-    def set_data(self) -> SetData:
-        """Return the set, in single precision."""
-        values = {**dequantize(self.all_symbols(), self.steps), "background": self.background}
-        with np.errstate(over="ignore"):
-            arrays = {name: value.astype(np.float32) for name, value in values.items()}
-        scale = np.array(channel_weights(self.maps) or 1, np.float32)
-        arrays |= {name: arrays[name] / scale for name in ("color", "background")}
-        return SetData(arrays, self.size, self.space, self.cutoff, self.maps)
 
     def all_symbols(self) -> Symbols:
         """Return the Gaussians of all sections."""
@@ -137,32 +128,21 @@ def egs_bytes(packed: EgsContent) -> bytes:
 
 
 def write_egs(path: str | os.PathLike[str], packed: EgsContent) -> int:
-    """Write a file atomically; return its number of bytes.
-
-    Raises
-    ------
-    ValueError
-        If `Gaussians.load` would reject the set.
-    OSError
-        If the file cannot be written; an existing file does not change.
-    """
-    with file_errors(path):
-        check(packed.set_data())
+    """Write a file atomically; return its number of bytes."""
     content = egs_bytes(packed)
     with atomic_write(path) as temporary:
         return temporary.write_bytes(content)
 
 
-def _map_table(maps: Sequence[TextureMap]) -> bytes:
+def _map_table(maps: Sequence[tuple[Any, ...]]) -> bytes:
     """Return the table of maps; empty for an image.
 
     The first byte is the number of maps. Each map has the length of its name, the index of its
     space and its number of channels (one byte each), its weight (float64), and its name in ASCII.
     """
     parts = [bytes([len(maps)])] if maps else []
-    for m in maps:
-        name = m.name.encode("ascii")
-        parts += [_MAP.pack(len(name), SPACES.index(m.space), m.channels, m.weight), name]
+    for name, space, channels, weight in maps:
+        parts += [_MAP.pack(len(name), SPACES.index(space), channels, weight), name.encode("ascii")]
     return b"".join(parts)
 
 
@@ -251,11 +231,16 @@ def read_egs(path: str | os.PathLike[str], sections: int | None = None) -> EgsCo
         return content
 
 
-def read_egs_head(path: str | os.PathLike[str]) -> tuple[tuple[TextureMap, ...], bytes]:
-    """Return the maps of a packed set, and the table of lights of planes; errors as `read_egs`."""
+def is_packed(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is a packed set; for errors see `open_regular`."""
+    with open_regular(path) as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def read_egs_head(path: str | os.PathLike[str]) -> EgsContent:
+    """Return the content of a packed set without its sections; errors as for `read_egs`."""
     with _opened(path) as file:
-        content = _read_header(file)[3]
-    return content.maps, content.lights
+        return _read_header(file)[3]
 
 
 def section_counts(path: str | os.PathLike[str]) -> list[int]:
@@ -275,7 +260,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
     """Return the levels, the number of sections, the first cell, and the content without sections.
 
-    Headers that `egs_bytes` never writes are rejected; `Gaussians.load` checks the rest.
+    Headers that `egs_bytes` never writes are rejected; `eigengs_dr.gaussian.file` checks the rest.
     """
     head = exactly(file, _HEADER.size)
     magic, version, space, channels, levels, count, *rest = _HEADER.unpack(head)
@@ -293,8 +278,8 @@ def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
         table = _read_lights(file)
     if exactly(file, 4) != zlib.crc32(head + background + table).to_bytes(4, "little"):
         raise BadValue("the header is damaged; copy the file again")
-    if version == MAPS_VERSION:
-        check_maps(maps, channels)
+    if version == MAPS_VERSION and not maps:
+        raise BadValue("maps are none; give each name once")
     steps = Steps(color, cell)
     if not 1 <= channels <= MAX_CHANNELS:
         raise BadValue(f"the header claims {channels} channels, expected 1 to {MAX_CHANNELS}")
@@ -320,15 +305,15 @@ def _read_lights(file: BinaryIO) -> bytes:
     return head + exactly(file, length)
 
 
-def _read_maps(file: BinaryIO) -> tuple[bytes, tuple[TextureMap, ...]]:
-    """Read a table of maps; return its bytes and the maps, which `check_maps` checks."""
-    table, maps = exactly(file, 1), []
+def _read_maps(file: BinaryIO) -> tuple[bytes, tuple[tuple[Any, ...], ...]]:
+    """Read a table of maps; return its bytes and the maps, which are not checked."""
+    table, maps = exactly(file, 1), list[tuple]()
     for _ in range(table[0]):
         entry = exactly(file, _MAP.size)
         length, number, channels, weight = _MAP.unpack(entry)
         name = exactly(file, length)
-        space = SPACES[number] if number < len(SPACES) else cast(Space, f"number {number}")
-        maps.append(TextureMap(name.decode("ascii", "replace"), space, channels, weight))
+        space = SPACES[number] if number < len(SPACES) else f"number {number}"
+        maps.append((name.decode("ascii", "replace"), space, channels, weight))
         table += entry + name
     return table, tuple(maps)
 

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.types import Doubles, Floats, Integers
-from ..gaussian.covariance import log_shapes
 from .exact_math import cos_turns, exp2, sin_turns, sum_in_order
 
 MAX_SYMBOL = 1 << 23
@@ -138,6 +137,29 @@ class Quantizer:
             unit = self.precision * (self.cell / MEAN_STEP)
             parts = np.rint(np.stack([factor[:, 0] * unit, factor[:, 2] * unit], axis=1))
         return np.clip(np.nan_to_num(parts, nan=1.0), 1, MAX_PARTS).astype(np.int64)
+
+
+def log_shapes(factor: Floats) -> Doubles:
+    """Return the matrix logarithms ``1/2 log(F^T F) = [[s + u, v], [v, s - u]]``.
+
+    Parameters
+    ----------
+    factor : ndarray, shape (N, 3)
+        a, b, c.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        s, u, v. The geometric mean of the two standard deviations is ``exp(-s)``. The vector (u, v)
+        gives elongation and direction, and is 0 for a round Gaussian.
+    """
+    a, b, c = np.asarray(factor, np.float64).T
+    half, across, size = 0.5 * (a * a - b * b - c * c), a * b, np.log(a * c)
+    # The larger eigenvalue of F^T F is a sum of positive numbers: there is no cancellation.
+    largest = 0.5 * (a * a + b * b + c * c) + np.hypot(half, across)
+    length = 0.5 * (np.log(largest) - size)
+    angle = np.arctan2(across, half)
+    return np.stack([0.5 * size, length * np.cos(angle), length * np.sin(angle)], axis=1)
 
 
 def quantize(arrays: dict[str, Floats], steps: Steps, dead_zone: float = 0.0) -> Symbols:

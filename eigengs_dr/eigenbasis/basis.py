@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..backend.doors import checks_types, shows_progress
-from ..backend.messages import shown, to_html, warn
+from ..backend.messages import notebook_html, shown, warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..image.folder import TrainingImages, find_lists
 from ..image.io import check_member
@@ -157,7 +157,7 @@ class Eigenbasis:
         components = name_components(self.space, map(len, self.components))
         return f"Eigenbasis({self.count} images, {self.width}x{self.height} pixels, {components})"
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     @property
     def width(self) -> int:
@@ -217,7 +217,11 @@ class Eigenbasis:
             See `from_images`.
         """
         if images is None:
-            refuse_encoding(encoding, "the curve follows from the eigenvalues")
+            if encoding is not None:
+                raise ValueError(
+                    "encoding is for the pixels of images, and the curve follows from the "
+                    "eigenvalues; leave it out"
+                )
             return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean.size)
         with series():
             rows = [self._residuals(image, encoding) for image in images]
@@ -274,12 +278,6 @@ class Eigenbasis:
         lengths = np.einsum("cij,cij->c", planes, planes, dtype=np.float64)
         pairs = zip(lengths, self._coefficients(planes), strict=True)
         return [residual_energy(length, w.astype(np.float64) ** 2) for length, w in pairs]
-
-
-def refuse_encoding(encoding: str | None, reason: str) -> None:
-    """Raise ValueError if an encoding is given where no pixels are read."""
-    if encoding is not None:
-        raise ValueError(f"encoding is for the pixels of images, and {reason}; leave it out")
 
 
 def check_components(

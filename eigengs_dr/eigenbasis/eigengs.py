@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..backend.doors import checks_types, door, shows_progress
-from ..backend.messages import to_html
+from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike, Doubles, Record, Singles
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.io import Codes, check_member
@@ -88,7 +88,6 @@ class EigenGS:
         iterations: int | None = None,
         backend: str | None = None,
         progress: Any = None,
-        encoding: str | None = None,
     ) -> EigenGS:
         """Fit one set of Gaussians to the mean image and all components of an eigenbasis.
 
@@ -112,8 +111,6 @@ class EigenGS:
         progress : bool or callable, optional
             By default a bar, in a terminal or a notebook, after two seconds; False shows none. A
             function is called as ``progress(step, steps, {})`` after every round of training.
-        encoding : {"srgb", "linear"}, optional
-            What the pixels of images are, see `eigengs_dr.Eigenbasis.from_images`.
 
         Raises
         ------
@@ -122,13 +119,11 @@ class EigenGS:
         BackendError
             If the backend does not work.
         """
-        from .basis import Eigenbasis, refuse_encoding
+        from .basis import Eigenbasis
         from .components import TrainOptions, fit_model
 
         if not isinstance(basis, Eigenbasis):
-            basis = Eigenbasis.from_images(basis, progress=False, encoding=encoding)
-        else:
-            refuse_encoding(encoding, "a basis holds none")
+            basis = Eigenbasis.from_images(basis, progress=False)
         options = TrainOptions(
             size=(basis.width, basis.height),
             gaussians=gaussians,
@@ -148,7 +143,7 @@ class EigenGS:
         size = f"{len(self.gaussians)} Gaussians, {self.gaussians.width}x{self.gaussians.height}"
         return f"EigenGS({size} pixels, {name_components(self.gaussians.space, self.components)})"
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     @property
     def components(self) -> tuple[int, ...]:
@@ -349,12 +344,11 @@ class EigenGS:
         ValueError, OSError
             As for `eigengs_dr.Gaussians.load`; also if there is no such file or name.
         """
-        if path in SHIPPED:
-            return cls(**read_model(SHIPPED[str(path)], backend))
-        if not Path(path).is_file():
+        file = SHIPPED.get(str(path), Path(path))
+        if not file.is_file():
             names = ", ".join(SHIPPED)
             raise ValueError(f"model {str(path)!r} is neither a file nor one of: {names}")
-        return cls(**read_model(path, backend))
+        return cls(**read_model(file, backend))
 
     def __getstate__(self) -> Record:
         """Leave out the encoder, whose cached values are Dr.Jit arrays."""

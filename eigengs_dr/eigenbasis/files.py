@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.types import Arrays, Record, Singles
-from ..gaussian.file import CUTOFF, SetData, check, file_errors
+from ..gaussian.file import CUTOFF, SetData, check
 from ..gaussian.gaussians import Gaussians
 from ..image.space import FAMILY_SPACES, space_of
 from ..storage import npz
-from ..storage.npz import BadValue, Field
+from ..storage.npz import BadValue, Field, check_values, file_errors
 
 BASIS_FORMAT, BASIS_VERSION = "eigengs_dr.eigenbasis", 2
 
@@ -200,12 +200,7 @@ def check_arrays(arrays: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
 
     They must be finite and have these shapes. Eigenvalues must descend, and match the variance.
     """
-    for name, array in arrays.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise BadValue(f"{name} holds values that are not finite")
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise BadValue(f"{name} has shape {arrays[name].shape}, expected {shape}")
+    check_values(arrays, shapes)
     if arrays["space"] not in FAMILY_SPACES:
         known = ", ".join(FAMILY_SPACES)
         raise BadValue(f"space is {str(arrays['space'])!r}, expected one of {known}")

@@ -24,10 +24,9 @@ import numpy as np
 from scipy.linalg import eigh
 from threadpoolctl import threadpool_limits
 
-from ..backend.executor import completed
 from ..backend.messages import warn
 from ..backend.types import Doubles, Singles, Values
-from ..cluster import executor_for
+from ..cluster import completed, executor_for
 from ..image.folder import ReadProgress, TrainingImages, list_images, read_blocks
 from ..image.notes import NotedImages, kept_notes, tell_all
 from ..image.pixels import ImageError, local_path

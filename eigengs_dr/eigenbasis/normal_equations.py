@@ -8,10 +8,9 @@ once, and each image costs one product and one back-substitution. For a single i
 
 from __future__ import annotations
 
-import weakref
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from itertools import pairwise
+from itertools import pairwise, repeat
+from operator import matmul
 from typing import NamedTuple
 
 import drjit as dr
@@ -21,11 +20,9 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from ..backend.arrays import types_of, upload
-from ..backend.recording import freeze_program
 from ..backend.types import Doubles, Singles
 from ..gaussian.gaussians import Gaussians
 from ..image.strips import available_cores
-from ..raster.adjoint import adjoint
 from ..raster.evaluate import weights
 from ..raster.parameters import (
     NUM_SHAPE_PARAMS,
@@ -34,11 +31,6 @@ from ..raster.parameters import (
     pack_parameters,
     unpack_parameters,
 )
-from ..raster.render import bin_gaussians, to_tiles
-
-ADJOINT_PLANES = 3
-"""Number of planes that one adjoint correlates, the channels of an image, so that all calls share a
-program."""
 
 THREADS = min(4, available_cores())
 """Number of threads that share a sparse product; SciPy releases the interpreter lock. The result
@@ -46,14 +38,6 @@ does not depend on it."""
 
 BATCH = 48
 """Number of columns of one sparse product."""
-
-MIN_BATCH = 12
-"""Smallest number of columns for sparse products. With 48 columns, 5,000 Gaussians and 256x256
-pixels, a sparse product takes a third of the time of adjoints; with the 3 columns of one image it
-is not faster."""
-
-MAX_KEPT_WEIGHTS = 1 << 24
-"""Largest number of weights that are kept for sparse products, in 128 MiB of memory."""
 
 STRIP_PIXELS = 2048
 """Number of pixels that are transposed at once; the planes of a strip fit into the cache."""
@@ -117,27 +101,16 @@ class NormalEquations:
     """
 
     def __init__(self, gaussians: Gaussians, low: int = 0) -> None:
-        self.count, self.radius = len(gaussians), kernel_radius(gaussians.cutoff)
+        self.count = len(gaussians)
         self.width, self.height = gaussians.width, gaussians.height
         matrix = weight_matrix(gaussians)
         double = matrix.astype(np.float64)
         self.gram = (double @ double.T).tocsr()
         self.coverage = np.asarray(matrix.sum(axis=1), np.float64)
         ends = [self.count * k // THREADS for k in range(THREADS + 1)]
-        keep = matrix.nnz <= MAX_KEPT_WEIGHTS
-        self.shares = [matrix[slice(*pair)] for pair in pairwise(ends)] if keep else []
+        self.shares = [matrix[slice(*pair)] for pair in pairwise(ends)]
         ends = [0, low, self.count] if low else [0, self.count]
         self.blocks = [self._block(slice(*pair)) for pair in pairwise(ends)]
-        with dr.suspend_grad():
-            types = types_of(gaussians.mean)
-            self.packed = pack_parameters(
-                [*kernel_shape(gaussians), *[types.Float(0)] * ADJOINT_PLANES]
-            )
-            self.lists = bin_gaussians(gaussians)
-        # Tracing the adjoint takes 0.4 ms in Python, calling a frozen one 0.05 ms.
-        programs = ExitStack()
-        self.adjoint = programs.enter_context(freeze_program(adjoint))
-        weakref.finalize(self, programs.close)
 
     def _block(self, rows: slice) -> FactoredBlock:
         """Factorise the equations of some Gaussians."""
@@ -174,43 +147,16 @@ class NormalEquations:
         Returns
         -------
         ndarray of float64, shape (N + 1, M)
-            Cost: one sparse product for `MIN_BATCH` to `BATCH` planes; for fewer planes, one
-            adjoint with respect to colours per `ADJOINT_PLANES`.
+            Cost: one sparse product for `BATCH` planes.
         """
         result = np.empty((self.count + 1, len(images)))
         for first in range(0, len(images), BATCH):
             planes = images[first : first + BATCH]
-            sums = result[:-1, first : first + len(planes)]
-            if self.shares and len(planes) >= MIN_BATCH:
-                sums[:] = self._multiply(planes)
-            else:
-                self._adjoint(planes, sums)
+            products = _POOL.map(matmul, self.shares, repeat(_columns(planes)))
+            result[:-1, first : first + len(planes)] = np.vstack(list(products))
         # Summing along the axis of rows first is fast for planes and for interleaved pixels.
         result[-1] = images.sum(axis=1).sum(axis=1, dtype=np.float64)
         return result
-
-    def _multiply(self, planes: Singles) -> Singles:
-        """Return ``A^T D`` of many planes, shape (N, M), by sparse products."""
-        flat = planes.reshape(len(planes), -1)
-        columns = np.empty(flat.shape[::-1], np.float32)
-        for first in range(0, len(columns), STRIP_PIXELS):
-            columns[first : first + STRIP_PIXELS] = flat[:, first : first + STRIP_PIXELS].T
-        return np.vstack(list(_POOL.map(lambda share: share @ columns, self.shares)))
-
-    def _adjoint(self, planes: Singles, result: Doubles) -> None:
-        """Write ``A^T D`` of few planes to an array (N, M), computed by Dr.Jit."""
-        types = types_of(self.packed)
-        with dr.suspend_grad():
-            for first in range(0, len(planes), ADJOINT_PLANES):
-                group = planes[first : first + ADJOINT_PLANES]
-                missing = [(0, ADJOINT_PLANES - len(group)), (0, 0), (0, 0)]
-                padded = np.pad(group, missing) if len(group) < ADJOINT_PLANES else group
-                delta = to_tiles(types, np.moveaxis(padded, 0, 2), self.lists.grid)
-                rows = self.adjoint(
-                    self.packed, delta, ADJOINT_PLANES, self.lists, self.radius, True
-                )
-                for column, row in zip(range(first, first + len(group)), rows, strict=False):
-                    result[:, column] = row.numpy()
 
     def solve(self, correlations: Doubles) -> Doubles:
         """Return the least-squares coefficients for the result of `correlate`.
@@ -268,6 +214,18 @@ class NormalEquations:
         product = self.product(coefficients)
         error = squared_norms + ((product - 2 * correlations) * coefficients).sum(axis=0)
         return np.maximum(error, 0)
+
+
+def _columns(planes: Singles) -> Singles:
+    """Return planes (M, H, W) as columns (H W, M); a view of interleaved pixels is not copied."""
+    pixels = np.moveaxis(planes, 0, 2)
+    if pixels.flags.c_contiguous:
+        return pixels.reshape(-1, len(planes))
+    flat = planes.reshape(len(planes), -1)
+    columns = np.empty(flat.shape[::-1], np.float32)
+    for first in range(0, len(columns), STRIP_PIXELS):
+        columns[first : first + STRIP_PIXELS] = flat[:, first : first + STRIP_PIXELS].T
+    return columns
 
 
 def squared_norms(planes: Singles) -> Doubles:

@@ -25,8 +25,8 @@ from ..backend.doors import check_fields
 from ..backend.recording import record
 from ..backend.types import Bool, Float, Rows, UInt
 from ..gaussian.gaussians import Gaussians, concatenate, take, whole
-from ..raster.binning.lists import TileLists
 from ..raster.kernels import channel_sums, sum_by_image
+from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape
 from ..raster.render import bin_gaussians, to_tiles
 from .objective import Part, Pixels, Quadratic
@@ -511,7 +511,7 @@ class _Comparison:
 
     def peaks(self, slope: Float, count: int) -> Peaks:
         """Return where at most `count` added Gaussians would reduce the loss of an image most."""
-        canvas = Canvas(types_of(slope), self.lists.grid, self.lists.sizes)
+        canvas = Canvas(types_of(slope), self.lists.grid, self.lists.layout)
         return residual_peaks(canvas, -slope, self.model.curvatures(self.lists.grid), count)
 
 

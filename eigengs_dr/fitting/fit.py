@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..backend.doors import checks_types, door, shows_progress
 from ..backend.interrupts import Interrupted, defer_interrupts
-from ..backend.messages import to_html
+from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike
 from ..gaussian.file import FitFigures, write_set
 from ..gaussian.gaussians import Gaussians
@@ -118,7 +118,7 @@ class Fit:
             f"seconds={self.seconds:.2f}, stopped={self.stopped!r})"
         )
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     @checks_types
     def save(self, path: str | os.PathLike[str]) -> None:

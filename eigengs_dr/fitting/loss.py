@@ -24,8 +24,8 @@ from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.space import Affine
-from ..raster.binning.lists import TileLists
 from ..raster.kernels import forward, pixels_inside
+from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import bin_gaussians, to_tensor
 from .objective import Channels, Pixels, Quadratic, Slope

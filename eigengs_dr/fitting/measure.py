@@ -20,8 +20,8 @@ from ..backend.types import Float, Record
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import RGB_TO_YCBCR, to_linear, to_pu21
 from ..image.metrics import psnr_from_mse
-from ..raster.binning.lists import TileLists
 from ..raster.kernels import image_of, pixels_inside, sum_by_image
+from ..raster.lists import TileLists
 from ..raster.parameters import (
     detached_shape,
     gather_run,
@@ -101,7 +101,7 @@ def _squared_errors(
     rendered = image_of(packed, background, lists, kernel_radius(cutoff))
     length = grid.tile[0]
     run = dr.arange(types.UInt, grid.tiles * grid.pixels // length)
-    owner = lists.sizes.image_of(run // (grid.pixels // length))
+    owner = lists.layout.image_of(run // (grid.pixels // length))
 
     def read(image: Float) -> list:
         channels = dr.width(image) // (grid.tiles * grid.pixels)

@@ -24,11 +24,11 @@ from ..gaussian.channels import TextureMap
 from ..gaussian.gaussians import Gaussians, whole
 from ..image.color import exposed
 from ..image.space import DATA, Affine, Extent, Space
-from ..raster.binning.lists import TileLists
-from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums, forward, pixels_inside, residual
+from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import batch_to_tiles, bin_gaussians, to_tensor
+from ..raster.tiles import Grid
 
 if TYPE_CHECKING:
     from .state import State

@@ -19,9 +19,8 @@ from ..backend.recording import record
 from ..backend.types import Float, UInt
 from ..gaussian.gaussians import Gaussians, whole
 from ..raster.adjoint import adjoint
-from ..raster.binning.lists import TileLists
-from ..raster.binning.tiles import Grid
 from ..raster.kernels import channel_sums, difference, image_of, sum_by_image
+from ..raster.lists import TileLists
 from ..raster.parameters import (
     detached_shape,
     gather_run,
@@ -29,6 +28,7 @@ from ..raster.parameters import (
     pack_parameters,
 )
 from ..raster.render import bin_gaussians
+from ..raster.tiles import Grid
 from .objective import Pixels, Quadratic
 
 RELATIVE_TOLERANCE = {32: 1e-12, 64: 1e-28}
@@ -249,7 +249,7 @@ def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) ->
     types, grid = types_of(image), lists.grid
     tile, length = dr.arange(types.UInt, grid.tiles), grid.pixels * len(factors)
     change = gather_run(types, step, tile, length, True)
-    owner = lists.sizes.image_of(tile)
+    owner = lists.layout.image_of(tile)
     factors = [spread(f, owner) for f in factors]
     added = [c * f for c, f in zip(change, factors * grid.pixels, strict=True)]
     add, alone = dr.ReduceOp.Add, dr.ReduceMode.NoConflicts

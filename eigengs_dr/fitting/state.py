@@ -16,7 +16,7 @@ from ..backend.arrays import rsqrt, types_of
 from ..backend.doors import check_fields
 from ..backend.types import Float, FloatLike, Rows
 from ..gaussian.gaussians import Gaussians
-from ..raster.binning.lists import TileLists
+from ..raster.lists import TileLists
 
 Variables: TypeAlias = dict[str, Rows]
 """Variables by name: arrays of Dr.Jit with one or several numbers for each Gaussian."""

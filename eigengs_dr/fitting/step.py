@@ -19,8 +19,8 @@ from ..backend.arrays import ArrayTypes, make_divisor, types_of, upload
 from ..backend.types import Float, FloatLike, Mask, UInt
 from ..gaussian.gaussians import Gaussians, take, whole
 from ..raster.adjoint import adjoint_pieces, sum_pieces
-from ..raster.binning.lists import TileLists
 from ..raster.kernels import sum_lanes
+from ..raster.lists import TileLists
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import bin_gaussians
 from .method import Method
@@ -177,15 +177,14 @@ def step_program(objective: Pixels, method: Method) -> StepProgram:
             delta, squares = model.compare(moving.packed, background, listed, radius, pairs=True)
             parts = adjoint_pieces(moving.packed, delta, channels, listed, radius)
             dr.eval(parts)
-            number = listed.sizes.width * listed.sizes.height * channels
+            number = listed.layout.width * listed.layout.height * channels
             factor = 2 / number
             if levels:
                 factor = factor / (sum(sum_lanes(squares, listed)) / number + LOSS_EPSILON)
             sums = _sum_level(parts, listed, channels, len(fixed))
             before = gradient or [0.0] * len(sums)
             gradient = [g + s * factor for g, s in zip(before, sums, strict=True)]
-        sizes = lists[0].sizes
-        size = sizes.width, sizes.height
+        size = lists[0].layout.width, lists[0].layout.height
         rests = model.size == 0 if isinstance(model, Slope) else None
         return _move(method, moving, fixed, gradient, rates, index, size, rests)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,7 +70,7 @@ def check_name(name: str) -> None:
         )
 
 
-def check_maps(maps: Sequence[TextureMap], channels: int) -> tuple[TextureMap, ...]:
+def check_maps(given: Sequence[tuple[Any, ...]], channels: int) -> tuple[TextureMap, ...]:
     """Return maps that may still be plain tuples, and whose spaces may be names.
 
     Raises
@@ -81,10 +81,10 @@ def check_maps(maps: Sequence[TextureMap], channels: int) -> tuple[TextureMap, .
         If maps are invalid, or their total number of channels differs.
     """
     try:
-        maps = [TextureMap(*m) for m in maps]
+        maps = [TextureMap(*m) for m in given]
     except TypeError:
         raise TypeError(
-            f"maps are {shown(maps)}; give the name, space and channels of each"
+            f"maps are {shown(given)}; give the name, space and channels of each"
         ) from None
     names = [m.name for m in maps]
     for m in maps:

@@ -1,4 +1,4 @@
-"""Forms of the covariance of a 2D Gaussian: factor, Cholesky factor, matrix logarithm.
+"""Forms of the covariance of a 2D Gaussian: factor, Cholesky factor.
 
 A Gaussian has the covariance ``Sigma = (F^T F)^-1`` with the upper triangular *factor*
 ``F = [[a, b], [0, c]]``, a > 0 and c > 0. Functions on NumPy arrays compute in double precision.
@@ -51,22 +51,20 @@ def max_deviation(a: Floats, b: Floats, c: Floats) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(middle + root), np.float64)
 
 
-def outline(factor: Floats, points: int = 25) -> NDArray[np.float64]:
+def outline(factor: Floats) -> NDArray[np.float64]:
     """Return points of the ellipses at one standard deviation, relative to the mean.
 
     Parameters
     ----------
     factor : ndarray, shape (N, 3)
         a, b, c.
-    points : int, optional
-        Number of points per Gaussian; the last point repeats the first.
 
     Returns
     -------
-    ndarray of float64, shape (N, points, 2)
-        x, y with ``|F (x, y)| = 1``; not finite if a or c is zero.
+    ndarray of float64, shape (N, 25, 2)
+        x, y with ``|F (x, y)| = 1``, the first point twice; not finite if a or c is zero.
     """
-    turn = np.linspace(0, 2 * np.pi, points)
+    turn = np.linspace(0, 2 * np.pi, 25)
     a, b, c = np.asarray(factor, np.float64).T[:, :, None]
     with np.errstate(all="ignore"):
         y = np.sin(turn) / c
@@ -104,34 +102,6 @@ def add_variances(
     columns = 1 + xx * dr.square(a)
     amplitude, narrower = rsqrt(dr.fma(rows, columns, yy * dr.square(b))), rsqrt(rows)
     return (a * dr.sqrt(rows) * amplitude, b * narrower * amplitude, c * narrower), amplitude
-
-
-# ---------------------------------------------------------------------------------------------
-#  The matrix logarithm: 1/2 log(F^T F) = [[s + u, v], [v, s - u]]
-# ---------------------------------------------------------------------------------------------
-
-
-def log_shapes(factor: Floats) -> NDArray[np.float64]:
-    """Return the matrix logarithms ``1/2 log(F^T F) = [[s + u, v], [v, s - u]]``.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (N, 3)
-        a, b, c.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        s, u, v. The geometric mean of the two standard deviations is ``exp(-s)``. The vector (u, v)
-        gives elongation and direction, and is 0 for a round Gaussian.
-    """
-    a, b, c = np.asarray(factor, np.float64).T
-    half, across, size = 0.5 * (a * a - b * b - c * c), a * b, np.log(a * c)
-    # The larger eigenvalue of F^T F is a sum of positive numbers: there is no cancellation.
-    largest = 0.5 * (a * a + b * b + c * c) + np.hypot(half, across)
-    length = 0.5 * (np.log(largest) - size)
-    angle = np.arctan2(across, half)
-    return np.stack([0.5 * size, length * np.cos(angle), length * np.sin(angle)], axis=1)
 
 
 # ---------------------------------------------------------------------------------------------

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
+from operator import index
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..backend.messages import printable, shown
-from ..backend.types import Arrays
+from ..backend.types import Arrays, Singles
+from ..codec.egs import EgsContent, is_packed, read_egs, read_egs_head, write_egs
+from ..codec.quantization import dequantize
 from ..image.color import MAX_CHANNELS
 from ..image.formats import SUFFIXES
 from ..image.space import DATA, SPACES, Space, space_of
 from ..storage import npz
-from ..storage.npz import BadValue, Field
-from . import packed
-from .channels import MAX_MAP_CHANNELS, TextureMap, check_maps, find_map
+from ..storage.npz import BadValue, Field, check_values, file_errors
+from .channels import MAX_MAP_CHANNELS, TextureMap, channel_weights, check_maps, find_map
 
 FORMAT = "eigengs_dr.gaussians"
 MATERIAL = "eigengs_dr.material"
-"""Formats of a file without maps and with maps."""
+LIGHTS = "eigengs_dr.relightable"
+"""Formats of a file without maps, with maps, and of planes with a table of lights."""
 
 VERSIONS = {FORMAT: 2, MATERIAL: 1}
 """Versions of the formats."""
@@ -115,6 +117,48 @@ class SetData(NamedTuple):
         arrays = {k: self.arrays[k][..., part] for k in ("color", "background")}
         return self._replace(arrays=self.arrays | arrays, space=texture_map.space, maps=())
 
+    def crop(
+        self,
+        corner: tuple[float, float],
+        size: tuple[int, int],
+        scale: tuple[float, float] = (1.0, 1.0),
+    ) -> SetData:
+        """Return the Gaussians that touch a region, as a set with the size of the region.
+
+        Parameters
+        ----------
+        corner : (float, float)
+            x and y of the upper left corner of the region, in native pixels of the set.
+        size : (int, int)
+            Width and height of the region in pixels of the result.
+        scale : (float, float), optional
+            Pixels of the result per native pixel, along x and y.
+
+        Returns
+        -------
+        SetData
+            Its rendering equals the region in the rendering of the full set, up to rounding. The
+            Gaussians keep their order. The set is empty if the region shows only the background.
+        """
+        mean = self.arrays["mean"]
+        touches = np.ones(len(mean), bool)
+        for axis, reach in enumerate(self.reaches()):
+            half = 0.5 * size[axis] / scale[axis]
+            distance = np.abs(mean[:, axis] - np.float32(corner[axis] + half))
+            touches &= distance <= reach * np.float32(1.001) + np.float32(half + 1)
+        arrays = {name: self.arrays[name][touches] for name in ("mean", "factor", "color")}
+        x, y = scale
+        arrays["mean"] = ((arrays["mean"].astype(np.float64) - corner) * scale).astype(np.float32)
+        arrays["factor"] = (arrays["factor"] / np.array([x, y, y])).astype(np.float32)
+        return self._replace(arrays=self.arrays | arrays, size=size)
+
+    def reaches(self) -> tuple[Singles, Singles]:
+        """Return how far each Gaussian reaches from its mean along x and along y, in pixels."""
+        a, b, c = self.arrays["factor"].T
+        # The covariance (F^T F)^-1 has the entries xx = (1 + (b / c)^2) / a^2 and yy = 1 / c^2.
+        across = self.cutoff * np.hypot(np.float32(1), b / c) / a
+        return across.astype(np.float32), (self.cutoff / c).astype(np.float32)
+
 
 class FitFigures(NamedTuple):
     """Results of a fit, or of an encoding, in a file.
@@ -162,13 +206,9 @@ def write_set(
         If the file cannot be written; an existing file does not change.
     """
     check_suffix(path)
-    kind = MATERIAL if data.maps else FORMAT
-    with np.errstate(over="ignore"):  # the check rejects infinity
-        members: Arrays = {name: np.asarray(a, np.float32) for name, a in data.arrays.items()}
+    kind, members = MATERIAL if data.maps else FORMAT, members_of(data)
     with file_errors(path):
         check(data._replace(arrays=members))
-    members["size"] = np.array(data.size, np.int64)
-    members["cutoff"] = np.array(data.cutoff, np.float64)
     if data.maps:
         columns = zip(*data.maps, strict=True)
         members |= {name: np.array(column) for name, column in zip(MAPS, columns, strict=True)}
@@ -181,6 +221,13 @@ def write_set(
             members["options"] = np.array(figures.options)
     compressed = len(members["mean"]) < UNCOMPRESSED_COUNT
     npz.write(path, kind, VERSIONS[kind], members, compressed)
+
+
+def members_of(data: SetData) -> Arrays:
+    """Return the arrays of a file for a set, in single precision, without its maps and space."""
+    with np.errstate(over="ignore"):  # the check of a set rejects infinity
+        members = {name: np.asarray(a, np.float32) for name, a in data.arrays.items()}
+    return members | {"size": np.array(data.size, np.int64), "cutoff": np.array(float(data.cutoff))}
 
 
 def read_head(path: Path) -> tuple[int, SetData]:
@@ -200,19 +247,6 @@ def read_head(path: Path) -> tuple[int, SetData]:
         head = SetData({}, *_properties(npz.read(path, kind, version, small)))
         space, maps = _check_properties(shape[1], *head[1:])
     return shape[0], head._replace(space=space, maps=maps)
-
-
-@contextmanager
-def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the name of a file before error messages, about its values or of the system."""
-    try:
-        yield
-    except BadValue as error:
-        raise ValueError(printable(f"{path}: {error}")) from None
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{printable(str(path))}: no such file; check the path") from None
-    except IsADirectoryError:
-        raise IsADirectoryError(f"{printable(str(path))}: is a folder; give a file in it") from None
 
 
 def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:
@@ -237,9 +271,12 @@ def _properties(members: Arrays) -> tuple[tuple[int, int], Space, float, tuple[T
     return size, DATA, cutoff, maps
 
 
-def maps_of(path: Path) -> tuple[TextureMap, ...]:
-    """Return the maps of an ``.npz`` or ``.egs`` file, () for one image; errors: see `read_set`."""
-    return packed.read_head(path)[0] if packed.is_packed(path) else read_head(path)[1].maps
+def kind_of(path: str | os.PathLike[str]) -> str:
+    """Return the format of a file that this package wrote; of a packed one, that of its content."""
+    if not is_packed(path):
+        return npz.format_of(path)
+    head = read_egs_head(path)
+    return LIGHTS if head.lights else MATERIAL if head.maps else FORMAT
 
 
 def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
@@ -259,13 +296,12 @@ def read_map(path: Path, name: str | None, option: str = "map") -> SetData:
         As for `read_set`; if a file with maps is read without a name, or one without maps with a
         name; or if there is no such map. The message lists the maps.
     """
-    maps = maps_of(path)
-    if not maps and name is not None:
-        raise ValueError(f"{path}: holds one image and no maps; leave out {option}")
-    if maps and name is None:
-        names = ", ".join(m.name for m in maps)
-        raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
     data = read_set(path)
+    if not data.maps and name is not None:
+        raise ValueError(f"{path}: holds one image and no maps; leave out {option}")
+    if data.maps and name is None:
+        names = ", ".join(m.name for m in data.maps)
+        raise ValueError(f"{path}: holds the maps {names}; choose one with {option}")
     with file_errors(path):
         return data if name is None else data.map_data(name)
 
@@ -290,14 +326,32 @@ def read_figures(path: Path) -> FitFigures | None:
 def read_set(path: Path, sections: int | None = None) -> SetData:
     """Read and check a set; parameters and errors as for `eigengs_dr.Gaussians.load`."""
     with file_errors(path):
-        if packed.is_packed(path):
-            data = SetData(*packed.read_set(path, sections))
+        if is_packed(path):
+            data = packed_data(read_egs(path, sections))
         elif sections is not None:
             raise BadValue("has no sections; pass sections for .egs files only")
         else:
             members = npz.read(path, *_layout_of(path))
             data = SetData({name: members[name] for name in ARRAYS}, *_properties(members))
         return check(data)
+
+
+def packed_data(content: EgsContent) -> SetData:
+    """Return the set of a packed file, in single precision; only its maps are checked."""
+    values = {**dequantize(content.all_symbols(), content.steps), "background": content.background}
+    with np.errstate(over="ignore"):
+        arrays = {name: value.astype(np.float32) for name, value in values.items()}
+    maps = check_maps(content.maps, len(content.background)) if content.maps else ()
+    scale = np.array(channel_weights(maps) or 1, np.float32)
+    arrays |= {name: arrays[name] / scale for name in ("color", "background")}
+    return SetData(arrays, content.size, _known(content.space), content.cutoff, maps)
+
+
+def write_packed(path: str | os.PathLike[str], content: EgsContent) -> int:
+    """Write a packed file; return its number of bytes; errors as for `write_set`."""
+    with file_errors(path):
+        check(packed_data(content))
+    return write_egs(path, content)
 
 
 def check(data: SetData) -> SetData:
@@ -314,16 +368,8 @@ def check(data: SetData) -> SetData:
     channels = color.shape[1] if color.ndim == 2 else 3
     if not 1 <= channels <= MAX_CHANNELS:
         raise BadValue(f"color has {channels} channels, expected 1 to {MAX_CHANNELS}")
-    for name, array, expected in (
-        ("factor", factor, (len(mean), 3)),
-        ("color", color, (len(mean), channels)),
-        ("background", arrays["background"], (channels,)),
-    ):
-        if array.shape != expected:
-            raise BadValue(f"{name} has shape {array.shape}, expected {expected}")
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise BadValue(f"{name} holds values that are not finite")
+    shapes = {"factor": (len(mean), 3), "color": (len(mean), channels), "background": (channels,)}
+    check_values(arrays, shapes)
     if not (factor[:, [0, 2]] > 0).all():
         raise BadValue("factor has a or c <= 0; both must be positive")
     sums = np.abs(color).sum(axis=0, dtype=np.float64) + np.abs(arrays["background"])
@@ -368,6 +414,25 @@ def _known(name: str) -> Space:
         return space_of(name)
     except ValueError:
         raise BadValue(f"space is {shown(name)}, expected one of {', '.join(SPACES)}") from None
+
+
+Region = tuple[int, int, int, int]
+"""Left, top, width and height, in native pixels of a set."""
+
+
+def check_region(name: str, region: Sequence[int], size: tuple[int, int]) -> Region:
+    """Return a region, or raise ValueError unless it is inside an image of (width, height)."""
+    values = [index(v) for v in region]
+    if len(values) != 4:
+        raise ValueError(f"{name} is {values}; expected left, top, width and height in pixels")
+    left, top, width, height = values
+    inside = 0 <= left <= size[0] - width and 0 <= top <= size[1] - height
+    if not inside or min(width, height) < 1:
+        raise ValueError(
+            f"{name} {left},{top},{width},{height} is not inside the image of "
+            f"{size[0]}x{size[1]} pixels"
+        )
+    return left, top, width, height
 
 
 MAX_VALUES = (1 << 32) - 1

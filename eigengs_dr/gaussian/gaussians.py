@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
 from ..backend.doors import class_of_doors, door
-from ..backend.messages import shown, to_html
+from ..backend.messages import notebook_html, shown
 from ..backend.selection import BackendError, select
 from ..backend.types import Array2f, Array3f, Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size
@@ -196,7 +196,7 @@ class Gaussians:
             kind = f"maps {', '.join(m.name for m in self.maps)}"
         return f"Gaussians({size}, {kind}, cutoff={self.cutoff:g})"
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""

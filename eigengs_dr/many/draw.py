@@ -12,7 +12,6 @@ from ..backend.doors import door
 from ..backend.types import Values
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
-from ..gaussian.region import crop
 from ..image.color import exposed
 from ..image.formats import TIFF_SUFFIXES
 from ..image.io import bits_of, dtype_of, to_file, write_pixels
@@ -87,11 +86,11 @@ def draw_region(
     if min(scale) < 1:  # before a Gaussian that becomes wider is left out
         data = filter_by_box(_load(data, backend), (1 / scale[0], 1 / scale[1])).data()
     if (native_width, native_height) != data.size:
-        data = crop(data, (left, top), (native_width, native_height))
+        data = data.crop((left, top), (native_width, native_height))
     rows = max(1, BAND_PIXELS // width // TILE_SIDE) * TILE_SIDE
     for first in range(0, height, rows):
         band = width, min(rows, height - first)
-        part = crop(data, (0, first / scale[1]), band, scale)
+        part = data.crop((0, first / scale[1]), band, scale)
         yield to_file(_pixels_of(part, backend), data.space.encoding, kind)
 
 

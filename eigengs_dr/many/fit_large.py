@@ -15,17 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..backend.doors import checks_types, shows_progress
-from ..backend.executor import Executor, Value, completed
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.selection import select
 from ..backend.types import Arrays
-from ..cluster import executor_for
+from ..cluster import Executor, Value, completed, executor_for
 from ..fitting.method import DEFAULT, Method
 from ..fitting.objective import restored
 from ..fitting.options import COLOR_PARAMETERS, FitOptions, named_options
 from ..gaussian.file import SetData, check_suffix, write_set
 from ..gaussian.gaussians import Gaussians
-from ..gaussian.region import crop
 from ..image.metrics import psnr_from_mse
 from ..image.space import Extent, exposure_of, space_of
 from ..storage.atomic import require_writable
@@ -323,9 +321,9 @@ class LargeRun:
             nonlocal band, in_band
             if block.rows != band:  # cropping first to a row of blocks is faster
                 band = block.rows
-                in_band = crop(data, (0, band.start), (self.image.width, band.stop - band.start))
+                in_band = data.crop((0, band.start), (self.image.width, band.stop - band.start))
             size = (block.columns.stop - block.columns.start, band.stop - band.start)
-            part = crop(in_band, (block.columns.start, 0), size)
+            part = in_band.crop((block.columns.start, 0), size)
             return BlockTask(self.image.window(block.rows, block.columns), block, part.arrays)
 
         errors = self._each(block_errors, task_of)

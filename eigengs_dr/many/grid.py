@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ..backend.types import Arrays
 from ..gaussian.file import CUTOFF, SetData
-from ..gaussian.region import crop, reaches
 from ..image.space import DATA
 
 HALO_SPACINGS = 5.0
@@ -212,7 +211,7 @@ class BlockSets:
             rows[part] = arrays[name] + block.corner if name == "mean" else arrays[name]
         mean, reach = self.arrays["mean"][part], np.zeros(1)
         if "factor" in self.arrays:
-            reach = np.stack(reaches(self._data(part)), axis=1)
+            reach = np.stack(self._data(part).reaches(), axis=1)
         box = (mean - reach).min(axis=0), (mean + reach).max(axis=0)
         self._boxes[block.number] = np.concatenate(box)
 
@@ -241,7 +240,7 @@ class BlockSets:
         """
         numbers = np.concatenate([outside for _, outside in self._near(block)])
         (left, top), (width, height) = block.corner.tolist(), block.window_size.tolist()
-        arrays = crop(self._data(numbers), (left, top), (int(width), int(height))).arrays
+        arrays = self._data(numbers).crop((left, top), (int(width), int(height))).arrays
         return {name: arrays[name] for name in self.arrays}
 
     def _near(self, block: Block) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:

@@ -27,11 +27,10 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..backend.executor import Executor
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.messages import warn
 from ..backend.recording import exclusive
-from ..cluster import executor_for
+from ..cluster import Executor, executor_for
 from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write_set
 from ..gaussian.gaussians import Gaussians

@@ -23,11 +23,11 @@ from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
 from ..image.space import DATA
 from ..raster.adjoint import adjoint
-from ..raster.binning.lists import TileLists
-from ..raster.binning.tiles import Grid
 from ..raster.kernels import residual
+from ..raster.lists import TileLists
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import bin_gaussians, to_tiles
+from ..raster.tiles import Grid
 from .adan import Adan
 from .gaussianimage import Cholesky
 

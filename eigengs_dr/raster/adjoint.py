@@ -6,11 +6,11 @@ import drjit as dr
 
 from ..backend.arrays import types_of
 from ..backend.types import Float, FloatLike, Mask, UInt
-from .binning.lists import Pieces, TileLists
-from .binning.tiles import granularity_of
 from .evaluate import weights, weights_vjp
 from .kernels import shares_of
+from .lists import Pieces, TileLists
 from .parameters import NUM_SHAPE_PARAMS, gather_index, gather_run, unpack_parameters
+from .tiles import granularity_of
 
 
 def adjoint(
@@ -77,7 +77,7 @@ def adjoint_pieces(
     for the cutoff, 2 per channel and 5 for the shape.
     """
     types = types_of(packed)
-    sizes, pieces, tile_size = lists.sizes, lists.pieces, lists.grid.tile
+    layout, pieces, tile_size = lists.layout, lists.pieces, lists.grid.tile
     assert pieces is not None
     rows, shares = shares_of(types, lists.grid)
     fields = [pieces.splat, pieces.begin, pieces.end, pieces.slot]
@@ -95,7 +95,7 @@ def adjoint_pieces(
         active = i < end
         tile = gather_index(types, pieces.tile, i, active)
         d = gather_run(types, delta, tile * shares + part, length * channels, active)
-        column, row = sizes.first_pixel(tile)
+        column, row = layout.first_pixel(tile)
         x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
         color = sums[-channels - images :][:channels]
 

@@ -9,16 +9,17 @@ channel after channel. A lane then reads or writes one contiguous run with packe
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, in_pairs, types_of
 from ..backend.types import Float, UInt
-from .binning.lists import TileLists
-from .binning.tiles import Grid, GridArrays, granularity_of
 from .evaluate import weights
+from .lists import TileLists
 from .parameters import NUM_SHAPE_PARAMS, gather_index, gather_run, unpack_parameters
+from .tiles import Grid, granularity_of
 
 
 class _Blocks(NamedTuple):
@@ -60,7 +61,7 @@ def _blocks(types: ArrayTypes, lists: TileLists) -> _Blocks:
         lane = dr.arange(types.UInt, lists.grid.tiles * parts)
         part = lane % parts
         tile, begin, end = (dr.gather(types.UInt, v, lane // parts) for v in (tile, begin, end))
-    column, row = lists.sizes.first_pixel(tile)
+    column, row = lists.layout.first_pixel(tile)
     x, y = types.Float(column) + 0.5, types.Float(row + part * rows) + 0.5
     return _Blocks(tile * parts + part, tile, x, y, begin, end, (width, rows))
 
@@ -86,7 +87,7 @@ def _sum_blocks(
     """
     types = types_of(packed)
     number = NUM_SHAPE_PARAMS + len(start)
-    image = lists.sizes.image_of(blocks.tile)
+    image = lists.layout.image_of(blocks.tile)
     if image is not None:
         start = [dr.gather(types.Float, b, image) for b in start]
 
@@ -211,21 +212,17 @@ def residual(
     blocks = _blocks(types, lists)
     sums = _sum_blocks(packed, start, lists, blocks, radius)
 
-    def load(image: Float, values: int) -> list:
+    inside = None
+    if grid.overhangs:
+        (width, height), layout = blocks.size, lists.layout
+        places = ((blocks.x + i, blocks.y + j) for j in range(height) for i in range(width))
+        inside = [layout.inside(*place) for place in places]
+
+    def load(image: Float) -> list:
+        values = dr.width(image) // (grid.tiles * grid.pixels)
         return gather_run(types, image, blocks.run, blocks.pixels * values, True)
 
-    errors = sums
-    if target is not None:
-        errors = [s - t for s, t in zip(sums, load(target, channels), strict=True)]
-    inside = _inside(blocks, lists.sizes) if grid.overhangs else None
-    if inside is not None:
-        errors = [dr.select(inside[k // channels], e, 0) for k, e in enumerate(errors)]
-    deltas = errors
-    if curvature is not None:
-        values = dr.width(curvature) // (grid.tiles * grid.pixels)
-        factors = load(curvature, values)
-        deltas = [e * factors[k * values // channels] for k, e in enumerate(errors)]
-    squares = sum_channels([e * d for e, d in zip(errors, deltas, strict=True)], channels)
+    deltas, squares = _compared(sums, channels, load, target, curvature, inside)
     number = grid.tiles * grid.pixels * channels
     if pairs and types.bits == 32:
         delta = dr.empty(types.UInt, number // 2)
@@ -256,44 +253,46 @@ def difference(
     def load(values: Float) -> list:
         return gather_run(types, values, row, length * (dr.width(values) // number), True)
 
-    errors = load(image)
-    if target is not None:
-        errors = [s - t for s, t in zip(errors, load(target), strict=True)]
+    inside = None
     if grid.overhangs:
-        column, first = lists.sizes.first_pixel(row // height)
-        is_inside = first + row % height < lists.sizes.height
-        for k in range(length * channels):
-            inside = is_inside & (column + k // channels < lists.sizes.width)
-            errors[k] = dr.select(inside, errors[k], 0)
+        column, line = lists.layout.pixel(row * length)
+        inside = [lists.layout.inside(column + i, line) for i in range(length)]
+    deltas, squares = _compared(load(image), channels, load, target, curvature, inside)
+    delta = dr.empty(types.Float, number * channels)
+    dr.scatter(delta, types.FloatX(deltas), row)
+    dr.eval(delta, squares)  # together: later, the sums would read all again
+    return delta, [sum_by_image(s, grid) for s in squares]
+
+
+def _compared(
+    errors: list,
+    channels: int,
+    load: Callable[[Float], list],
+    target: Float | None,
+    curvature: Float | None,
+    inside: list | None,
+) -> tuple[list, list]:
+    """Return ``h e`` for the values of a lane, and the sums of ``h e^2`` for each channel.
+
+    `load` reads what a lane owns of an image; `inside` says which of its pixels are in the image.
+    """
+    if target is not None:
+        errors = [e - t for e, t in zip(errors, load(target), strict=True)]
+    if inside is not None:
+        errors = [dr.select(inside[k // channels], e, 0) for k, e in enumerate(errors)]
     deltas = errors
     if curvature is not None:
         factors = load(curvature)
         share = len(errors) // len(factors)
         deltas = [e * factors[k // share] for k, e in enumerate(errors)]
-    delta = dr.empty(types.Float, number * channels)
-    dr.scatter(delta, types.FloatX(deltas), row)
-    squares = sum_channels([e * d for e, d in zip(errors, deltas, strict=True)], channels)
-    dr.eval(delta, squares)  # together: later, the sums would read all again
-    return delta, [sum_by_image(s, grid) for s in squares]
-
-
-def _inside(blocks: _Blocks, sizes: GridArrays) -> list:
-    """Return whether each pixel of a block lies in the image."""
-    return [
-        (blocks.x + i < sizes.width) & (blocks.y + j < sizes.height)
-        for j in range(blocks.size[1])
-        for i in range(blocks.size[0])
-    ]
+    return deltas, sum_channels([e * d for e, d in zip(errors, deltas, strict=True)], channels)
 
 
 def pixels_inside(types: ArrayTypes, grid: Grid) -> Float:
     """Return 1 for pixels inside the images and 0 for overhanging pixels, in tile layout."""
-    sizes = grid.in_arrays(types)
-    index = dr.arange(types.UInt, grid.tiles * grid.pixels)
-    column, row = sizes.first_pixel(index // grid.pixels)
-    x = types.Float(column + index % grid.tile[0])
-    y = types.Float(row + index // grid.tile[0] % grid.tile[1])
-    return dr.select((x < sizes.width) & (y < sizes.height), types.Float(1), 0)
+    layout = grid.in_arrays(types)
+    pixel = layout.pixel(dr.arange(types.UInt, grid.tiles * grid.pixels))
+    return dr.select(layout.inside(*pixel), types.Float(1), 0)
 
 
 def sum_lanes(values: list, lists: TileLists) -> list:

@@ -18,13 +18,11 @@ from ..backend.doors import door
 from ..backend.types import Float, FloatLike, Tensor, UInt, Values
 from ..gaussian.channels import slices
 from ..gaussian.covariance import add_variances
-from ..gaussian.file import MAX_CUTOFF, check_index_range
+from ..gaussian.file import MAX_CUTOFF, Region, check_index_range, check_region
 from ..gaussian.gaussians import Fitted, Gaussians, set_of
-from ..gaussian.region import Region, check_region
 from .adjoint import adjoint
-from .binning.lists import TileLists, build_lists, update_exact_exp
-from .binning.tiles import TILE, Grid
 from .kernels import channel_sums, forward
+from .lists import TileLists, build_lists, update_exact_exp
 from .parameters import (
     EXP2_SCALE,
     KernelParameters,
@@ -34,6 +32,7 @@ from .parameters import (
     kernel_shape,
     pack_parameters,
 )
+from .tiles import TILE, Grid
 
 
 @door
@@ -427,21 +426,17 @@ def to_tiles(types: ArrayTypes, image: Values, grid: Grid) -> Float:
     else:
         source, strides = np.ascontiguousarray(image), (width * channels, channels, 1)
     # Sizes are in arrays, so that one program serves all images with this number of channels.
-    limits = (dr.opaque(types.UInt, side) for side in (width, height))
     steps = (dr.opaque(types.UInt, stride) for stride in strides)
-    sizes, (tile_width, tile_height) = grid.in_arrays(types), grid.tile
-    index = dr.arange(types.UInt, grid.tiles * grid.pixels * channels)
+    layout, count = grid.in_arrays(types), grid.tiles * grid.pixels * channels
+    index = dr.arange(types.UInt, count)
     pixel, channel = index // channels, index % channels
-    tile = pixel // grid.pixels
-    column, row = sizes.first_pixel(tile)
-    column += pixel % tile_width
-    row += pixel // tile_width % tile_height
+    column, row = layout.pixel(pixel)
     place = sum(n * step for n, step in zip((row, column, channel), steps, strict=True))
-    if grid.images > 1:
-        place += sizes.image_of(tile) * dr.opaque(types.UInt, height * width * channels)
-    inside = [n < limit for n, limit in zip((column, row), limits, strict=True)]
+    number = layout.image_of(pixel // grid.pixels)
+    if number is not None:
+        place += number * dr.opaque(types.UInt, height * width * channels)
     flat = types.Float(source.reshape(-1))
-    result = dr.gather(types.Float, flat, place, inside[0] & inside[1])
+    result = dr.gather(types.Float, flat, place, layout.inside(column, row))
     dr.eval(result)
     dr.sync_thread()  # the source may share the caller's memory
     return result

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of
 from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
-from ..backend.messages import to_html
+from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike, Doubles, Rows
+from ..codec.egs import is_packed, read_egs
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
-from ..gaussian import packed
-from ..gaussian.file import ARRAYS, SetData, check, file_errors, read_set
+from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
 from ..gaussian.gaussians import Gaussians, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats
@@ -34,11 +34,13 @@ from ..image.resize import resample
 from ..image.space import DATA, LINEAR, RGB
 from ..raster.render import render
 from ..storage import npz
-from ..storage.npz import BadValue, Field
+from ..storage.npz import BadValue, Field, file_errors
+from .directions import LatLong
 from .fit import find_planes, fit_planes, most_planes, read_photos
 from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
-FORMAT, VERSION = "eigengs_dr.relightable", 1
+VERSION = 1
+"""Version of the format."""
 
 LAYOUT: dict[str, Field] = ARRAYS | {
     "size": Field("i8", 1),
@@ -87,7 +89,7 @@ class Relightable:
     psnr_held_out: float = float("nan")
     brightest: float = 1.0
 
-    _repr_html_ = to_html  # what a notebook shows
+    _repr_html_ = notebook_html  # what a notebook shows
 
     @classmethod
     @shows_progress
@@ -235,11 +237,8 @@ class Relightable:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
-        data, table = self.planes.data(), self.table
-        arrays = {name: values.astype(np.float32) for name, values in data.arrays.items()}
-        arrays |= {
-            "size": np.array(data.size, np.int64),
-            "cutoff": np.array(data.cutoff, np.float64),
+        table = self.table
+        arrays = members_of(self.planes.data()) | {
             "lights": table.lights.astype(np.float32),
             "values": table.values.astype(np.float32),
             "kind": np.array(table.kind),
@@ -247,7 +246,7 @@ class Relightable:
             "psnr_held_out": np.array(self.psnr_held_out, np.float64),
             "brightest": np.array(self.brightest, np.float64),
         }
-        npz.write(path, FORMAT, VERSION, arrays)
+        npz.write(path, LIGHTS, VERSION, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], backend: str | None = None) -> Relightable:
@@ -262,23 +261,25 @@ class Relightable:
             If the file cannot be opened.
         """
         with file_errors(Path(path)):
-            if packed.is_packed(path):
-                return cls(*_read_packed(Path(path), backend))
-            layout = LAYOUT | (BRIGHTEST if "brightest" in npz.sizes_of(path) else {})
-            members = npz.read(path, FORMAT, VERSION, layout)
-            parts = {name: members[name] for name in ARRAYS}
-            size = tuple(members["size"].tolist())
-            data = check(SetData(parts, size, DATA, float(members["cutoff"])))
-            table = LightTable(
-                members["lights"].astype(np.float64),
-                members["values"].astype(np.float64),
-                str(members["kind"]),
-                float(members["smoothing"]),
-            )
-            table = check_table(table, data.arrays["color"].shape[1])
-            figures = [float(members.get(name, 1)) for name in ("psnr_held_out", "brightest")]
-            check_brightest(figures[1])
-            return cls(Gaussians.from_data(data, backend), table, *figures)
+            if is_packed(path):
+                content = read_egs(path)
+                if not content.lights:
+                    raise BadValue("holds a set without a table of lights; Gaussians.load reads it")
+                data = check(packed_data(content))
+                table, *figures = read_table(content.lights, len(content.background))
+            else:
+                layout = LAYOUT | (BRIGHTEST if "brightest" in npz.sizes_of(path) else {})
+                members = npz.read(path, LIGHTS, VERSION, layout)
+                parts = {name: members[name] for name in ARRAYS}
+                size = tuple(members["size"].tolist())
+                data = check(SetData(parts, size, DATA, float(members["cutoff"])))
+                lights, values = (members[name].astype(np.float64) for name in ("lights", "values"))
+                kind, smoothing = str(members["kind"]), float(members["smoothing"])
+                table = LightTable(lights, values, kind, smoothing)
+                table = check_table(table, data.arrays["color"].shape[1])
+                figures = [float(members.get(name, 1)) for name in ("psnr_held_out", "brightest")]
+                check_brightest(figures[1])
+        return cls(Gaussians.from_data(data, backend), table, *figures)
 
 
 def check_brightest(code: float) -> float:
@@ -328,13 +329,6 @@ def or_camera(light: Any) -> Any:
     return dr.select(dr.isfinite(length) & (length > 0), light, type(light)(0, 0, 1))
 
 
-def holds_lights(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file that this package wrote holds a model of lights."""
-    if packed.is_packed(path):
-        return bool(packed.read_head(Path(path))[1])
-    return npz.format_of(path) == FORMAT
-
-
 ENVIRONMENT_SIZE = (32, 16)
 """Width and height to which environments are averaged: 256 directions above the horizon."""
 
@@ -365,13 +359,9 @@ def environment_lights(environment: object) -> tuple[Doubles, Doubles]:
     if len(light) > 1:  # the outermost rows have half the height of the others
         light = np.repeat(resample(light, width, len(light)), 2, axis=0)[1:-1]
     average = np.maximum(resample(light, width, height), 0).astype(np.float64)
-    polar = np.pi * (np.arange(height) + 0.5) / height
-    turn = 2 * np.pi * (np.arange(width) + 0.5) / width
-    ring, up = np.sin(polar)[:, None], np.cos(polar)[:, None]
-    directions = np.stack(np.broadcast_arrays(ring * np.sin(turn), up, -ring * np.cos(turn)), -1)
-    share = 2 * np.pi / (width * height) * ring[..., None]  # solid angles, over pi
+    directions, areas = LatLong(width, height).directions(), LatLong(width, height).areas()
     above = directions[..., 2] > 0
-    return directions[above], (average * share)[above]
+    return directions[above], (average * areas[:, None, None] / np.pi)[above]
 
 
 # --- The table in a packed file ------------------------------------------------------------------
@@ -401,16 +391,6 @@ def table_bytes(model: Relightable) -> bytes:
     values = np.round(table.values / scale).astype(np.int8)
     brightest = _BRIGHTEST.pack(model.brightest) if model.brightest > 1 else b""
     return head + scale.tobytes() + lights.tobytes() + values.tobytes() + brightest
-
-
-def _read_packed(path: Path, backend: str | None) -> tuple[Gaussians, LightTable, float, float]:
-    """Read the parts of a model from an ``.egs`` file."""
-    content = packed.read_head(path)[1]
-    if not content:
-        raise BadValue("holds a set without a table of lights; read it by Gaussians.load")
-    data = read_set(path)
-    figures = read_table(content, data.arrays["color"].shape[1])
-    return Gaussians.from_data(data, backend), *figures
 
 
 def read_table(content: bytes, channels: int) -> tuple[LightTable, float, float]:

@@ -23,6 +23,7 @@ from PIL import Image
 from ..backend.types import Doubles, Singles
 from ..raster.render import picture_of
 from ..storage.atomic import atomic_folder
+from .directions import Octahedron
 from .model import Relightable
 
 RESOLUTION = 16
@@ -57,7 +58,7 @@ class PixelPlanes(NamedTuple):
         shape = (planes.height, planes.width, planes.channels)
         padding = -planes.channels % 3
         images = np.pad(picture_of(planes).reshape(shape), ((0, 0), (0, 0), (0, padding)))
-        factors = model.table.at(directions(resolution))
+        factors = model.table.at(Octahedron(resolution).directions())
         mean = factors[..., -1:]
         factors = np.pad(factors[..., :-1], ((0, 0), (0, 0), (0, padding)))
         whole = np.concatenate([factors, mean], axis=2)
@@ -99,12 +100,3 @@ class PixelPlanes(NamedTuple):
                 picture = Image.fromarray(np.ascontiguousarray(codes[..., k : k + 3]))
                 name = place / f"plane_{k // 3}.jpg"
                 picture.save(name, quality=quality, optimize=True, keep_rgb=True)
-
-
-def directions(resolution: int) -> Doubles:
-    """Return the directions of a grid, row by row: unit vectors (R^2, 3) above the horizon."""
-    across = np.linspace(-1, 1, resolution)
-    column, row = np.meshgrid(across, across)
-    x, y = (column - row).ravel() / 2, (column + row).ravel() / 2
-    found = np.stack([x, y, np.maximum(1 - abs(x) - abs(y), 0)], axis=1)
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))

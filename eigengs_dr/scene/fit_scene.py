@@ -23,7 +23,7 @@ from ..backend.arrays import types_in
 from ..backend.doors import door, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.selection import backend_of, select
-from ..backend.types import ArrayLike
+from ..backend.types import ArrayLike, Texture
 from ..fitting.loop import Descent
 from ..fitting.measure import Measured
 from ..fitting.method import DEFAULT
@@ -37,9 +37,7 @@ from ..image.io import check_data, check_image
 from ..image.metrics import psnr as psnr_of
 from ..image.pixels import check_encoding
 from ..image.space import DATA, LINEAR, Affine, Space, space_of
-from ..plugins.cone import PIXEL
-from ..plugins.follow import check_scene
-from ..plugins.versions import Texture
+from ..plugins.cone import PIXEL, check_scene
 from ..raster.render import render
 from .rendering import Progress, stages
 from .target import error_weights, seen_by, smoothest_target

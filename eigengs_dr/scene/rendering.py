@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..backend.interrupts import defer_interrupts
 from ..backend.recording import collector_off
 from ..backend.types import Record
-from ..plugins.follow import follow_where_asked
+from ..plugins.cone import follow_where_asked
 
 Progress = Callable[[int, int, Record], None]
 """``progress(done, total, row)``; the row names the ``stage``."""

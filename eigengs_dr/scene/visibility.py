@@ -25,10 +25,9 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, csr_array
 
 from ..backend.arrays import upload
-from ..backend.types import Float, Floats
+from ..backend.types import Float, Floats, Texture
 from ..plugins.cone import PIXEL
 from ..plugins.properties import WRAPS, to_uv
-from ..plugins.versions import Texture
 from ..raster.lookup.points import fold
 
 SPACING = 0.5

@@ -14,7 +14,6 @@ import numpy as np
 
 from ..backend.interrupts import undone_at_end
 from ..backend.messages import warn
-from ..backend.plain import parse_json, read_json
 from ..backend.types import Arrays, Record
 from . import npz
 from .atomic import atomic_folder, lock_output, refuse_link, remove_folder, remove_stale
@@ -229,3 +228,55 @@ def _brief(value: Any) -> str:
     """Return a stored value in a line; of an object, the name of its class."""
     text = str(value.get("class", value) if isinstance(value, dict) else value)
     return " ".join(text.split())[:80]
+
+
+# --- JSON, which may come from elsewhere ----------------------------------------------------------
+
+MAX_DEPTH = 64
+"""Levels of nesting of a value; files of the package have fewer than ten."""
+
+MAX_BYTES = 1 << 26
+"""Bytes of a file that holds one value."""
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text.
+
+    Raises
+    ------
+    ValueError
+        If the text is no JSON, or is nested deeper than `MAX_DEPTH`: whoever prints or compares
+        such a value reaches Python's limit of recursion.
+    """
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError(f"JSON is nested deeper than {MAX_DEPTH} levels") from None
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        level = [
+            child
+            for parent in level
+            if isinstance(parent, (list, dict))
+            for child in (parent.values() if isinstance(parent, dict) else parent)
+        ]
+        if not level:
+            return value
+    raise ValueError(f"JSON is nested deeper than {MAX_DEPTH} levels")
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Return the value of a JSON file.
+
+    Raises
+    ------
+    ValueError
+        As `parse_json`; also if the file has more than `MAX_BYTES`.
+    OSError
+        If the file cannot be read.
+    """
+    with Path(path).open("rb") as file:
+        text = file.read(MAX_BYTES + 1)
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"JSON has more than {MAX_BYTES} bytes")
+    return parse_json(text)

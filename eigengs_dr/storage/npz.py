@@ -44,6 +44,29 @@ class Field(NamedTuple):
     max_count: int = MAX_ENTRIES
 
 
+def check_values(arrays: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise `BadValue` unless arrays have these shapes, and all floats are finite."""
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise BadValue(f"{name} has shape {arrays[name].shape}, expected {shape}")
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise BadValue(f"{name} holds values that are not finite")
+
+
+@contextmanager
+def file_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Put the name of a file before error messages, about its values or of the system."""
+    try:
+        yield
+    except BadValue as error:
+        raise ValueError(printable(f"{path}: {error}")) from None
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{printable(str(path))}: no such file; check the path") from None
+    except IsADirectoryError:
+        raise IsADirectoryError(f"{printable(str(path))}: is a folder; give a file in it") from None
+
+
 def write(
     path: str | os.PathLike[str],
     name: str,
@@ -176,7 +199,9 @@ def _check_format(archive: zipfile.ZipFile, name: str, version: int) -> None:
     """Raise `BadValue` for another format or version."""
     stored = str(_read_array(archive, "format", Field("U", 0)))
     if stored != name:
-        raise BadValue(f"format is {stored[:40]!r}, expected {name!r}")
+        known = stored.startswith("eigengs_dr.")
+        advice = "; eigengs_dr.load reads files of all formats" if known else ""
+        raise BadValue(f"format is {stored[:40]!r}, expected {name!r}{advice}")
     number = int(_read_array(archive, "version", Field("i8", 0)))
     if number != version:
         advice = "upgrade eigengs-dr" if number > version else "make the file again"

@@ -382,19 +382,36 @@ THUMBNAIL_WIDTH = 120
 
 
 @singledispatch
-def html_of(value: object) -> str:
-    """Return HTML of a set, a fit, a basis or a model."""
+def to_html(value: object) -> str:
+    """Return what a notebook shows of a set, a fit, a basis or a model: pictures and a line.
+
+    Parameters
+    ----------
+    value : Gaussians, Fit, Eigenbasis, EigenGS or Relightable
+
+    Returns
+    -------
+    str
+        HTML, with the pictures in it.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> g = eg.Gaussians.from_arrays([[4, 4]], [[0.5, 0, 0.5]], [[1]], size=(8, 8), space="data")
+    >>> "<img" in eg.to_html(g)
+    True
+    """
     return f"<pre>{escape(repr(value))}</pre>"
 
 
-@html_of.register
+@to_html.register
 def _show_set(gaussians: Gaussians) -> str:
     if len(gaussians) > MAX_GAUSSIANS:  # rendering would take seconds
         return _block(repr(gaussians))
     return _block(repr(gaussians), *_images(picture_of(gaussians, *_shown_size(gaussians))))
 
 
-@html_of.register
+@to_html.register
 def _show_fit(fit: Fit) -> str:
     size = _shown_size(fit.gaussians)
     if isinstance(fit.image, Mapping):
@@ -408,13 +425,13 @@ def _shown_size(gaussians: Gaussians) -> tuple[int, int]:
     return within(min(MAX_PICTURE_SIDE, max(size)), *size)
 
 
-@html_of.register(Eigenbasis)
-@html_of.register(EigenGS)
+@to_html.register(Eigenbasis)
+@to_html.register(EigenGS)
 def _show_components(source: EigenGS | Eigenbasis) -> str:
     return _block(repr(source), *_images(dict(first_components(source)), THUMBNAIL_WIDTH))
 
 
-@html_of.register
+@to_html.register
 def _show_lights(model: Relightable) -> str:
     gaussians = model.relight(OVERHEAD)
     return _block(repr(model), *_images(picture_of(gaussians, *_shown_size(gaussians))))

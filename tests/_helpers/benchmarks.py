@@ -48,13 +48,6 @@ def row(job, run=RUN, **figures):
     return {"bench": "made", "job": job, **figures, "run": run}
 
 
-def moment(iteration, decibels, seconds=1.0):
-    """The figures of `score`; None for a fit that has failed."""
-    rgb = None if decibels is None else decibels - 6
-    figures = {"psnr_ycbcr": decibels, "psnr_rgb": rgb, "ssim": 0.5, "ms_ssim": 0.75}
-    return {"iteration": iteration, "seconds": seconds, **figures}
-
-
 def lines_of(table):
     """The lines of a table, as tuples of texts."""
     return [tuple(line) for line in table.frame.to_numpy()]

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def factors_from_log_shapes(shape):
-    """Return a, b, c of s, u, v: the inverse of `eigengs_dr.gaussian.covariance.log_shapes`."""
+    """Return a, b, c of s, u, v: the inverse of `eigengs_dr.codec.quantization.log_shapes`."""
     s, u, v = np.asarray(shape, np.float64).T
     length, angle = np.hypot(u, v), np.arctan2(v, u)
     # F^T F / exp(2 s) = cosh(2 length) + sinh(2 length) [[cos, sin], [sin, -cos]] of the angle.

@@ -21,7 +21,7 @@ def small_fit():
 def few_groups():
     """Let Gaussians of 4 groups instead of 16 make up for the rounding, in a third of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("eigengs_dr.codec.rounding.MAX_GROUPS", 4)
+        patch.setattr("eigengs_dr.packing.rounding.MAX_GROUPS", 4)
         yield
 
 

@@ -14,7 +14,7 @@ from _helpers.benchmarks import (  # noqa: F401  data is a fixture
 )
 from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
-from eigengs_bench import cases, inverse, kernels, poster, rate, relight, scaling, sky, texture
+from eigengs_bench import alike, cases, inverse, kernels, rate, relight, scaling, texture
 from eigengs_bench.images import images_of
 from eigengs_bench.names import SETS, ImageSet
 from eigengs_bench.report import Section
@@ -148,7 +148,7 @@ def test_scaling(tmp_path):
     arguments = ("--part", "pixels", "--iterations", 2, "--max-side", 128)
     [row], _ = answered(tmp_path / "out", "scaling", *arguments)
     assert row["job"]["gaussians"] == 1250
-    assert row["mean_ms"] > 0 and row["place_seconds"] > 0
+    assert row["step_ms"] > 0 and row["start_seconds"] > 0
     assert scaling.measure_fits(scaling.Case(16, 16, 20), 1, "llvm", 1e-9)["many_ratio"] > 0
 
 
@@ -167,11 +167,11 @@ def test_texture(monkeypatch, tmp_path):
     counts = {"COUNTS": (20,), "SETTLED": 20, "CHANGED": (20,), "HELD": (20,)}
     smaller(monkeypatch, texture, SIDE=16, TEXELS=16, SPP=1, STEPS=2, ROUNDS=1, **counts)
     images = {"PHOTOS": ("coffee",), "MAPS": ("gravel",)}
-    smaller(monkeypatch, poster, TEXELS=64, PIXELS=32, GOAL=25.0, **images)
-    smaller(monkeypatch, sky, ROWS=32, PIXELS=8, SPP=4, GOAL=25.0, STEPS=5, ROUNDS=1)
+    smaller(monkeypatch, alike, TEXELS=64, PIXELS=32, GOAL=25.0, **images)
+    smaller(monkeypatch, alike, ROWS=32, SIDE=8, SPP=4, STEPS=5, ROUNDS=1)
     text = said("bench", "texture", "-o", tmp_path)  # it times the ball anew each time
     photo, material, letters, *lights, ball = read(tmp_path / FILE, "texture")
-    for found, goal in ((photo, 25), (material, 25), (letters, poster.TEXT_GOAL)):
+    for found, goal in ((photo, 25), (material, 25), (letters, alike.TEXT_GOAL)):
         assert found["psnr"] >= goal and found["psnr_bitmap"] >= goal and found["side"] <= 64
         assert found["filtered_bytes"] > found["bytes"] > 0
     # Texels of a colour take four bytes, those of a map one.

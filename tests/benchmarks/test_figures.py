@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from _helpers.benchmarks import lines_of, row
-from eigengs_bench import inverse, kodak, pareto, rate, stability
-from eigengs_bench.sky import psnr_without_noise
+from eigengs_bench import inverse, pareto, rate, stability
+from eigengs_bench.alike import psnr_without_noise
 
 
 @given(st.lists(st.tuples(st.floats(0.1, 9), st.one_of(st.floats(0, 50), st.just(np.nan)))))
@@ -16,20 +16,6 @@ def test_front_is_what_nothing_beats(points):
     known = {p for p in points if p[1] == p[1]}
     beaten = {p for p in known for q in known if q != p and q[0] <= p[0] and q[1] >= p[1]}
     assert pareto.front(points) == sorted(known - beaten)
-
-
-def test_fits_of_one_machine_stand_beside_published_ones():
-    job = {"set": "kodak", "image": "a", "gaussians": 5000, "iterations": 1000, "timed": True}
-    figures = {"psnr_float": 33.0, "psnr_rgb": 32.9, "ms_ssim": 0.9, "seconds": 4.0}
-    fit = row(job, **figures)
-    other = row(job | {"image": "b"}, fit["run"] | {"cpu": "another"}, **figures)
-    charts = kodak.summarize([fit, fit, other]).charts
-    [axis] = charts["kodak-speed"].axes
-    assert axis.get_title() == "1 photos of Kodak,\n2 cores beside GPUs"
-    labels = [line.get_label() for line in axis.lines]
-    assert labels[0] == "eigengs_dr, 1,000 steps, by Gaussians"
-    assert any("NVIDIA V100 (arXiv 2403.08551)" in label for label in labels)
-    assert "kodak-speed" not in kodak.summarize([row(job | {"timed": False}, **figures)]).charts
 
 
 def test_the_matrix_of_ends():

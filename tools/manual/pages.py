@@ -30,8 +30,6 @@ FOLDER = Path(__file__).parents[2] / "build" / "docs" / "extra"
 
 REFERENCE = Path(__file__).parents[2] / "docs" / "reference"
 
-PLUGINS = ("texture", "environment")
-
 TEXTURE_PAGE = "gaussian-texture.md"
 
 
@@ -84,7 +82,8 @@ def outdated() -> dict[Path, str]:
 
 def plugin_pages() -> dict[str, Path]:
     """Return the page of each plugin."""
-    return {f"gaussian_{name}": REFERENCE / f"gaussian-{name}.md" for name in PLUGINS}
+    plugins = ("gaussian_texture", "gaussian_environment")
+    return {name: REFERENCE / f"{name.replace('_', '-')}.md" for name in plugins}
 
 
 def names_list(names: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Compose pictures of how-to pages, docs/images/how-to-*.jpg: ``python tools/manual/pictures.py``.
+"""Compose pictures of README.md and how-to pages: ``python tools/manual/pictures.py``.
 
 ``python tools/manual/pictures.py view number`` writes these alone. All of them show photos that
 scikit-image ships. They take five minutes on two cores; "view" needs Chromium.
@@ -19,16 +19,23 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from eigengs_dr.image.color import to_coded, to_linear
+from eigengs_bench.subjects import bitmap, grey, load_scene
+from eigengs_dr.image.color import to_coded
 from eigengs_dr.image.resize import center_crop, resample
 from eigengs_dr.image.sheet import text_line
-from eigengs_dr.plugins import follow, keep_in_bounds, texture_of
+from eigengs_dr.plugins import keep_in_bounds, photo_loss, texture_of
+from eigengs_dr.viewer.pictures import overlay
 
 ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "scenes"))
+import plane  # noqa: E402, isort: skip
+
 IMAGES = ROOT / "docs" / "images"
 WIDTH, GAP = 840, 6  # pixels: of a whole picture, and white between two
+APART = ((0, GAP), (0, GAP), (0, 0))  # around a picture
 LETTERS = 22  # pixels: they can be read where the picture is shown half as wide
 MAX_BYTES = 60_000
+CAMERAS, SLOT = 6, "poster.bsdf.reflectance"  # of the photos of a poster; what they recover
 ERROR_GAIN = 4  # errors are shown as absolute differences of sRGB values, times this
 
 Row = dict[str, np.ndarray]
@@ -226,53 +233,13 @@ def split() -> list[Row]:
 
 
 def aliasing() -> list[Row]:
-    """Render a floor of photos at a slant: a bitmap, Gaussians at points, and the prefilter."""
-    photo = eg.sample("coffee")[:, 100:500]
-    gaussians = eg.fit(photo, 4000, 300, space="linear").gaussians
-    repeated = mi.ScalarTransform4f().scale([60, -60, 1])
-    texels = {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(to_linear(photo).astype(np.float32)),
-        "raw": True,
-        "to_uv": repeated,
-    }
-    points = texture_of(gaussians, to_uv=repeated)
-    bitmap, plain, filtered = (floor(texture) for texture in (texels, points, points))
-    follow(filtered, filtered.sensors()[0])
-    return [
-        {
-            "bitmap": slanted(bitmap, 1),
-            "Gaussians": slanted(plain, 1),
-            "prefilter": slanted(filtered, 1),
-            "1,024 samples": slanted(plain, 1024),
-        }
-    ]
-
-
-def floor(texture: dict) -> "mi.Scene":
-    """Return a floor that shines with a texture, and recedes to the horizon."""
-    view = mi.ScalarTransform4f().look_at([0.3, 0, 1], [0.1, 3, 0.2], [0, 0, 1])
-    film = {"type": "hdrfilm", "width": 410, "height": 410, "rfilter": {"type": "box"}}
-    to_world = mi.ScalarTransform4f().translate([0, 29, 0]).scale([30, 30, 1])
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1},
-            "camera": {"type": "perspective", "fov": 45, "to_world": view, "film": film},
-            "floor": {
-                "type": "rectangle",
-                "to_world": to_world,
-                "emitter": {"type": "area", "radiance": texture},
-            },
-        }
-    )
-
-
-def slanted(scene: "mi.Scene", samples: int) -> np.ndarray:
-    """Render a floor, and cut what lies below the horizon."""
-    passes = range(-(-samples // 16))
-    linear = sum(mi.render(scene, spp=min(samples, 16), seed=k).numpy() for k in passes)
-    return to_coded(linear / len(passes))[84:289, 102:307]
+    """Render the floor of scenes/plane.py: a bitmap, Gaussians at points, and the prefilter."""
+    plane.write_sets()
+    kinds = {"bitmap": {"bitmap": True}, "Gaussians": {}, "prefilter": {"prefilter": True}}
+    scenes = {kind: plane.load("floor", 410, **settings) for kind, settings in kinds.items()}
+    row = {kind: plane.image_of(scene, 1, 0) for kind, scene in scenes.items()}
+    row["1,024 samples"] = plane.image_of(scenes["Gaussians"], 1024, 1)
+    return [{kind: to_coded(picture)[84:289, 102:307] for kind, picture in row.items()}]
 
 
 def descent() -> list[Row]:
@@ -282,8 +249,8 @@ def descent() -> list[Row]:
         for name in ("coffee", "chelsea")
     )
     goal = mi.render(wall_of(other), spp=64)
-    scene, key = wall_of(start), "wall.bsdf.reflectance"
-    rates = {f"{key}.mean": 0.5, f"{key}.factor": 0.01, f"{key}.color": 0.03}
+    scene = wall_of(start)
+    rates = {f"{SLOT}.mean": 0.5, f"{SLOT}.factor": 0.01, f"{SLOT}.color": 0.03}
     parameters = mi.traverse(scene)
     adam = mi.ad.Adam(lr=0.01, params={name: parameters[name] for name in rates})
     adam.set_learning_rate(rates)
@@ -294,7 +261,7 @@ def descent() -> list[Row]:
         dr.backward(dr.mean(dr.square(picture - goal), axis=None))
         adam.step()
         parameters.update(adam)
-        keep_in_bounds(parameters, key, start)
+        keep_in_bounds(parameters, SLOT, start)
         adam.update({name: parameters[name] for name in rates})
         if step in (20, 80):
             row[f"{step} steps"] = mi.render(scene, spp=64)
@@ -303,20 +270,31 @@ def descent() -> list[Row]:
 
 
 def wall_of(gaussians: eg.Gaussians) -> "mi.Scene":
-    """Return a wall with Gaussians, seen from the side."""
-    view = mi.ScalarTransform4f().look_at([1.8, 0, 2.6], [0.1, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 205, "height": 205}
-    upright = mi.ScalarTransform4f().translate([0, 1, 0]).scale([1, -1, 1])
-    reflectance = texture_of(gaussians, to_uv=upright)
-    return mi.load_dict(
+    """Return a poster with Gaussians, seen from the side."""
+    return load_scene(mi, "poster", {"color": texture_of(gaussians)}, 3)
+
+
+def recovery() -> list[Row]:
+    """Show a photo, its Gaussians, a scene with them, and what photos of the scene give back."""
+    photo = eg.sample("coffee")[:400, 120:520]
+    few, many = eg.fit(photo, 1500), eg.fit(photo, 5000, space="linear").gaussians
+    scene = load_scene(mi, "poster", {"color": texture_of(many, wrap_mode="clamp")}, CAMERAS)
+    photos = [mi.render(scene, sensor=k, spp=64, seed=k).numpy() for k in range(CAMERAS)]
+    unknown = load_scene(mi, "poster", {"color": bitmap(mi, grey("poster", "color"))}, CAMERAS)
+    loss = photo_loss(unknown, SLOT, photos, sensors=range(CAMERAS))
+    recovered = eg.fit(loss=loss, size=(256, 256), iterations=480, space="linear").gaussians
+    seen = eg.psnr(photo, eg.picture_of(recovered, width=photo.shape[1]))
+    view = mi.ScalarTransform4f().look_at([1.9, 0.5, 3.1], [0.05, -0.12, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "pixel_format": "rgb", "width": 300, "height": 300}
+    side = mi.load_dict({"type": "perspective", "fov": 40, "to_world": view, "film": film})
+    return [
         {
-            "type": "scene",
-            "integrator": {"type": "prb"},
-            "sky": {"type": "constant"},
-            "camera": {"type": "perspective", "fov": 40, "to_world": view, "film": film},
-            "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": reflectance}},
+            "a photo": photo,
+            "1,500 Gaussians": overlay(few.gaussians, eg.picture_of(few.gaussians, width=800)),
+            "5,000 in a scene": to_coded(mi.render(scene, sensor=side, spp=512).numpy()),
+            f"recovered, {seen:.1f} dB": eg.picture_of(recovered),
         }
-    )
+    ]
 
 
 def browser() -> list[Row]:
@@ -352,11 +330,11 @@ def write(name: str, rows: list[Row]) -> None:
     for row in rows:
         width = (WIDTH + GAP) // len(row) - GAP
         cells = [labelled(label, cell_of(picture, width)) for label, picture in row.items()]
-        line = between(cells, axis=1)
-        margin = WIDTH - line.shape[1]
+        line = np.concatenate([np.pad(cell, APART, constant_values=255) for cell in cells], axis=1)
+        margin = WIDTH + GAP - line.shape[1]
         lines.append(np.pad(line, ((0, 0), (0, margin), (0, 0)), constant_values=255))
-    picture = Image.fromarray(between(lines, axis=0))
-    path = IMAGES / f"how-to-{name}.jpg"
+    picture = Image.fromarray(np.concatenate(lines)[:-GAP, :-GAP])
+    path = IMAGES / ("teaser.jpg" if name == "teaser" else f"how-to-{name}.jpg")
     for quality in range(85, 0, -5):
         picture.save(path, quality=quality, optimize=True)
         if path.stat().st_size <= MAX_BYTES:
@@ -368,14 +346,6 @@ def labelled(label: str, cell: np.ndarray) -> np.ndarray:
     if not label:
         return cell
     return np.concatenate([np.uint8(255 * text_line(label, cell.shape[1], LETTERS)), cell])
-
-
-def between(parts: list[np.ndarray], axis: int) -> np.ndarray:
-    """Join pictures with a white gap between each two."""
-    shape = [*parts[0].shape]
-    shape[axis] = GAP
-    gap = np.full(shape, 255, np.uint8)
-    return np.concatenate([one for part in parts for one in (part, gap)][:-1], axis)
 
 
 def cell_of(picture: np.ndarray, width: int) -> np.ndarray:
@@ -402,6 +372,7 @@ PICTURES: dict[str, Callable[[], list[Row]]] = {
     "prefilter": aliasing,
     "differentiate": descent,
     "view": browser,
+    "teaser": recovery,
 }
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from ...backend.types import Doubles, Float, Singles
 from ...gaussian.covariance import factor_from_covariance
 from ...gaussian.file import CUTOFF
 from ...gaussian.gaussians import Gaussians
-from ...raster.binning.tiles import TILE, Grid
+from ...raster.tiles import TILE, Grid
 from ..objective import Pixels
 from .curve import hilbert_curve
 

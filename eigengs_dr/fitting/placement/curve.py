@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...backend.arrays import make_divisor, types_of
 from ...backend.types import UInt
 from ...gaussian.gaussians import Gaussians
-from ...raster.binning.tiles import Grid
+from ...raster.tiles import Grid
 
 
 def hilbert_curve(width: int, height: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

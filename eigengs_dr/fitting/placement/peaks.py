@@ -19,8 +19,8 @@ import drjit as dr
 from ...backend.arrays import ArrayTypes, make_divisor
 from ...backend.recording import record
 from ...backend.types import Float, Rows, UInt
-from ...raster.binning.tiles import TILE, Grid, GridArrays
 from ...raster.parameters import gather_run
+from ...raster.tiles import TILE, Grid, TileLayout
 from ..solve import for_channels
 
 SIDE = TILE[0]
@@ -37,21 +37,21 @@ class Canvas:
     ----------
     types : ArrayTypes
     grid : Grid
-    sizes : GridArrays
+    layout : TileLayout
         Sizes of `grid`: computing them takes microseconds, and many kernels need them.
     """
 
     types: ArrayTypes
     grid: Grid
-    sizes: GridArrays
+    layout: TileLayout
 
     def sides(self) -> tuple[UInt, UInt]:
         """Return width and height of an image as Int32."""
-        return self.types.Int(self.sizes.width), self.types.Int(self.sizes.height)
+        return self.types.Int(self.layout.width), self.types.Int(self.layout.height)
 
     def corner(self, tile: UInt) -> tuple[UInt, UInt]:
         """Return column and row of the first pixel of a tile as Int32."""
-        column, row = self.sizes.first_pixel(tile)
+        column, row = self.layout.first_pixel(tile)
         return self.types.Int(column), self.types.Int(row)
 
     def channels(self, image: Float) -> int:
@@ -70,7 +70,7 @@ class Canvas:
         column, row = x + right, y + down
         width, height = self.sides()
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        tiles = ((row >> 2) - (y >> 2)) * self.sizes.nx + (column >> 2) - (x >> 2)
+        tiles = ((row >> 2) - (y >> 2)) * self.layout.nx + (column >> 2) - (x >> 2)
         place = (tiles + types.Int(pixel >> 4)) * PIXELS + (row & 3) * SIDE + (column & 3)
         return gather_run(types, image, types.UInt(place), self.channels(image), inside)
 

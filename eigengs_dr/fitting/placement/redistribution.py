@@ -26,8 +26,8 @@ from ...backend.arrays import rcp, types_of
 from ...backend.recording import record
 from ...backend.types import Float, Singles
 from ...gaussian.gaussians import Gaussians, whole
-from ...raster.binning.lists import TileLists
 from ...raster.kernels import image_of, sum_by_image
+from ...raster.lists import TileLists
 from ...raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ...raster.render import batch_to_tiles, bin_gaussians
 from ..objective import Pixels, Quadratic
@@ -91,7 +91,7 @@ class Owners:
         """Return the average of values (N,) over the owners of each pixel."""
         sums = _sum_weights(self.shape, values, self.lists, self.cutoff)
         tile = dr.arange(types_of(values).UInt, dr.width(sums)) // self.lists.grid.pixels
-        mean = spread(_mean_by_image(values, self.lists), self.lists.sizes.image_of(tile))
+        mean = spread(_mean_by_image(values, self.lists), self.lists.layout.image_of(tile))
         return dr.fma(NO_WEIGHT, mean, sums) / (self.total + NO_WEIGHT)
 
 

@@ -8,7 +8,7 @@ parameters of its own; few Gaussians reach into two bands, and their rows are st
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...backend.arrays import ArrayTypes, types_of, upload, upload_rows
-from ...backend.recording import record
 from ...backend.types import Bool, Float, UInt
-from ..binning.lists import TileLists, build_lists
-from ..binning.tiles import Grid, GridArrays, State, tile_columns
-from ..parameters import NUM_SHAPE_PARAMS, pack_parameters, unpack_parameters
+from ..lists import TileLists, build_lists
+from ..parameters import pack_parameters
+from ..tiles import Grid
 
 MOST = (1 << 16) - 1
 """Largest number of Gaussians of a band. Their numbers start at 1: row 0 of a band is blank."""
@@ -34,9 +33,6 @@ SIDE = 1.05
 
 RUN = 4
 """Numbers that a step of a sum reads at once, in one gather: two words of 32 bits."""
-
-COLUMNS = 4
-"""Cells of a strip, of one row, which one lane lists: they share the extent of a Gaussian."""
 
 PAD = 0.5
 """Pixels by which lists enlarge Gaussians: what is right for pixel centres is then for points."""
@@ -168,12 +164,8 @@ def list_cells(
 ) -> CellLists:
     """List the Gaussians of every cell of an image.
 
-    A sort lists the Gaussians of strips, of `COLUMNS` cells each. Then one lane per strip tests
-    these, twice: to count the runs of its cells, and to write them. Entries of cells are neither
-    sorted nor copied to the host, and their order is that of the Gaussians.
-
-    Cost: a sort of the entries of strips, less than half as many as those of cells; for each of
-    them two tests and `COLUMNS` comparisons; and one copy of a few bytes to the host.
+    Cells are tiles of lists, whose entries the host numbers in bands and fills up to whole runs.
+    Their order is that of the Gaussians.
 
     Parameters
     ----------
@@ -192,35 +184,38 @@ def list_cells(
         If more than `MOST` Gaussians touch one row of cells.
     """
     types, count = types_of(levels[0][0][0]), dr.width(levels[0][0])
-    lists = [_list_strips(shape, width, height, side, radius) for shape, side in levels]
-    bands, reach = _number(types, count, lists), dr.opaque(types.Float, radius)
-    grids = [Grid(width, height, (side, side)) for _, side in levels]
-    strips = [
-        _Strips(one.splat, number, one.begin, one.end, one.sizes, grid.in_arrays(types), grid.tiles)
-        for one, number, grid in zip(lists, bands.numbers, grids, strict=True)
+    lists = [
+        build_lists(shape, radius, Grid(width, height, (s, s)), PAD, adjoint=False, ordered=False)
+        for shape, s in levels
     ]
-    rows, starts = _count_runs([shape for shape, _ in levels], strips, reach)
-    runs = _write_runs(rows, strips, starts, reach, _rounded(int(starts[-1][-1])))
+    bands = _number(types, count, lists)
+    parts, starts = [], [np.zeros(1, np.int64)]
+    for one, numbers in zip(lists, bands.numbers, strict=True):
+        begin, end = (v.numpy().astype(np.int64) for v in (one.begin, one.end))
+        runs = -(-(end - begin) // RUN)
+        first = starts[-1][-1] + np.append(0, np.cumsum(runs))
+        part = np.zeros(RUN * int(runs.sum()), np.uint16)
+        moved = np.repeat(RUN * (first[:-1] - first[0]) - begin, end - begin)
+        part[moved + np.arange(len(moved))] = numbers[: len(moved)]
+        parts.append(part)
+        starts.append(first)
+    filled = sum(map(len, parts))
+    parts.append(np.zeros(RUN * _rounded(filled // RUN) - filled, np.uint16))
+    words, *firsts = upload_rows(types.UInt, [np.concatenate(parts).view(np.uint32), *starts[1:]])
     cells = []
-    for grid, start in zip(grids, starts, strict=True):
-        density = dr.opaque(types.Float, 1 / grid.tile[0])
-        columns, lines = (dr.opaque(types.UInt, n) for n in (grid.nx, grid.ny))
+    for one, start in zip(lists, firsts, strict=True):
+        density = dr.opaque(types.Float, 1 / one.grid.tile[0])
+        columns, lines = (dr.opaque(types.UInt, n) for n in (one.grid.nx, one.grid.ny))
         cells.append(Cells(start, density, columns, lines))
     return CellLists(
         count,
         cells,
-        runs,
+        words,
         bands.members,
         bands.first,
         dr.opaque(types.Float, 1 / bands.height),
         dr.opaque(types.UInt, dr.width(bands.first) - 1),
     )
-
-
-def _list_strips(shape: list, width: int, height: int, side: int, radius: float) -> TileLists:
-    """List the Gaussians of every strip of cells with this side."""
-    grid = Grid(width, height, (COLUMNS * side, side))
-    return build_lists(shape, radius, grid, pad=PAD, adjoint=False, ordered=False)
 
 
 def _rounded(runs: int) -> int:
@@ -230,167 +225,20 @@ def _rounded(runs: int) -> int:
 
 
 @dataclass(frozen=True)
-class _Strips:
-    """The Gaussians near each strip, for one division of an image into cells.
-
-    Attributes
-    ----------
-    splat : UInt32, shape (capacity,)
-        Gaussians, strip after strip.
-    number : UInt32, shape (capacity,), or None
-        Their numbers in the band of the strip; None for a single band, where they are one higher.
-    begin, end : UInt32, shape (strips,)
-        Range of each strip in `splat`.
-    grid, cells : GridArrays
-        Division of the image into strips, and into cells.
-    tiles : int
-        Number of cells.
-    """
-
-    splat: UInt
-    number: UInt | None
-    begin: UInt
-    end: UInt
-    grid: GridArrays
-    cells: GridArrays
-    tiles: int
-
-
-def _visit_strips(
-    rows: Float,
-    strips: _Strips,
-    radius: Float,
-    start: Callable[[list], State],
-    visit: Callable[[list, UInt, State], State],
-    label: str,
-) -> tuple[list, State]:
-    """Test the Gaussians near each strip in each of its cells.
-
-    Parameters
-    ----------
-    rows : Float
-        The shapes of the Gaussians, from `pack_parameters`.
-    strips : _Strips
-    radius : Float
-    start : callable
-        ``start(cells) -> state``: the first state.
-    visit : callable
-        ``visit(touched, number, state) -> state`` with a Bool for each cell.
-    label : str
-        Name of the loop for profilers.
-
-    Returns
-    -------
-    cells : list of (UInt, Bool)
-        For each cell of a strip, its index in the image, and whether it exists.
-    state
-        The last one.
-    """
-    types, grid = types_of(rows), strips.cells
-    row, column = strips.grid.row.divmod(dr.arange(types.UInt, dr.width(strips.begin)))
-    row, first_column = types.Int(row), types.Int(column * COLUMNS)
-    columns = [first_column + k for k in range(COLUMNS)]
-    cells = [(types.UInt(row * grid.nx + column), column < grid.nx) for column in columns]
-
-    def body(i: UInt, stop: UInt, state: State) -> tuple:
-        here = i < stop
-        gaussian = dr.gather(types.UInt, strips.splat, i, here)
-        shape = unpack_parameters(rows, gaussian, NUM_SHAPE_PARAMS, here)
-        first, last = tile_columns(shape, radius, grid, row, PAD)
-        touched = [here & (first <= column) & (column < last) for column in columns]
-        number = gaussian + 1
-        if strips.number is not None:
-            number = dr.gather(types.UInt, strips.number, i, here)
-        return i + 1, stop, visit(touched, number, state)
-
-    state = dr.while_loop(
-        (strips.begin, strips.end, start(cells)), lambda i, stop, _: i < stop, body, label=label
-    )[-1]
-    dr.eval(state)  # else each scatter of a part would repeat the loop
-    return cells, state
-
-
-@record
-def _count_runs(
-    shapes: list, levels: list[_Strips], radius: Float
-) -> tuple[list[Float], list[UInt]]:
-    """Return the rows of the shapes of all levels, and where the runs of each cell begin."""
-    types = types_of(radius)
-    packed, starts = [], list[UInt]()
-
-    def add(touched: list, number: UInt, counts: list) -> list:
-        return [n + dr.select(t, types.UInt(1), 0) for t, n in zip(touched, counts, strict=True)]
-
-    for shape, strips in zip(shapes, levels, strict=True):
-        rows = pack_parameters(shape)
-        dr.eval(rows)
-        cells, counts = _visit_strips(
-            rows, strips, radius, lambda cells: [types.UInt(0) for _ in cells], add, "count runs"
-        )
-        runs = dr.zeros(types.UInt, strips.tiles + 1)
-        dr.make_opaque(runs)
-        for (cell, exists), count in zip(cells, counts, strict=True):
-            dr.scatter(runs, (count + (RUN - 1)) // RUN, cell, exists)
-        before = dr.gather(types.UInt, starts[-1], dr.width(starts[-1]) - 1) if starts else 0
-        packed.append(rows)
-        starts.append(dr.prefix_sum(runs) + before)
-        dr.eval(starts)
-    return packed, starts
-
-
-@record
-def _write_runs(
-    packed: list[Float], levels: list[_Strips], starts: list[UInt], radius: Float, capacity: int
-) -> UInt:
-    """Return the runs of all cells of all levels, see `CellLists`."""
-    types = types_of(radius)
-    # Zeros, because rounding may make the two passes differ by a cell in different programs.
-    runs = dr.zeros(types.UInt, RUN // 2 * capacity)
-    dr.make_opaque(runs)
-
-    def append(touched: list, number: UInt, places: list) -> list:
-        return [_append(runs, t, number, *one) for t, one in zip(touched, places, strict=True)]
-
-    for rows, strips, start in zip(packed, levels, starts, strict=True):
-
-        def begin(cells: list, start: UInt = start) -> list:
-            ends = [[dr.gather(types.UInt, start, c + k, e) for k in (0, 1)] for c, e in cells]
-            return [(first * RUN, last * RUN, types.UInt(0)) for first, last in ends]
-
-        _, places = _visit_strips(rows, strips, radius, begin, append, "write runs")
-        for slot, stop, half in places:
-            dr.scatter(runs, half, slot // 2, (slot % 2 != 0) & (slot < stop))
-        dr.eval(runs)
-    return runs
-
-
-def _append(runs: UInt, active: Bool, number: UInt, slot: UInt, stop: UInt, half: UInt) -> tuple:
-    """Append a number to the runs of a cell; `half` is the first number of a word without second.
-
-    Returns the next slot, the end of the slots of the cell, and `half`.
-    """
-    active = active & (slot < stop)
-    dr.scatter(runs, half | (number << 16), slot // 2, active & (slot % 2 != 0))
-    half = dr.select(active & (slot % 2 == 0), number, half)
-    return slot + dr.select(active, type(slot)(1), 0), stop, half
-
-
-@dataclass(frozen=True)
 class _Bands:
-    """Rows of parameters, see `CellLists`, and for each level the numbers of `_Strips`."""
+    """Rows of parameters, see `CellLists`, and for each level the numbers of its entries."""
 
     members: UInt | None
     first: UInt
     height: int  # of a band, in pixels
-    numbers: list[UInt | None]
+    numbers: list[NDArray[np.uint32]]
 
 
 def _number(types: ArrayTypes, count: int, lists: list[TileLists]) -> _Bands:
     """Number the Gaussians of as few bands as possible, of equal height."""
-    grid = lists[-1].grid
+    grid, splats = lists[-1].grid, [one.splat.numpy() for one in lists]
     if count <= MOST:
-        return _Bands(None, dr.opaque(types.UInt, 0), grid.height, [None for _ in lists])
-    splats = [one.splat.numpy() for one in lists]
+        return _Bands(None, dr.opaque(types.UInt, 0), grid.height, [s + 1 for s in splats])
     side, bands = grid.tile[1], 2
     while True:
         band = side * -(-grid.ny // bands)
@@ -415,8 +263,8 @@ def _number(types: ArrayTypes, count: int, lists: list[TileLists]) -> _Bands:
         for number, splat, part in zip(numbers, splats, parts, strict=True):
             number[part] = local[splat[part]]
     first = np.cumsum(np.append(0, 1 + listed[:-1].sum(axis=1)))
-    bits, starts, *uploaded = upload_rows(types.UInt, [_pack_bits(listed), first, *numbers])
-    return _Bands(bits, starts, band, list(uploaded))
+    bits, starts = upload_rows(types.UInt, [_pack_bits(listed), first])
+    return _Bands(bits, starts, band, numbers)
 
 
 def _cut(lists: TileLists, band: int) -> list[slice]:

@@ -21,9 +21,8 @@ import drjit as dr
 
 from ...backend.arrays import ArrayTypes, rcp, rsqrt, types_of
 from ...backend.types import Bool, DrJitArray, Float, Mask, UInt
-from ..binning.lists import TileLists, build_lists
-from ..binning.tiles import Grid
 from ..evaluate import LN2, falloff, widen
+from ..lists import TileLists, build_lists
 from ..parameters import (
     KernelParameters,
     kernel_covariance,
@@ -31,6 +30,7 @@ from ..parameters import (
     unpack_parameters,
 )
 from ..render import rasterize, to_tensor
+from ..tiles import Grid
 from .footprint import extreme_variances
 from .points import Packed, axes_of
 from .prefilter import sum_prefiltered

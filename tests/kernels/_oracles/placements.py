@@ -4,18 +4,6 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from _helpers.footprints import matrices
-
-
-def generator(seed=0):
-    """A generator of random numbers."""
-    return np.random.default_rng(seed)
-
-
-def covariances_of(factor):
-    """Covariances of factors (N, 3), shape (N, 2, 2)."""
-    return matrices(*np.asarray(factor, np.float64).T)
-
 
 def check_placement(mean, factor, count, size):
     """Check shapes and bounds of what a placement returns."""

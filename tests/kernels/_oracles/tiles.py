@@ -4,8 +4,8 @@ import numpy as np
 
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.binning.tiles import Grid
 from eigengs_dr.raster.render import batch_to_tiles, to_tensor
+from eigengs_dr.raster.tiles import Grid
 
 
 def to_tiles(image, backend="llvm"):

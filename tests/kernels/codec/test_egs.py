@@ -29,7 +29,7 @@ def content(scene=None, sections=(COUNT,)):
     ends = np.cumsum(sections)
     parts = [symbols.select(slice(end - k, end)) for end, k in zip(ends, sections, strict=True)]
     background = scene.background.astype(np.float32)
-    return packed.EgsContent(parts, STEPS, background, scene.size, "data", psnr=37.5)
+    return packed.EgsContent(parts, STEPS, background, scene.size, "data", 3.0, psnr=37.5)
 
 
 def rows_of(symbols):

@@ -7,8 +7,7 @@ from hypothesis import given
 from _helpers.log_shapes import factors_from_log_shapes
 from _helpers.sets import few, scenes
 from eigengs_dr.codec import quantization as qz
-from eigengs_dr.codec.quantization import MAX_SYMBOL, Quantizer, Steps, quantize
-from eigengs_dr.gaussian.covariance import log_shapes
+from eigengs_dr.codec.quantization import MAX_SYMBOL, Quantizer, Steps, log_shapes, quantize
 
 STEPS = Steps(0.03125, 0.25)
 

@@ -1,11 +1,12 @@
 """Joint training: its gradient, its steps and its scaling."""
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
 
-from _oracles.reference import render_plain
-from eigengs_dr.backend.arrays import types_of
+import eigengs_dr as eg
 from eigengs_dr.backend.selection import select
 from eigengs_dr.paper.joint_training import (
     HALVING_STEPS,
@@ -15,7 +16,6 @@ from eigengs_dr.paper.joint_training import (
     joint_weights,
     train_jointly,
 )
-from eigengs_dr.raster.render import bin_gaussians
 
 WIDTH, HEIGHT = 23, 18
 """No multiples of a tile."""
@@ -48,15 +48,16 @@ def train(backend, steps, waves=None, state=None):
 
 
 def loss_of(state, waves, backend):
-    """Mean squared error of all scaled planes, by a renderer that Dr.Jit differentiates."""
-    rows = [select(backend).Float(row) for row in state["rows"][0]]
+    """Mean squared error of all scaled planes, by one rendering of all of them."""
+    module = select(backend)
+    rows = [module.Float(row) for row in state["rows"][0]]
     dr.enable_grad(rows)
     planes = np.concatenate([(p - p.min()) / np.ptp(p) for p in waves.components if len(p)])
-    types, placed = types_of(rows[0]), decode_shapes(rows[:5], waves.size)
-    values = [*placed.mean, *placed.factor, *rows[5:]]
-    image = render_plain(values, [types.Float(0)] * len(planes), bin_gaussians(placed))
-    target = types.Float(np.moveaxis(planes, 0, 2).ravel())
-    return rows, dr.mean(dr.square(image - target))
+    black = dr.zeros(module.ArrayXf, (len(planes), 1))
+    colored = {"color": module.ArrayXf(rows[5:]), "background": black}
+    image = eg.render(replace(decode_shapes(rows[:5], waves.size), **colored))
+    target = module.TensorXf(np.moveaxis(planes, 0, 2))
+    return rows, dr.mean(dr.square(image - target), axis=None)
 
 
 def test_gradient_is_that_of_all_planes(backend):

@@ -75,11 +75,10 @@ def test_least_squares(backend, channels, steps):
     check_equal(gaussians, scene._asdict())
 
 
-@pytest.mark.parametrize("cutoff", [2.0, 9.0])
-def test_cutoffs(backend, cutoff):
+def test_another_cutoff(backend):
     scene, image = roomy(), noise()
-    solution = solve(replace(scene.on(backend), cutoff=cutoff), image, steps=40)
-    best, _ = best_colors(scene, image, cutoff=cutoff)
+    solution = solve(replace(scene.on(backend), cutoff=2.0), image, steps=40)
+    best, _ = best_colors(scene, image, cutoff=2.0)
     np.testing.assert_allclose(solution.to_arrays()["color"], best, atol=1e-4)
 
 

@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from _helpers.footprints import matrices
 from _helpers.sets import few
 from _oracles.objectives import objective_of
-from _oracles.placements import check_placement, covariances_of, generator, images_and_counts
+from _oracles.placements import check_placement, images_and_counts
 from eigengs_dr.codec.range_coder import hilbert_encode
 from eigengs_dr.fitting.place import Adaptive, Grid, Random
 from eigengs_dr.fitting.placement.adaptive import (
@@ -50,17 +51,6 @@ def density_of(image, count):
     """Gaussians per pixel (H, W)."""
     spacing = float(np.sqrt(image.shape[0] * image.shape[1] / count))
     return normalized(density_from_hessian(np.moveaxis(image, 2, 0), spacing)[1], count)
-
-
-@few
-@given(drawn=images_and_counts())
-def test_density_of_any_image(drawn):
-    """No pixel has more than one Gaussian, none has nothing."""
-    image, count = drawn
-    density = density_of(image, count)
-    assert (density > 0).all()
-    assert density.max() <= 1
-    assert density.sum(dtype=float) <= count * (1 + 1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 10, 100, 400])
@@ -123,7 +113,7 @@ def test_pieces_have_equal_mass(height, width, part, shift):
 
 def test_shapes_are_those_of_eigenvectors():
     """The long axis lies along the smallest second derivative; the area follows the density."""
-    random = generator(5)
+    random = np.random.default_rng(5)
     energy = random.uniform(0.5, 1, (3, 20, 24)).astype(np.float32) - [[[0]], [[0]], [[0.75]]]
     density = random.uniform(0.01, 0.1, (20, 24)).astype(np.float32)
     y, x = np.indices(density.shape).reshape(2, -1)
@@ -136,7 +126,7 @@ def test_shapes_are_those_of_eigenvectors():
     # Eigenvalues ascend: the first axis lies along the smallest second derivative.
     own = np.stack([variance * ratio, variance / ratio], 1)
     sigma = axes * own[:, None] @ axes.transpose(0, 2, 1)
-    np.testing.assert_allclose(covariances_of(factor), sigma, rtol=1e-4, atol=1e-4 * sigma.max())
+    np.testing.assert_allclose(matrices(*factor.T), sigma, rtol=1e-4, atol=1e-4 * sigma.max())
 
 
 def test_splats_lie_along_a_slanted_edge():
@@ -145,7 +135,7 @@ def test_splats_lie_along_a_slanted_edge():
     image = np.repeat((x > y)[..., None], 3, axis=2).astype(np.float32)
     mean, factor = placed(image, 200)
     near = np.abs(mean[:, 0] - mean[:, 1]) < 6
-    sigma = covariances_of(factor[near])
+    sigma = matrices(*factor[near].T)
     along = sigma.sum(axis=(1, 2)) / 2  # variance along (1, 1) / sqrt 2
     across = along - 2 * sigma[:, 0, 1]
     assert (along > 2 * across).mean() > 0.9

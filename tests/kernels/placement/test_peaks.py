@@ -57,7 +57,7 @@ def noise(*shape):
     layers=st.integers(0, 2),
 )
 def test_peaks_are_those_of_a_plain_search(backend, height, width, channels, share, layers):
-    """On sizes that whole tiles do not fill too; weights of pixels or channels, a third of them 0.
+    """On layout that whole tiles do not fill too; weights of pixels or channels, a third of them 0.
 
     Rounding may exchange peaks of equal gain.
     """

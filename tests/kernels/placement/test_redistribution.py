@@ -64,16 +64,12 @@ def test_parts_are_those_of_the_weights(backend):
     assert (found > 0.99).all()  # also where there is no Gaussian
 
 
-def test_equal_shares_of_error_leave_the_density_as_it_was(backend):
-    """Gaussians on a grid, each with the same error: nothing is gained by moving any."""
-    density = density_for(rounds(80, backend), np.ones((80, 80)), np.ones((80, 80)), backend)
-    inner = density[25:-25, 25:-25]
-    np.testing.assert_allclose(inner, inner.mean(), rtol=1e-3)
-
-
-@pytest.mark.parametrize("times", [0.1, 10.0, 100.0])
+@pytest.mark.parametrize("times", [1.0, 0.1, 100.0])
 def test_density_follows_the_error_by_its_power(backend, times):
-    """Far from the border of two halves, densities differ by ``times^(1 / (q + 1))``."""
+    """Far from the border of two halves, densities differ by ``times^(1 / (q + 1))``.
+
+    Of equal errors nothing is gained by moving any.
+    """
     error = np.ones((80, 80))
     error[:, 40:] = times
     density = density_for(rounds(80, backend), error, np.ones((80, 80)), backend)

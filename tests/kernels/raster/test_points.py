@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from _helpers.footprints import check_gradient, coordinates, exact_at, some_points, stacked
 from _helpers.sets import SIZE, few, random_scene, scenes
 from _oracles.lookups import cells_of, squares, sums_at
-from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.lookup.points import fold, gradient_terms
+from eigengs_dr.raster.lookup.points import gradient_terms
 
 POINTS = np.concatenate([np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * SIZE, some_points(396)])
 """Points in the image, its corners among them, shape (points, 2)."""
@@ -77,13 +76,3 @@ def test_the_gradient_reaches_the_point(backend):
     rows = sums_at(gaussians, POINTS, WIDE, terms=gradient_terms, number=3)
     np.testing.assert_allclose(np.array(dr.grad(x)), np.array(rows[1]), atol=1e-9)
     np.testing.assert_allclose(np.array(dr.grad(y)), np.array(rows[2]), atol=1e-9)
-
-
-@few
-@given(x=st.floats(width=32), wrap=st.sampled_from(["repeat", "mirror", "clamp"]))
-def test_no_coordinate_leaves_the_image(backend, x, wrap):
-    """What is not finite becomes the first place."""
-    found, slope = (np.array(v) for v in fold(types_in(select(backend)).Float([x]), 10, wrap))
-    assert 0 <= found[0] <= 10
-    assert np.isfinite(x) or found[0] == (0.5 if wrap == "clamp" else 0)
-    assert slope[0] in (-1, 0, 1)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
 from eigengs_dr.backend.arrays import types_in, upload_rows
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.binning.lists import build_lists
-from eigengs_dr.raster.binning.tiles import ON_CPU, ON_GPU, TILE, Grid
+from eigengs_dr.raster.lists import build_lists
+from eigengs_dr.raster.tiles import ON_CPU, ON_GPU, TILE, Grid
 
 RADIUS = 3.0
 

@@ -68,13 +68,6 @@ def short(side=6):
     return np.random.default_rng(0).uniform(0, 1, (side, side, 3))
 
 
-def test_vectors_get_the_length_1():
-    shown = NORMAL.decode_image(short())
-    np.testing.assert_allclose(np.linalg.norm(2 * shown - 1, axis=2), 1, atol=1e-6)
-    np.testing.assert_allclose(NORMAL.decode_image(shown), shown, atol=1e-6)
-    assert np.isfinite(NORMAL.decode_image(np.full((1, 1, 3), 0.5))).all()
-
-
 @pytest.mark.parametrize("mode", ["backward", "forward"])
 def test_derivatives_of_the_length(backend, mode):
     Tensor = getattr(dr, backend).ad.TensorXf64

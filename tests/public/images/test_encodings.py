@@ -144,7 +144,6 @@ def test_light_above_white_in_a_family_gets_a_word(family, model):
 def test_an_encoding_without_pixels_is_refused(model, tmp_path):
     basis, fitted = model
     calls = {
-        "a basis": lambda: eg.EigenGS.fit(basis, gaussians=60, encoding="linear"),
         "eigenvalues": lambda: basis.truncation_curve(encoding="linear"),
         "view": lambda: eg.view(fitted, encoding="linear"),
         "pack": lambda: eg.pack(fitted.gaussians, tmp_path / "a.egs", encoding="srgb"),

@@ -5,18 +5,12 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.frozen import check_frozen
 from _helpers.kernels import launches
 from _helpers.sets import SIZE
-from _helpers.texture import (
-    backend,
-    gaussians,
-    in_front,
-    mi,
-    small_scene,
-    texel_centres,
-    texture,
-)
-from eigengs_dr.plugins import texture_of
+from _helpers.skies import lit, sky
+from _helpers.texture import backend, gaussians, in_front, mi, small_scene, texel_centres, texture
+from eigengs_dr.plugins import environment_of, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -135,25 +129,14 @@ class TestFrozen:
         bsdf = {"type": "diffuse", "reflectance": texture_of(gaussians(), prefilter=0.02)}
         every = ["color", "background", "mean", "factor"]
         several = [["color", "background"], every, ["color"], ["color"], ["to_uv"], ["to_uv"]]
-        self.check(small_scene(bsdf), [[], *([name] for name in every), *several])
+        check_frozen(small_scene(bsdf), [[], *([name] for name in every), *several])
 
     def test_a_light_that_was_sampled_before(self):
         emitter = {"type": "area", "radiance": texture_of(gaussians("linear"))}
         scene = small_scene(None, emitter=emitter)
         mi.render(scene, spp=1)
-        self.check(scene, [[], *[["color"]] * 4])
+        check_frozen(scene, [[], *[["color"]] * 4])
 
-    @staticmethod
-    def check(scene, changes):
-        parameters = mi.traverse(scene)
-        frozen = dr.freeze(lambda scene, spp, seed: mi.render(scene, spp=spp, seed=seed))
-        for step, names in enumerate(changes):
-            for name in names:
-                key = next(k for k in parameters.keys() if k.endswith(f".{name}"))  # noqa: SIM118
-                shrunk = mi.ScalarTransform3f().scale(1 - 0.05 * step)
-                parameters[key] = shrunk if name == "to_uv" else parameters[key] * 0.9
-            parameters.update()
-            seed = mi.UInt32(step)
-            found, expected = (draw(scene, spp=4, seed=seed) for draw in (frozen, mi.render))
-            np.testing.assert_allclose(np.array(found), np.array(expected), atol=1e-6)
-        assert frozen.n_recordings <= 3  # the first calls record, all others replay
+    def test_a_sky_that_turns(self):
+        scene = lit(environment_of(sky()), "direct", 12)
+        check_frozen(scene, [[], *[["sky.color", "sky.to_world"]] * 3], most=4)

@@ -236,38 +236,44 @@ def test_mistakes_cost_a_line(arguments, others, words):
     assert "\n" not in str(error.value)
 
 
-def test_ctrl_c_keeps_the_best_set():
-    calls = []
-
-    def stop(done, total, row):
-        calls.append(row["stage"])
-        if row["stage"] == "search" and done >= 20:
-            assert row["gaussians"] > 0 and row["psnr"] == min(row["psnr_of_cameras"])
-            raise KeyboardInterrupt
-
-    scene = scene_of(camera([0, 0, 7.0]))
-    with pytest.raises(eg.Interrupted) as stopped:
-        eg.fit_for_scene(scene, NAME, photo(), BOUND, iterations=STEPS, progress=stop)
-    found = stopped.value.result
-    assert list(dict.fromkeys(calls)) == ["rays", "target", "search"]
-    assert min(found.psnr) in [psnr for _, psnr in found.tried]
-    text = f"SceneFit({len(found.gaussians)} Gaussians, 48x48 pixels, psnr=({found.psnr[0]:.2f}))"
-    assert repr(found) == text
+def press():
+    raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("stage", ["rays", "target", "search"])
-def test_a_signal_in_any_stage(stage):
+def signal_it():
+    signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    ("stage", "first", "end"),
+    [
+        ("rays", 0, signal_it),
+        ("target", 0, signal_it),
+        ("search", 1, signal_it),
+        ("search", 20, press),
+    ],
+)
+def test_ctrl_c_in_any_stage_keeps_the_best_set(stage, first, end):
     """It ends the call where progress is told next; before the search there is no set."""
-    calls = []
+    calls, pressed = [], []
 
     def stop(done, total, row):
         calls.append(row["stage"])
-        if row["stage"] == stage and calls.count(stage) == 1:
-            signal.raise_signal(signal.SIGINT)
+        if row["stage"] == stage and done >= first:
+            assert stage != "search" or row["psnr"] == min(row["psnr_of_cameras"])
+            pressed.append(len(calls))
+            end()
 
     scene = scene_of(camera([0, 0, 7.0]))
     with pytest.raises(eg.Interrupted, match="interrupted") as stopped:
         eg.fit_for_scene(scene, NAME, photo(), BOUND, iterations=STEPS, progress=stop)
-    assert calls[-1] == stage and calls.count(stage) == 1
-    assert (stopped.value.result is not None) == (stage == "search")
+    stages = ["rays", "target", "search"]
+    assert pressed == [len(calls)]
+    assert list(dict.fromkeys(calls)) == stages[: stages.index(stage) + 1]
     assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+    found = stopped.value.result
+    assert (found is not None) == (stage == "search")
+    if found:
+        assert min(found.psnr) in [psnr for _, psnr in found.tried]
+        text = f"{len(found.gaussians)} Gaussians, 48x48 pixels, psnr=({found.psnr[0]:.2f})"
+        assert repr(found) == f"SceneFit({text})"

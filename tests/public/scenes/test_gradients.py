@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.derivatives import SIDE, SPP, check_forward_mode, check_gradients
 from _helpers.families import small_model
+from _helpers.poster import camera
 from _helpers.process import run_python
 from _helpers.sets import SIZE, random_scene
+from _helpers.skies import lit, sky
 from _helpers.texture import (
     at,
     backend,
@@ -22,68 +25,16 @@ from _helpers.texture import (
     texel_centres,
     texture,
 )
-from eigengs_dr.plugins import keep_in_bounds, texture_of
+from eigengs_dr.plugins import environment_of, keep_in_bounds, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
 PARAMETERS = ["mean", "factor", "color", "background"]
 TEXTURE = "wall.bsdf.reflectance"
-SIDE, SPP, SEED = 12, 32, 3
-STEPS = {"mean": 2e-2, "factor": 1e-3, "coefficients": 1e-2}
-
-
-def of_texture(scene):
-    parameters = mi.traverse(scene)
-    parameters.keep(f"{TEXTURE}\\.(?!to_uv|prefilter)")
-    return parameters
 
 
 def wall(g, **properties):
     return {"type": "diffuse", "reflectance": {**texture_of(g), **properties}}
-
-
-def direction_like(array):
-    return np.random.default_rng(2).normal(size=array.shape).astype(np.float32)
-
-
-def upstream():
-    return np.random.default_rng(1).normal(size=(SIDE, SIDE, 3)).astype(np.float32)
-
-
-def gradients(scene, weight):
-    """Gradient of ``<weight, image>`` with respect to every parameter, from the integrator."""
-    parameters = of_texture(scene)
-    for key, value in parameters:
-        dr.enable_grad(value)
-        parameters[key] = value
-    parameters.update()
-    scene.integrator().render_backward(scene, parameters, weight, seed=SEED, spp=SPP)
-    return {key.split(".")[-1]: np.array(dr.grad(value)) for key, value in parameters}
-
-
-def difference(scene, name, step, direction, weight):
-    """The same along a direction, by finite differences at the same seed."""
-    parameters, key = of_texture(scene), f"{TEXTURE}.{name}"
-    start, losses = np.array(parameters[key]), []
-    for moved in (start + step * direction, start - step * direction, start):
-        parameters[key] = mi.TensorXf(np.float32(moved))
-        parameters.update()
-        with dr.suspend_grad():
-            image = scene.integrator().render(scene, seed=SEED, spp=SPP)
-        losses.append((np.array(image, np.float64) * np.array(weight)).sum())
-    return (losses[0] - losses[1]) / (2 * step)
-
-
-def check_gradients(scene, names):
-    """Compare with finite differences to 1 %, at equal seeds."""
-    weight = mi.TensorXf(upstream())
-    found = gradients(scene, weight)
-    assert list(found) == names
-    for name, gradient in found.items():
-        direction = direction_like(gradient)
-        expected = difference(scene, name, STEPS.get(name, 2e-3), direction, weight)
-        assert abs(expected) > 1e-2
-        assert (gradient * direction).sum() == pytest.approx(expected, rel=0.01), name
 
 
 @pytest.mark.parametrize(
@@ -93,31 +44,35 @@ def check_gradients(scene, names):
 def test_gradients_are_finite_differences(integrator, prefilter):
     """A cutoff of 6 leaves no edge for finite differences to cross."""
     bsdf = wall(gaussians(), cutoff=6.0, prefilter=prefilter)
-    check_gradients(small_scene(bsdf, integrator, SIDE, SPP), PARAMETERS)
+    check_gradients(small_scene(bsdf, integrator, SIDE, SPP), TEXTURE, PARAMETERS)
 
 
-def along_parameters(integrator):
-    """A picture whose parameters depend on one variable, and this variable."""
-    scene = small_scene(wall(gaussians()), integrator, SIDE, 8)
-    parameters, along = of_texture(scene), mi.Float(0)
-    dr.enable_grad(along)
-    for name in PARAMETERS:
-        start = mi.TensorXf(parameters[f"{TEXTURE}.{name}"])
-        parameters[f"{TEXTURE}.{name}"] = start + along * mi.TensorXf(direction_like(start))
-    parameters.update()
-    return mi.render(scene, parameters, seed=SEED, spp=8), along
+@pytest.mark.parametrize(
+    ("space", "prefilter"),
+    [("radiance", 0.0), pytest.param("log", 0.2, marks=pytest.mark.slow)],
+)
+def test_gradients_of_a_sky_are_finite_differences(space, prefilter):
+    """Of its picture; where it lights a scene, its samples move with it."""
+    light = environment_of(sky(space, count=12), cutoff=6.0, prefilter=prefilter)
+    view = camera([0, 0, 0], SIDE, fov=120, target=[1, 0.2, 0.3])
+    scene = {"type": "scene", "integrator": {"type": "direct"}, "sensor": view, "sky": light}
+    check_gradients(mi.load_dict(scene), "sky", ["scale", *PARAMETERS])
 
 
-@pytest.mark.parametrize("integrator", [pytest.param("direct", marks=pytest.mark.slow), "prb"])
-def test_forward_mode_in_the_usual_order(integrator):
-    """Rendered first and walked then, from a variable behind the parameters."""
-    image, along = along_parameters(integrator)
-    dr.forward(along)
-    found = (np.array(dr.grad(image)) * upstream()).sum()
-    image, along = along_parameters(integrator)
-    dr.backward(dr.sum(image * mi.TensorXf(upstream()), axis=None))
-    assert abs(dr.grad(along)[0]) > 1e-3
-    assert found == pytest.approx(dr.grad(along)[0], rel=1e-3)
+def wall_in_a_scene():
+    return small_scene(wall(gaussians()), "prb", SIDE, 8)
+
+
+def ball_under_a_sky():
+    return lit(environment_of(sky(count=12)), "prb", SIDE)
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "names"),
+    [(wall_in_a_scene, TEXTURE, PARAMETERS), (ball_under_a_sky, "sky", ["color"])],
+)
+def test_forward_mode_in_the_usual_order(make, name, names):
+    check_forward_mode(make, name, names)
 
 
 FORWARD_WITH_PREFILTER = """
@@ -271,7 +226,7 @@ class TestModel:
 
     def test_gradients_are_finite_differences(self, saved):
         bsdf = {"type": "diffuse", "reflectance": {"type": "gaussian_texture", "model": saved[0]}}
-        check_gradients(small_scene(bsdf, "prb", SIDE, SPP), ["coefficients"])
+        check_gradients(small_scene(bsdf, "prb", SIDE, SPP), TEXTURE, ["coefficients"])
 
     def test_coefficients_of_another_shape_or_that_are_not_finite(self, saved):
         path, model = saved

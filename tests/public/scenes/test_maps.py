@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.frozen import check_frozen
 from _helpers.kernels import jit, launches
 from _helpers.materials import MAPS, material
 from _helpers.sets import SIZE
@@ -35,8 +36,8 @@ def map_texture(path, name=None, **properties):
 def test_values_are_those_of_the_map_alone(file):
     m = eg.Gaussians.load(file, backend())
     for name in [part.name for part in m.maps]:
-        found = map_texture(file, name, prefilter=0.01, memory="exact")
-        alone = mi.load_dict(texture_of(m[name], prefilter=0.01))
+        found = map_texture(file, name, memory="exact")
+        alone = mi.load_dict(texture_of(m[name]))
         si = texel_centres()
         if m[name].channels == 1:
             np.testing.assert_array_equal(found.eval_1(si).numpy(), alone.eval_1(si).numpy())
@@ -132,17 +133,8 @@ class TestMapsOfAFile:
 
     @pytest.mark.slow
     def test_frozen_renderings(self, of_files):
-        frozen = dr.freeze(lambda scene, seed: mi.render(scene, spp=4, seed=seed))
-        scenes = [small_scene(of_files(shared), "direct") for shared in (True, False)]
-        parameters = [mi.traverse(scene) for scene in scenes]
-        for step in range(4):
-            for p in parameters[: step > 1 and 2]:  # in the file's values first, then in others
-                key = next(k for k, _ in p if k.endswith("opacity.color"))
-                p[key] = 1.1 * p[key]
-                p.update()
-            found = np.array(frozen(scenes[0], mi.UInt32(step)))
-            expected = np.array(mi.render(scenes[1], spp=4, seed=step))
-            np.testing.assert_allclose(found, expected, atol=1e-6)
+        """In the file's values first, then in others."""
+        check_frozen(small_scene(of_files(True), "direct"), [[], [], *[["opacity.color"]] * 3], 4)
 
     def test_derivatives_of_one_map(self, of_files):
         """The map that has them has lookups of its own; the others still share theirs."""

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.derivatives import SIDE, check_gradients
+from _helpers.frozen import check_frozen
 from _helpers.materials import material
 from _helpers.sets import SIZE
 from _helpers.skies import sky, uniform
@@ -25,7 +27,6 @@ from eigengs_dr.plugins import (
     follow,
     gaussians_of,
     resident_bytes,
-    texture_of,
 )
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
@@ -113,17 +114,6 @@ class TestLoss:
         np.testing.assert_array_equal(seen(mi.load_dict(in_a_file(tmp_path, g))), seen(texture(g)))
 
     @pytest.mark.slow
-    def test_light_above_65504(self, tmp_path):
-        arrays = gaussians("radiance").to_arrays()
-        arrays["color"] = np.abs(arrays["color"]) * (1e6 / np.abs(arrays["color"]).max())
-        g = eg.Gaussians.from_arrays(**arrays, size=SIZE, space="radiance", backend=backend())
-        whole = {"cutoff": 8.0}  # at the usual one, the sun has an edge of 1 %
-        exact = seen(texture(g, **whole))
-        assert exact.max() > 1e5
-        coded = seen(mi.load_dict(in_a_file(tmp_path, g, **whole)))
-        np.testing.assert_allclose(coded, exact, rtol=0.02, atol=LOSS)
-
-    @pytest.mark.slow
     def test_an_environment_loses_little(self, tmp_path):
         sky().save(tmp_path / "sky.npz")
         file = {"type": "gaussian_environment", "filename": str(tmp_path / "sky.npz")}
@@ -163,65 +153,32 @@ class TestParameters:
         mi.traverse(tex)
         assert resident_bytes(tex) >= held + 4 * 8 * len(gaussians())
 
-    def test_without_its_file_a_texture_shows_what_its_rows_hold(self, tmp_path):
-        g = gaussians("linear")
-        tex = mi.load_dict(in_a_file(tmp_path, g, prefilter=0.05))
-        (tmp_path / "set.npz").unlink()
-        found = gaussians_of(mi.traverse(tex), "", like=g).to_arrays()
-        for name, values in g.to_arrays().items():
-            np.testing.assert_allclose(found[name], values, rtol=4e-3, atol=2e-3, err_msg=name)
-
-    @pytest.mark.slow
-    def test_maps_lose_little_and_without_their_file_show_what_rows_hold(self, tmp_path):
+    def test_without_their_file_textures_show_what_their_rows_hold(self, tmp_path):
+        """Also those of maps."""
         whole = material(size=SIZE, backend=backend())
         whole.save(tmp_path / "m.npz")
-        file = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz"), "prefilter": 0.05}
-        textures = {m.name: mi.load_dict({**file, "map": m.name}) for m in whole.maps}
-        for name, tex in textures.items():
-            exact = mi.load_dict({**file, "map": name, "memory": "exact"})
-            values = [np.array(t.eval(in_front(texel_centres()))) for t in (tex, exact)]
-            np.testing.assert_allclose(*values, atol=5 * LOSS)
-            assert resident_bytes(tex) < resident_bytes(exact)
-        (tmp_path / "m.npz").write_bytes(b"another one")
-        for name, tex in textures.items():
-            found = gaussians_of(mi.traverse(tex), "", like=whole[name]).to_arrays()
-            for key, values in whole[name].to_arrays().items():
-                np.testing.assert_allclose(found[key], values, rtol=4e-3, atol=2e-3, err_msg=key)
+        maps = {"type": "gaussian_texture", "filename": str(tmp_path / "m.npz"), "prefilter": 0.05}
+        given = {m.name: (mi.load_dict({**maps, "map": m.name}), whole[m.name]) for m in whole.maps}
+        g = gaussians("linear")
+        given["set"] = mi.load_dict(in_a_file(tmp_path, g, prefilter=0.05)), g
+        (tmp_path / "m.npz").unlink()
+        (tmp_path / "set.npz").unlink()
+        for tex, expected in given.values():
+            found = gaussians_of(mi.traverse(tex), "", like=expected).to_arrays()
+            for name, values in expected.to_arrays().items():
+                np.testing.assert_allclose(found[name], values, rtol=4e-3, atol=2e-3, err_msg=name)
 
-    def test_derivatives_are_those_of_a_texture_of_floats(self, tmp_path):
-        found = []
-        for given in (in_a_file(tmp_path), texture_of(gaussians())):
-            bsdf = {"type": "diffuse", "reflectance": {**given, "prefilter": 0.05}}
-            scene = small_scene(bsdf, "prb")
-            parameters = mi.traverse(scene)
-            parameters.keep(r".*reflectance\.(mean|factor|color|background)")
-            for key, value in parameters:
-                dr.enable_grad(value)
-                parameters[key] = value
-            parameters.update()
-            image = mi.render(scene, parameters, spp=4, seed=1)
-            dr.backward(dr.sum(dr.square(image), axis=None))
-            found.append([np.array(dr.grad(value)) for _, value in parameters])
-        assert len(found[0]) == 4
-        for ours, expected in zip(*found, strict=True):
-            largest = np.abs(expected).max()
-            assert largest > 1e-3
-            np.testing.assert_allclose(ours, expected, rtol=1e-3, atol=1e-4 * largest)
+    def test_derivatives_are_finite_differences(self, tmp_path):
+        """As those of a texture of floats, which it becomes."""
+        file = in_a_file(tmp_path, cutoff=6.0, prefilter=0.05)
+        scene = small_scene({"type": "diffuse", "reflectance": file}, "prb", SIDE)
+        check_gradients(scene, "wall.bsdf.reflectance", ["mean", "factor", "color", "background"])
 
     def test_frozen_renderings_follow_a_texture_that_becomes_one_of_floats(self, tmp_path):
         """Also where the frozen function is the first to ask."""
         scene = small_scene({"type": "diffuse", "reflectance": in_a_file(tmp_path)}, "direct")
 
-        def render(scene, seed):
+        def draw(scene, seed):
             return mi.render(scene, mi.traverse(scene), spp=4, seed=seed)
 
-        frozen = dr.freeze(render)
-        for step in range(4):
-            if step > 1:
-                parameters = mi.traverse(scene)
-                key = next(key for key, _ in parameters if key.endswith("reflectance.color"))
-                parameters[key] = 0.9 * parameters[key]
-                parameters.update()
-            shown = np.array(frozen(scene, mi.UInt32(step)))
-            expected = np.array(mi.render(scene, spp=4, seed=step))
-            np.testing.assert_allclose(shown, expected, atol=1e-6)
+        check_frozen(scene, [[], [], ["color"], ["color"]], draw=draw)

@@ -67,7 +67,7 @@ BLANK = [GREY[:SIDE, :SIDE]] * 3
 
 def few(loss, **options):
     """A fit of a few Gaussians in a few steps."""
-    options = {"size": (32, 32), "gaussians": 20, "iterations": 4} | options
+    options = {"size": (32, 32), "gaussians": 60, "iterations": 4} | options
     return eg.fit(loss=loss, progress=False, **options)
 
 
@@ -84,7 +84,7 @@ class TestFits:
         scene, photos = wall(GREY), photos_of(wall(true_texture()))
         loss = photo_loss(scene, NAME, photos)
         assert len(repr(loss)) < 300 and "\n" not in repr(loss)
-        found = few(loss, gaussians=60, iterations=60)
+        found = few(loss, iterations=60)
         inner = np.s_[4:-4, 4:-4]
         assert np.mean((found.image[inner] - to_coded(true_texture())[inner]) ** 2) < 1e-3
         assert found.gaussians.space == "linear" and found.iterations == 60
@@ -111,7 +111,8 @@ class TestFits:
         photos = photos_of(wall(true_texture(), light=1.5))
         light = mi.ad.Adam(lr=0.03, params={LIGHT: mi.Float(1.0)})
         loss = photo_loss(wall(GREY), NAME, photos, parameters=light)
-        start = eg.fit(to_coded(true_texture()), 60, 60, space="linear").gaussians
+        known = photo_loss(wall(GREY), NAME, photos_of(wall(true_texture())))
+        start = few(known, iterations=60).gaussians
         method = eg.COARSE_TO_FINE.at_rates(0.01)
         few(loss, gaussians=None, start=start, iterations=60, method=method)
         assert light[LIGHT][0] == pytest.approx(1.5, abs=0.05)
@@ -134,7 +135,7 @@ class TestFits:
         photos, scene = photos_of(lit(light), 256), lit(np.full((32, 32, 3), 0.5))
         before = np.mean([(a - b) ** 2 for a, b in zip(photos_of(scene), photos, strict=True)])
         loss = photo_loss(scene, "sky", photos, spp=16)
-        found = few(loss, gaussians=60, iterations=60, space="log")
+        found = few(loss, iterations=60, space="log")
         after = np.mean([(a - b) ** 2 for a, b in zip(photos_of(scene), photos, strict=True)])
         assert after < 0.05 * before
         seen = eg.render(found.gaussians).numpy()
@@ -418,4 +419,4 @@ def test_ctrl_c_in_a_rendering_ends_the_fit_with_its_result(call, press):
         fit(press, [call])
     result = caught.value.result
     assert result.stopped == "interrupted" and result.iterations < STEPS
-    assert len(result.gaussians) == 20
+    assert len(result.gaussians) == 60

@@ -182,7 +182,21 @@ class TestMistakes:
     def test_of_properties(self, properties, message):
         with pytest.raises(RuntimeError) as caught:
             texture(gaussians(), **properties)
-        assert message in str(caught.value).splitlines()[0]
+        assert f"gaussian_texture: {message}" in str(caught.value).splitlines()[0]
+
+    @pytest.mark.parametrize(
+        ("properties", "message"),
+        [
+            ({"scale": -1.0}, "scale is -1.0; it must be finite, and at least 0"),
+            ({"scale": "bright"}, "scale is 'bright'; it must be a number"),
+            ({"prefilter": 2.0}, "prefilter is 2.0; it is the angle of a pixel"),
+            ({"wrap_mode": "clamp"}, "it has no property wrap_mode"),
+        ],
+    )
+    def test_of_an_environment(self, properties, message):
+        with pytest.raises(RuntimeError) as caught:
+            mi.load_dict({**environment_of(gaussians("linear")), **properties})
+        assert f"gaussian_environment: {message}" in str(caught.value).splitlines()[0]
 
     def test_transforms(self):
         flat = np.diag([1.0, 0, 1])

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-import eigengs_dr as eg
 from _helpers.command import said
-from _helpers.process import run_python
 from _helpers.scene_sets import save_halves
 
 mi = pytest.importorskip("mitsuba", reason="the scenes need mitsuba")
@@ -119,42 +117,3 @@ def test_measurement_of_the_plane(folder, monkeypatch, tmp_path):
     assert len(error) == 5
     assert error["Gaussians, prefiltered"] < error["bitmap"] / 4
     assert strip.exists()
-
-
-CONVERT = """
-import runpy, sys
-for path in {paths!r}:
-    sys.argv = ["convert_scene.py", path]
-    runpy.run_path({example!r}, run_name="__main__")
-"""
-
-
-@pytest.mark.slow
-def test_bitmaps_of_the_scenes_are_converted_by_the_example(folder, tmp_path):
-    """Where there are none, a scene is only written anew; a bitmap that nobody sees stays."""
-    eg.save_image(tmp_path / "floor.png", eg.sample("coffee")[:128:4, :128:4])
-    for path in SCENES.glob("*.xml"):
-        text = path.read_text().replace("../build/scenes", str(folder))
-        text = text.replace('value="600"', 'value="16"').replace('value="400"/', 'value="16"/')
-        (tmp_path / path.name).write_text(text)
-    plane = (tmp_path / "plane.xml").read_text().replace("gaussian_texture", "bitmap")
-    plane = re.sub(r'"[^"]*/floor.npz"', '"floor.png"', plane)
-    plane = re.sub(r'<float name="prefilter".*/>', "", plane)
-    hidden = """<shape type="rectangle"><transform name="to_world"><translate z="-9"/></transform>
-        <bsdf type="diffuse"><texture name="reflectance" type="bitmap"><string name="filename"
-        value="floor.png"/></texture></bsdf></shape></scene>"""
-    (tmp_path / "plane.xml").write_text(plane.replace("</scene>", hidden))
-    paths = sorted(str(path) for path in tmp_path.glob("*.xml"))
-    done = run_python(
-        CONVERT.format(paths=paths, example=str(ROOT / "examples" / "convert_scene.py"))
-    )
-    assert done.returncode == 0, done.stderr
-    mi.set_variant("llvm_ad_rgb")
-    eg.register_plugins()
-    for path in map(Path, paths):
-        scene = mi.load_file(str(path.with_stem(f"{path.stem}-gaussians")))
-        assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
-    text = (tmp_path / "plane-gaussians.xml").read_text()
-    assert text.count('type="gaussian_texture"') == text.count('type="bitmap"') == 1
-    [made] = tmp_path.glob("plane-*.npz")
-    assert eg.Gaussians.load(made).space == "linear" and made.name in text

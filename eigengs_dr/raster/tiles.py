@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import drjit as dr
 
-from ...backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
-from ...backend.types import Float, FloatLike, UInt
+from ..backend.arrays import ArrayTypes, Divisor, make_divisor, rcp, rsqrt, types_of
+from ..backend.types import Bool, Float, FloatLike, UInt
 
 
 class Granularity(NamedTuple):
@@ -119,19 +119,20 @@ class Grid:
         """Whether the last tiles overhang the image."""
         return self.nx * self.tile[0] != self.width or self.ny * self.tile[1] != self.height
 
-    def in_arrays(self, types: ArrayTypes) -> GridArrays:
-        """Return the sizes in arrays, for programs that serve grids of every size."""
+    def in_arrays(self, types: ArrayTypes) -> TileLayout:
+        """Return the layout of tiles, for programs that serve grids of every size."""
         width, height = (dr.opaque(types.Float, v) for v in (self.width, self.height))
         row, ny = make_divisor(types, self.nx), dr.opaque(types.Int, self.ny)
         image = make_divisor(types, self.nx * self.ny) if self.images > 1 else None
-        return GridArrays(width, height, ny, row, image, self.tile)
+        return TileLayout(width, height, ny, row, image, self.tile)
 
 
 @dataclass(frozen=True)
-class GridArrays:
-    """The sizes of a `Grid` in arrays; as literals, every size would compile a program of its own.
+class TileLayout:
+    """Where tiles and pixels of a `Grid` lie in their image.
 
-    There are few of them, because each costs a frozen program a microsecond per call.
+    Sizes are in arrays: as literals, every size would compile a program of its own. There are few
+    of them, because each costs a frozen program a microsecond per call.
 
     Attributes
     ----------
@@ -167,9 +168,19 @@ class GridArrays:
         row, column = self.row.divmod(tile)
         return column * self.tile[0], row * self.tile[1]
 
+    def pixel(self, index: UInt) -> tuple[UInt, UInt]:
+        """Return the column and the row of a pixel in its image, by its index in tile layout."""
+        width, height = self.tile
+        column, row = self.first_pixel(index // (width * height))
+        return column + index % width, row + index // width % height
+
+    def inside(self, column: Any, row: Any) -> Bool:
+        """Return whether a pixel lies in the image, not where a tile overhangs it."""
+        return (column < self.width) & (row < self.height)
+
 
 def tile_columns(
-    shape: list, radius: FloatLike, grid: GridArrays, row: UInt, pad: FloatLike = 0.0
+    shape: list, radius: FloatLike, grid: TileLayout, row: UInt, pad: FloatLike = 0.0
 ) -> tuple[UInt, UInt]:
     """Return the columns `[first, last)` that the ellipse of a Gaussian touches in a row of tiles.
 
@@ -184,7 +195,7 @@ def tile_columns(
         Mean x, mean y in pixels; a, b, c in 1 / pixels, in the units of `radius`; a > 0, c > 0.
     radius : float
         Cutoff in the units of the factor.
-    grid : GridArrays
+    grid : TileLayout
     row : Int32
         Row of tiles.
     pad : float or Float, optional
@@ -222,7 +233,7 @@ def tile_columns(
 
 
 def tile_rows(
-    shape: list, radius: FloatLike, grid: GridArrays, pad: FloatLike = 0.0
+    shape: list, radius: FloatLike, grid: TileLayout, pad: FloatLike = 0.0
 ) -> tuple[UInt, UInt]:
     """Return the rows of tiles `[first, last)` that the ellipse may touch; see `tile_columns`."""
     Int = types_of(shape[0]).Int
@@ -243,7 +254,7 @@ State = TypeVar("State")
 def for_each_row(
     shape: list,
     radius: FloatLike,
-    grid: GridArrays,
+    grid: TileLayout,
     visit: Callable[[UInt, UInt, UInt, State], State],
     state: State,
     *,

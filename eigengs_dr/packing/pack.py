@@ -1,10 +1,10 @@
-"""The function `pack`, which writes the smallest file within an allowed loss of PSNR."""
+"""Files of any kind: `load` opens them, and `pack` writes the smallest within a loss of PSNR."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,10 +15,16 @@ from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
 from ..backend.doors import door
-from ..backend.types import ArrayLike
+from ..backend.types import ArrayLike, PathLike
+from ..codec.egs import MAX_SECTIONS, SUFFIX
+from ..codec.quantization import Steps
+from ..eigenbasis.basis import Eigenbasis
+from ..eigenbasis.eigengs import SHIPPED, EigenGS
+from ..eigenbasis.files import BASIS_FORMAT, MODEL_FORMAT
 from ..fitting.fit import Fit
 from ..fitting.problem import Map, read_maps
 from ..gaussian.channels import TextureMap, channel_weights, slices
+from ..gaussian.file import FORMAT, LIGHTS, MATERIAL, kind_of, write_packed
 from ..gaussian.gaussians import Gaussians, scale_channels, set_of
 from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
@@ -26,11 +32,58 @@ from ..image.pixels import check_encoding
 from ..raster.render import picture_of
 from ..relight.model import Relightable, read_table, table_bytes
 from ..storage.atomic import require_writable
-from .egs import MAX_SECTIONS, SUFFIX, write_egs
-from .quantization import Steps
 from .rounding import MIN_MSE, TOO_FINE, Comparison, planes_of, round_within
 
 Array = NDArray[np.floating]
+
+Content = Gaussians | EigenGS | Eigenbasis | Relightable
+"""What a file holds."""
+
+READERS: dict[str, Callable[[PathLike, str | None], Content]] = {
+    FORMAT: Gaussians.load,
+    MATERIAL: Gaussians.load,
+    MODEL_FORMAT: EigenGS.load,
+    BASIS_FORMAT: lambda path, backend: Eigenbasis.load(path),
+    LIGHTS: Relightable.load,
+}
+"""What reads a file, by its format."""
+
+
+@door
+def load(path: PathLike, backend: str | None = None) -> Content:
+    """Read what a file of this package holds, whatever it is.
+
+    Parameters
+    ----------
+    path : path-like
+        A file that a method `save` or `eigengs_dr.pack` wrote, or the name of a model of this
+        package, such as ``"natural"``.
+    backend : {"llvm", "cuda"}, optional
+        See `eigengs_dr.Gaussians.load`.
+
+    Returns
+    -------
+    Gaussians, EigenGS, Eigenbasis or Relightable
+
+    Raises
+    ------
+    ValueError
+        If the file is of another kind, damaged, or of a newer version.
+    OSError
+        If there is no such file, it is a folder, or it cannot be opened.
+
+    Examples
+    --------
+    >>> import eigengs_dr as eg
+    >>> type(eg.load("natural")).__name__
+    'EigenGS'
+    """
+    file = SHIPPED.get(str(path), path)
+    kind = kind_of(file)
+    if kind not in READERS:
+        raise ValueError(f"{file}: format is {kind[:40]!r}, expected one of {', '.join(READERS)}")
+    return READERS[kind](file, backend)
+
 
 BUDGET = 0.5
 """Default loss of PSNR in dB. For a larger loss, using fewer Gaussians saves more bits."""
@@ -163,7 +216,7 @@ def pack(
         held_out = after if math.isfinite(model.psnr_held_out) else math.nan
         lights = table_bytes(replace(model, psnr_held_out=held_out))
     content = attempt.packed._replace(maps=maps, psnr=stored, lights=lights)
-    size = write_egs(output, content)
+    size = write_packed(output, content)
     rounded = Gaussians.load(output, types_of(source.mean).backend)
     figure: float | dict[str, float] = seen
     if maps:

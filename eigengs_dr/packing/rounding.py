@@ -21,17 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
+from ..codec.egs import EgsContent
+from ..codec.quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
+from ..codec.range_coder import hilbert_encode
 from ..fitting.loop import descend, last
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
 from ..fitting.state import begin
+from ..gaussian.file import packed_data
 from ..gaussian.gaussians import Gaussians, like
 from ..image.space import DATA
 from ..raster.render import render
-from .egs import EgsContent
-from .quantization import DEAD_ZONE, Steps, Symbols, dequantize, quantize
-from .range_coder import hilbert_encode
 
 Array = NDArray[np.floating]
 
@@ -108,7 +109,7 @@ def round_within(
         raise ValueError(TOO_FINE)
 
     def evaluate(packed: EgsContent) -> Attempt:
-        after = errors(Gaussians.from_data(packed.set_data(), types_of(gaussians.mean).backend))
+        after = errors(Gaussians.from_data(packed_data(packed), types_of(gaussians.mean).backend))
         shares = [
             (e + extra - b) / (m + extra - b) for e, m, b in zip(after, limits, before, strict=True)
         ]

@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
-from ...backend.arrays import ArrayTypes, make_divisor, sorting_index, types_of, upload
-from ...backend.recording import record
-from ...backend.types import Bool, FloatLike, UInt
-from ..evaluate import is_steep
+from ..backend.arrays import ArrayTypes, make_divisor, sorting_index, types_of, upload
+from ..backend.recording import record
+from ..backend.types import Bool, FloatLike, UInt
+from .evaluate import is_steep
 from .tiles import (
     TILE,
     Grid,
-    GridArrays,
+    TileLayout,
     for_each_row,
     granularity_of,
     tile_columns,
@@ -80,8 +80,8 @@ class TileLists:
     Attributes
     ----------
     grid : Grid
-    sizes : GridArrays
-        The sizes of `grid` as arrays.
+    layout : TileLayout
+        That of `grid`, in arrays.
     splat : UInt32, shape (capacity,)
         Indices of Gaussians, tile after tile; entries after the last list are not used.
     begin, end : UInt32, shape (tiles,)
@@ -106,7 +106,7 @@ class TileLists:
     """
 
     grid: Grid
-    sizes: GridArrays
+    layout: TileLayout
     splat: UInt
     begin: UInt
     end: UInt
@@ -154,7 +154,7 @@ def build_lists(
     Parameters
     ----------
     shape : list of 5 Float, shape (N,)
-        As for `eigengs_dr.raster.binning.tiles.tile_columns`.
+        As for `eigengs_dr.raster.tiles.tile_columns`.
     radius : float
         Cutoff in the units of the factor.
     grid : Grid
@@ -178,10 +178,10 @@ def build_lists(
     """
     types = types_of(shape[0])
     # Numbers are in arrays: as literals, each value would compile a program of its own.
-    sizes, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
+    layout, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
     pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
     share = granularity_of(types)
-    touched, totals = _count_tiles(shape, radius, wide, sizes, pad)
+    touched, totals = _count_tiles(shape, radius, wide, layout, pad)
     narrow, entries = divmod(int(totals[0]), 1 << 40)  # one copy to the host
     exact_exp = narrow > 0 or not share.products or grid.tile[0] != TILE[0]
     if entries >= MAX_LIST_ENTRIES:
@@ -194,14 +194,14 @@ def build_lists(
     # At most one piece of each Gaussian is not full: this bounds their number without a copy.
     max_pieces = _padded(dr.width(touched) + entries // visits) if adjoint else 0
     tile, last, cut = _list_tiles(
-        shape, wide, sizes, pad, image, touched, visits, (_padded(entries), max_pieces)
+        shape, wide, layout, pad, image, touched, visits, (_padded(entries), max_pieces)
     )
     pieces = _in_order(types, tile, *cut) if adjoint else None
     transpose = transpose_by_counting if types.backend == "llvm" else transpose_by_sorting
     splat, starts = transpose(types, grid.tiles, tile, last, entries, dr.width(tile))
     order, begin, end = _lanes(types, grid, starts, ordered and share.ordered)
     lists = TileLists(
-        grid, sizes, splat, begin, end, order, image, pieces, dr.width(splat), exact_exp, radius
+        grid, layout, splat, begin, end, order, image, pieces, dr.width(splat), exact_exp, radius
     )
     dr.eval(lists)
     return lists
@@ -254,7 +254,7 @@ def _padded(count: int) -> int:
 
 @record
 def _count_tiles(
-    shape: list, radius: float, wide: FloatLike, grid: GridArrays, pad: FloatLike
+    shape: list, radius: float, wide: FloatLike, grid: TileLayout, pad: FloatLike
 ) -> tuple[UInt, UInt]:
     """Return the number of tiles that each Gaussian touches, and a total for one copy to the host.
 
@@ -276,7 +276,7 @@ def _count_tiles(
 def _list_tiles(
     shape: list,
     radius: FloatLike,
-    grid: GridArrays,
+    grid: TileLayout,
     pad: FloatLike,
     image: UInt | None,
     touched: UInt,
@@ -306,7 +306,7 @@ def _emit_tiles(
     types: ArrayTypes,
     shape: list,
     radius: FloatLike,
-    grid: GridArrays,
+    grid: TileLayout,
     pad: FloatLike,
     image: UInt | None,
     slots: tuple[UInt, UInt],
@@ -345,7 +345,7 @@ def _find_tiles(
     types: ArrayTypes,
     shape: list,
     radius: FloatLike,
-    grid: GridArrays,
+    grid: TileLayout,
     pad: FloatLike,
     image: UInt | None,
     slots: tuple[UInt, UInt],
@@ -595,32 +595,14 @@ def order_lanes(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray
     ndarray of uint32, shape (lanes,)
         By window, then by descending length; packets without work are spread among the others.
     """
-    order = _descending(length, window)
+    # NumPy sorts 16 bits fastest; a longer list than that is like the longest.
+    falling = 65535 - np.minimum(length, 65535).astype(np.uint16)
+    order = np.lexsort((falling, window.astype(np.uint16))).astype(np.uint32)
     in_packets = len(order) // PACKET * PACKET
     packets = order[:in_packets].reshape(-1, PACKET)
     full = (length[packets[:, 0]] > 0) | (length[packets[:, -1]] > 0)
-    place = np.empty(len(packets), np.uint16)  # NumPy sorts 16 bits fastest
+    place = np.empty(len(packets), np.uint16)
     for kind in (full, ~full):
         place[kind] = np.linspace(0, 65535, kind.sum())
     packets = packets[np.argsort(place, kind="stable")]
     return np.concatenate([packets.ravel(), order[in_packets:]])
-
-
-def _descending(length: NDArray[np.int32], window: NDArray[np.int32]) -> NDArray[np.uint32]:
-    """Return the stable order by window, then by descending length.
-
-    A counting sort. The number of keys of a window is one more than the number of entries of its
-    longest list: except for one per window, there are no more keys than entries of lists.
-    """
-    # The lanes of one window come in runs, the rows of its tiles.
-    changes = np.flatnonzero(window[1:] != window[:-1]) + 1
-    bounds = np.concatenate([[0], changes, [len(window)]])
-    owner = window[bounds[:-1]]
-    longest = np.zeros(int(owner.max()) + 1, np.int32)
-    np.maximum.at(longest, owner, np.maximum.reduceat(length, bounds[:-1]))
-    empty = np.cumsum(longest + 1, dtype=np.int32) - 1  # keys of lanes without work
-    keys = np.repeat(empty[owner], np.diff(bounds)) - length
-    starts = np.arange(len(keys) + 1, dtype=np.int32)
-    keys = keys.astype(np.int32, copy=False)
-    order: NDArray[np.int32] = transpose_pattern(keys, starts, int(empty[-1]) + 1).indices
-    return order.view(np.uint32)
