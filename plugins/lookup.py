@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import drjit as dr
@@ -20,7 +20,6 @@ import numpy as np
 from eigengs_dr.backend.arrays import indices_of, scope, upload
 from eigengs_dr.backend.types import Bool, Float, Record
 from eigengs_dr.raster.evaluate import inverted
-from eigengs_dr.raster.lists import TileLists
 from eigengs_dr.raster.lookup.cells import CellLists, cell_side, list_cells
 from eigengs_dr.raster.lookup.coding import Coding, encode_rows
 from eigengs_dr.raster.lookup.footprint import bound_covariance
@@ -31,7 +30,6 @@ from eigengs_dr.raster.lookup.pyramid import (
     build_pyramid,
     is_minified,
     levels_of,
-    list_finest,
     pyramid_mean,
     sum_pyramid,
 )
@@ -51,13 +49,10 @@ class Lists:
         The Gaussians near every point of an image.
     sizes : SizeClasses or None
         The Gaussians near every footprint; None without a prefilter.
-    finest : TileLists or None
-        Those of the finest level of the pyramid; None while no parameter has changed.
     """
 
     cells: CellLists
     sizes: SizeClasses | None
-    finest: TileLists | None = None
 
 
 class Memory(NamedTuple):
@@ -142,11 +137,8 @@ def make_table(
 
     Rows are coded for a size of the picture if the set allows it and there are no derivatives.
     """
-    cells, sizes, finest = lists.cells, lists.sizes, lists.finest
+    cells, sizes = lists.cells, lists.sizes
     derivatives = dr.grad_enabled(inputs)
-    if sizes and (finest is None or (derivatives and finest.pieces is None)):
-        shape, size = decode(dr.detach(inputs)).shape, (sizes.width, sizes.height)
-        finest = list_finest(shape, *size, kernel_radius(cutoff), derivatives)
 
     def compute(inputs: Record) -> Record:
         parameters = decode(inputs)
@@ -157,9 +149,9 @@ def make_table(
         arrays: Record = {"packed": rows, "background": background}
         arrays |= {"coding": coding} if coding else {}
         dr.eval(arrays)
-        if sizes is not None and finest is not None:
+        if sizes is not None:
             packed = Packed(rows, len(color), cutoff, inverted=True, coding=coding)
-            pyramid = build_pyramid(sizes, packed, finest, shape, color)
+            pyramid = build_pyramid(sizes, packed)
             arrays |= {"values": pyramid.values, "average": pyramid_mean(pyramid)}
             dr.eval(arrays["average"])
         return arrays
@@ -173,9 +165,7 @@ def make_table(
         pyramid = pyramid if derivatives else pyramid.halved()
     coding, filtered = arrays.get("coding"), sizes is not None
     packed = Packed(arrays["packed"], channels, cutoff, inverted=filtered, coding=coding)
-    return Table(
-        replace(lists, finest=finest), packed, background, pyramid, arrays.get("average", [])
-    )
+    return Table(lists, packed, background, pyramid, arrays.get("average", []))
 
 
 def _rows(

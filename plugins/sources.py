@@ -273,7 +273,7 @@ class SharedFile:
             lists = list_gaussians(parameters.shape, size, *key)
             coded_for = size if memory.coded else None
             table = make_table(lists, cutoff, {}, lambda _: parameters, coded_for)
-            table = self.tables.setdefault(key, replace(table, lists=lists))
+            table = self.tables.setdefault(key, table)
             if table.packed.coding is not None:  # the rows hold the Gaussians
                 self._tensors = None
         return table

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -105,9 +104,7 @@ def plugin_of_sums(base: type) -> Any:
                 lists = self.table.lists
             # Rows of a texture that has changed stay floats: words would be another program.
             coded_for = size if self.memory.coded and not self.changed else None
-            table = make_table(lists, self.cutoff, source.tensors, source.decode, coded_for)
-            # A texture that has changed may change its colours next, and needs all lists again.
-            self.table = table if self.changed else replace(table, lists=lists)
+            self.table = make_table(lists, self.cutoff, source.tensors, source.decode, coded_for)
             self.part = slice(None)
 
         # --- The prefilter -----------------------------------------------------------------------

@@ -19,7 +19,7 @@ from ..gaussian.channels import TextureMap
 from ..gaussian.gaussians import Gaussians
 from ..image.color import exposed
 from ..image.space import Affine, Extent, Space
-from ..raster.render import batch_to_tiles
+from ..raster.render import to_tiles
 
 Image = NDArray[np.float32]
 
@@ -182,10 +182,10 @@ class Channels(NamedTuple):
             shown = np.stack(images) if len(images) > 1 else images[0]
         weights = None
         if weight is not None:
-            weights = batch_to_tiles(types, np.atleast_3d(weight).mean(axis=2, keepdims=True))
+            weights = to_tiles(types, np.atleast_3d(weight).mean(axis=2, keepdims=True))
         return Picture(
             self.space,
-            batch_to_tiles(types, shown),
+            to_tiles(types, shown),
             self.part.start,
             upload(types.Float, np.array([unit.scale for unit in units])),
             upload(types.Float, np.array([unit.offset for unit in units])),

@@ -21,7 +21,7 @@ import numpy as np
 from ..backend.arrays import make_divisor, types_of
 from ..backend.doors import check_fields
 from ..backend.types import Float, Rows
-from ..gaussian.gaussians import whole
+from ..gaussian.gaussians import broadcast_rows
 from ..raster.kernels import sum_by_image
 from .exchange import MAX_ERROR, among, exchange, exchange_levels, merged
 from .objective import Pixels
@@ -290,7 +290,7 @@ class Perturb:
         curvature = objective.model.mean_curvature(objective.grid, objective.channels)
         error = squares / (curvature * dr.opaque(type(squares), max(1, len(movable))))
         seed = int(np.random.SeedSequence([key, step]).generate_state(1)[0])
-        color = whole(gaussians.color, gaussians)
+        color = broadcast_rows(gaussians.color, gaussians)
         mean, factor = perturb(
             gaussians.mean, gaussians.factor, color, movable, error, strength, seed, images
         )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import make_divisor, types_of
 from ..backend.recording import record
 from ..backend.types import Bool, Float, UInt
-from ..gaussian.gaussians import Gaussians, concatenate, take, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows, concatenate, take
 from ..raster.kernels import channel_sums
 from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape
@@ -29,6 +29,7 @@ from .redistribution import Owners, error_by_pixel
 from .solve import (
     Unknowns,
     apply,
+    colors_of,
     for_channels,
     held_background,
     preconditioner,
@@ -91,8 +92,7 @@ def _compare(gaussians: Gaussians, objective: Pixels, lists: TileLists | None) -
     """Compare a set with an objective; list the Gaussians of the tiles unless lists are given."""
     if lists is None:
         lists = bin_gaussians(gaussians, images=objective.grid.images)
-    shape = detached_shape(gaussians)
-    colors = whole(gaussians.color, gaussians), list(gaussians.background)
+    shape, colors = detached_shape(gaussians), colors_of(gaussians)
     dr.eval(shape, colors)
     return _Comparison(shape, colors, lists, gaussians.cutoff, objective.model)
 
@@ -271,7 +271,7 @@ def exchange(
         # What takes their places
         peaks = scene.peaks(slope, leaving - dropped)
         pair = gaussians.mean, gaussians.factor
-        mean, factor = (type(rows)(whole(rows, gaussians)) for rows in pair)
+        mean, factor = (type(rows)(broadcast_rows(rows, gaussians)) for rows in pair)
         if dr.width(peaks.rank):
             slot = peaks.image * dr.opaque(types.UInt, leaving) + peaks.rank
             slot = dr.gather(types.UInt, moved, slot)
@@ -328,7 +328,7 @@ def _core(objective: Pixels, part: Part) -> Float:
     width, height = objective.size
     core = np.zeros((height, width, objective.channels), np.float32)
     core[part.core] = 1
-    return to_tiles(objective.types, core, objective.grid)
+    return to_tiles(objective.types, core)
 
 
 @record

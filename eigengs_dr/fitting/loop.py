@@ -68,14 +68,17 @@ def descend(
             if not state.lists or step >= state.until:
                 state = listed(state, image, method, schedule, step, part.stop)
             largest = max(largest, len(state.gaussians))
-            rates = [schedule.rate(step, state, rate, kind) for rate in method.rates.values()]
+            rates = image.types.Float(
+                [schedule.rate(step, state, rate, kind) for rate in method.rates.values()]
+            )
+            dr.make_opaque(rates)  # a single rate would be a literal of the program
             moving, moved = take_step(
                 largest,
                 state.moving,
                 state.fixed,
                 model_at(state),
                 list(state.lists),
-                image.types.Float(rates),
+                rates,
             )
             state = replace(state, moving=moving, gaussians=moved, squares=None)
             yield state

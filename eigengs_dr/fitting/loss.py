@@ -22,7 +22,7 @@ from ..backend.doors import check_types
 from ..backend.messages import shown
 from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor
-from ..gaussian.gaussians import Gaussians, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows
 from ..image.space import Affine
 from ..raster.kernels import forward
 from ..raster.lists import TileLists
@@ -386,7 +386,8 @@ class PictureLoss:
     def draw_set(self, gaussians: Gaussians) -> tuple[Float, list[Float]]:
         """Return the sums of a set and the pictures of the loss, see `draw`, by new lists."""
         lists = bin_gaussians(gaussians, adjoint=False)
-        packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
+        color = broadcast_rows(gaussians.color, gaussians)
+        packed = pack_parameters([*detached_shape(gaussians), *color])
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
         with dr.suspend_grad():
             return self.draw(packed, background, lists, radius)

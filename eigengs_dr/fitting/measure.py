@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..backend.arrays import types_of
 from ..backend.recording import record
 from ..backend.types import Float, Record
-from ..gaussian.gaussians import Gaussians, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows
 from ..image.color import RGB_TO_YCBCR, to_linear, to_pu21
 from ..image.metrics import psnr_from_mse
 from ..raster.kernels import image_of, pixels_inside, sum_by_image
@@ -72,7 +72,7 @@ def psnrs(gaussians: Gaussians, pictures: Sequence[Picture]) -> NDArray[np.float
     images = dr.width(pictures[0].scale)
     with dr.suspend_grad():
         lists = bin_gaussians(gaussians, adjoint=False, images=images)
-        shape, color = detached_shape(gaussians), whole(gaussians.color, gaussians)
+        shape, color = detached_shape(gaussians), broadcast_rows(gaussians.color, gaussians)
         background = list(gaussians.background)
         cutoff = gaussians.cutoff
         sums = _squared_errors(shape, color, background, lists, cutoff, list(pictures))

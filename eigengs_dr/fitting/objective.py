@@ -20,12 +20,12 @@ from numpy.typing import ArrayLike
 
 from ..backend.arrays import ArrayTypes, types_of
 from ..backend.types import Float, Record, Tensor
-from ..gaussian.gaussians import Gaussians, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows
 from ..image.space import DATA, Space
 from ..raster.kernels import channel_sums, pixels_inside, residual
 from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
-from ..raster.render import batch_to_tiles, bin_gaussians, to_tensor
+from ..raster.render import bin_gaussians, to_tensor, to_tiles
 from ..raster.tiles import Grid
 from .channels import Channels, Image, Picture
 from .loss import PictureLoss, Slope
@@ -163,12 +163,12 @@ class Pixels:
         placement_image : ndarray of float32, of the shape of `values`, optional
             The image that places Gaussians; by default `values`.
         """
-        target = batch_to_tiles(types, values)
-        placed = target if placement_image is None else batch_to_tiles(types, placement_image)
+        target = to_tiles(types, values)
+        placed = target if placement_image is None else to_tiles(types, placement_image)
         curvature = None
         if weight is not None:
             layers = weight if weight.ndim == values.ndim else weight[..., None]
-            curvature = batch_to_tiles(types, layers)
+            curvature = to_tiles(types, layers)
         *batch, height, width, channels = values.shape
         grid = Grid(width, height, images=batch[0] if batch else 1)
         return cls(grid, channels, space, Quadratic(target, curvature), placed)
@@ -198,7 +198,9 @@ class Pixels:
     def minus(self, gaussians: Gaussians) -> Pixels:
         """Return the objective for Gaussians that are added to these, which stay as they are."""
         lists = bin_gaussians(gaussians, adjoint=False)
-        packed = pack_parameters([*detached_shape(gaussians), *whole(gaussians.color, gaussians)])
+        packed = pack_parameters(
+            [*detached_shape(gaussians), *broadcast_rows(gaussians.color, gaussians)]
+        )
         radius, background = kernel_radius(gaussians.cutoff), list(gaussians.background)
         beyond, _ = Quadratic(self.model.target).compare(packed, background, lists, radius)
         left = -beyond

@@ -25,14 +25,14 @@ import drjit as dr
 from ..backend.arrays import rcp, types_of
 from ..backend.recording import record
 from ..backend.types import Float, Singles
-from ..gaussian.gaussians import Gaussians, whole
+from ..gaussian.gaussians import Gaussians
 from ..raster.kernels import image_of, sum_by_image
 from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
-from ..raster.render import batch_to_tiles, bin_gaussians
+from ..raster.render import bin_gaussians, to_tiles
 from .objective import Pixels, Quadratic
 from .place import place_adaptive, planes_of, shrunk
-from .solve import Unknowns, apply, correlate, for_channels, solve, spread
+from .solve import Unknowns, apply, colors_of, correlate, for_channels, solve, spread
 
 ERROR_EXPONENT = 4 / 3
 """Exponent q of the decay of the squared error: twice as many Gaussians leave ``2^-q`` of it, which
@@ -143,17 +143,16 @@ def error_by_pixel(
     """
     if lists is None:
         lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    colors = whole(dr.detach(gaussians.color), gaussians), list(dr.detach(gaussians.background))
-    return _squares(detached_shape(gaussians), colors, objective.model, lists, gaussians.cutoff)
+    shape, colors = detached_shape(gaussians), colors_of(gaussians)
+    return _squares(shape, colors, objective.model, lists, gaussians.cutoff)
 
 
 def squares_by_channel(gaussians: Gaussians, objective: Pixels) -> list:
     """Return ``sum h (p - t)^2`` over the pixels for each channel, a Float (images,)."""
     lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    colors = whole(gaussians.color, gaussians), list(gaussians.background)
-    shape, cutoff = detached_shape(gaussians), gaussians.cutoff
+    shape, colors = detached_shape(gaussians), colors_of(gaussians)
     with dr.suspend_grad():
-        return apply(shape, colors, lists, cutoff, objective.model)[1]
+        return apply(shape, colors, lists, gaussians.cutoff, objective.model)[1]
 
 
 def density_ratio(owners: Owners, error: Float, bending: Float) -> Float:
@@ -236,8 +235,8 @@ def redistribute(
                 small = replace(gaussians, mean=mean, factor=factor, width=width, height=height)
                 parts = Owners.of(small, images)
                 less = shrunk(planes_of(error, objective.grid)[:, 0], times)
-                seen = batch_to_tiles(objective.types, less[..., None])
-            bending = batch_to_tiles(objective.types, default[..., None])
+                seen = to_tiles(objective.types, less[..., None])
+            bending = to_tiles(objective.types, default[..., None])
             return planes_of(target_density(parts, seen, bending), parts.lists.grid)[:, 0]
 
         placed = place_adaptive(objective, count, gaussians.cutoff, density, seed)

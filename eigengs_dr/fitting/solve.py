@@ -16,7 +16,7 @@ import drjit as dr
 from ..backend.arrays import rcp, release_memory, types_of
 from ..backend.recording import record
 from ..backend.types import Float, UInt
-from ..gaussian.gaussians import Gaussians, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows
 from ..raster.adjoint import adjoint
 from ..raster.kernels import channel_sums, difference, image_of, sum_by_image
 from ..raster.lists import TileLists
@@ -96,7 +96,7 @@ def solve(
         shape = detached_shape(gaussians)
         types = types_of(gaussians.mean)
         if warm_start:
-            x = whole(gaussians.color, gaussians), list(gaussians.background)
+            x = colors_of(gaussians)
         else:
             color = [dr.zeros(types.Float, len(gaussians)) for _ in range(gaussians.channels)]
             x = color, model.mean_target(objective.grid, gaussians.channels)
@@ -111,6 +111,12 @@ def solve(
         del lists
     release_memory(values)
     return solved
+
+
+def colors_of(gaussians: Gaussians) -> Unknowns:
+    """Return the colours of a set and its backgrounds, without derivatives."""
+    color, background = dr.detach(gaussians.color), dr.detach(gaussians.background)
+    return broadcast_rows(color, gaussians), list(background)
 
 
 @record

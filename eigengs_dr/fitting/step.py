@@ -16,7 +16,7 @@ import drjit as dr
 
 from ..backend.arrays import make_divisor, types_of
 from ..backend.types import Float, FloatLike, Mask
-from ..gaussian.gaussians import Gaussians, take, whole
+from ..gaussian.gaussians import Gaussians, broadcast_rows, take
 from ..raster.adjoint import adjoint_pieces, sum_pieces
 from ..raster.kernels import sum_lanes
 from ..raster.lists import TileLists
@@ -50,7 +50,9 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
     moments = {name: method.optimizer.start(value) for name, value in variables.items()}
     types, scale = types_of(gaussians.mean), None
     if method.rate_exponent:
-        scale = rate_scale_of(whole(gaussians.color, gaussians), method.rate_exponent, images)
+        scale = rate_scale_of(
+            broadcast_rows(gaussians.color, gaussians), method.rate_exponent, images
+        )
         dr.eval(scale)
     time = dr.opaque(types.Float, 0)
     packed = pack_parameters([*kernel_shape(gaussians), *gaussians.color])

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import eval_pending_scatters, types_in, types_of, upload, upload_rows
 from ..backend.doors import class_of_doors, door
-from ..backend.messages import notebook_html, shown
+from ..backend.messages import shown
 from ..backend.selection import BackendError, select
 from ..backend.types import Array2f, Array3f, Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size
@@ -30,6 +30,13 @@ from .file import CUTOFF, Arrays, SetData, check, read_set, write_set
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can lie
 between pixel centres, where it has no gradient."""
+
+
+def notebook_html(value: object) -> str:
+    """Return HTML of a set, a fit, a basis or a model, by the public name of what lies above."""
+    import eigengs_dr as eg
+
+    return eg.to_html(value)
 
 
 @class_of_doors
@@ -376,13 +383,13 @@ def take(gaussians: Gaussians, index: UInt) -> Gaussians:
     Float = types_of(gaussians.mean).Float
 
     def pick(rows: Rows) -> Rows:
-        return type(rows)([dr.gather(Float, row, index) for row in whole(rows, gaussians)])
+        return type(rows)([dr.gather(Float, row, index) for row in broadcast_rows(rows, gaussians)])
 
     mean, factor, color = map(pick, (gaussians.mean, gaussians.factor, gaussians.color))
     return replace(gaussians, mean=mean, factor=factor, color=color)
 
 
-def whole(rows: Rows, gaussians: Gaussians) -> list[Float]:
+def broadcast_rows(rows: Rows, gaussians: Gaussians) -> list[Float]:
     """Return rows with one entry per Gaussian; a row of length 1 is broadcast."""
     return [row + dr.zeros(type(row), len(gaussians)) for row in rows]
 
@@ -425,7 +432,7 @@ def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
         return first
 
     def join(name: str) -> Rows:
-        parts = zip(*(whole(getattr(g, name), g) for g in sets), strict=True)
+        parts = zip(*(broadcast_rows(getattr(g, name), g) for g in sets), strict=True)
         return type(getattr(first, name))([dr.concat(part) for part in parts])
 
     joined = replace(
@@ -519,7 +526,9 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     tensors = {}
     for name in FIELDS:
         rows = getattr(gaussians, name)
-        rows = eval_pending_scatters(list(rows) if name == "background" else whole(rows, gaussians))
+        rows = eval_pending_scatters(
+            list(rows) if name == "background" else broadcast_rows(rows, gaussians)
+        )
         joint = dr.ravel(types.FloatX(rows), order="F")
         tensors[name] = types.Tensor(joint, (dr.width(joint) // len(rows), len(rows)))
     tensors["background"] = tensors["background"][0]
@@ -592,15 +601,6 @@ def _columns_of(like: Rows, tensor: Tensor) -> Rows:
     values = types.Float(tensor.array)  # the tensor may have another precision
     index = dr.arange(types.UInt, dr.width(values) // number) * number
     return type(like)([dr.gather(types.Float, values, index + k) for k in range(number)])
-
-
-def scale_channels(gaussians: Gaussians, factors: Sequence[float]) -> Gaussians:
-    """Multiply colours and background by a factor for each channel."""
-
-    def scale(rows: Rows) -> Rows:
-        return type(rows)([row * float(f) for row, f in zip(rows, factors, strict=True)])
-
-    return replace(gaussians, color=scale(gaussians.color), background=scale(gaussians.background))
 
 
 def one_image(gaussians: Gaussians) -> Gaussians:

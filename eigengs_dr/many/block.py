@@ -47,7 +47,7 @@ from ..gaussian.gaussians import Gaussians
 from ..image.color import to_linear
 from ..image.pixels import WHITE, ImageError
 from ..image.space import DATA, YCBCR, Affine, Extent, Space
-from ..raster.render import batch_to_tiles
+from ..raster.render import to_tiles
 from .grid import Block
 from .windows import Window
 
@@ -214,7 +214,7 @@ def find_density(
     _, density = _density(full, settings)
     owners = Owners.of(fitted)
     error = error_by_pixel(fitted, objective, owners.lists)
-    ratio = density_ratio(owners, error, batch_to_tiles(full.types, density[..., None]))
+    ratio = density_ratio(owners, error, to_tiles(full.types, density[..., None]))
     arrays = fitted.to_arrays()
     return {
         "mean": arrays["mean"][task.members],

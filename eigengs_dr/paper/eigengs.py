@@ -16,7 +16,7 @@ from ..fitting.method import Method, Model
 from ..fitting.objective import Pixels
 from ..gaussian.gaussians import Gaussians
 from ..image.space import Space
-from ..raster.render import batch_to_tiles
+from ..raster.render import to_tiles
 from .gaussianimage import GAUSSIANIMAGE
 
 
@@ -34,8 +34,8 @@ class EigenGSMethod(Method):
         The mean image becomes the base of the picture of the objective.
         """
         mean = model.dense_mean(*objective.size)
-        target = objective.model.target - batch_to_tiles(objective.types, mean)
-        base = batch_to_tiles(objective.types, mean_picture(mean, objective.space))
+        target = objective.model.target - to_tiles(objective.types, mean)
+        base = to_tiles(objective.types, mean_picture(mean, objective.space))
         pictures = tuple(picture._replace(base=base) for picture in objective.pictures)
         model_of_error = objective.model._replace(target=target)
         objective = replace(objective, model=model_of_error, pictures=pictures)

@@ -27,7 +27,6 @@ from ..raster.kernels import residual
 from ..raster.lists import TileLists
 from ..raster.parameters import NUM_SHAPE_PARAMS, kernel_radius, kernel_shape, pack_parameters
 from ..raster.render import bin_gaussians, to_tiles
-from ..raster.tiles import Grid
 from .adan import Adan
 from .gaussianimage import Cholesky
 
@@ -207,7 +206,7 @@ def _train(band: Band, state: State, steps: int, backend: str | None) -> Iterato
         for planes, (low, high) in zip(band.components, _bounds(band), strict=True)
     ]
     targets = [
-        to_tiles(types, np.moveaxis(planes, 0, 2), Grid(*size))
+        to_tiles(types, np.moveaxis(planes, 0, 2))
         for planes in _split(np.concatenate(scaled), axis=0)
     ]
     scale = dr.opaque(types.Float, 2 / sum(planes.size for planes in band.components))

@@ -413,13 +413,14 @@ class _Rasterize(dr.CustomOp):
         self.set_grad_in("background", channel_sums(delta, self.channels, self.lists.grid))
 
 
-def to_tiles(types: ArrayTypes, image: Values, grid: Grid) -> Float:
+def to_tiles(types: ArrayTypes, image: Values) -> Float:
     """Upload an image (height, width, channels) in tile layout; pixels outside it are 0.
 
     The images (M, height, width, channels) of a batch follow each other. Each lane gathers one
     value; the source holds interleaved pixels, or planes that `numpy.moveaxis` presents as pixels.
     """
     height, width, channels = image.shape[-3:]
+    grid = Grid(width, height, images=len(image) if image.ndim == 4 else 1)
     planes = np.moveaxis(image, -1, -3)
     if planes.flags.c_contiguous:
         source, strides = planes, (width, 1, height * width)
@@ -440,15 +441,6 @@ def to_tiles(types: ArrayTypes, image: Values, grid: Grid) -> Float:
     dr.eval(result)
     dr.sync_thread()  # the source may share the caller's memory
     return result
-
-
-def batch_to_tiles(types: ArrayTypes, images: Values) -> Float:
-    """Upload images (M, height, width, channels) in tile layout, image after image.
-
-    An image (height, width, channels) is a batch of one.
-    """
-    number, (height, width) = len(images) if images.ndim == 4 else 1, images.shape[-3:-1]
-    return to_tiles(types, images, Grid(width, height, images=number))
 
 
 def to_tensor(image: Float, grid: Grid, channels: int) -> Tensor:

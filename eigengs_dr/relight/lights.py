@@ -280,13 +280,9 @@ class LightTable:
     @cached_property
     def coefficients(self) -> Doubles:
         """The factors of the functions of a direction, shape (B, 3, K + 1)."""
-        found = solve_table(self.kind, self.smoothing, self.lights, self.values_as_rows)
+        rows = self.values.reshape(len(self.values), -1)
+        found = solve_table(self.kind, self.smoothing, self.lights, rows)
         return found.reshape(-1, *self.values.shape[1:])
-
-    @property
-    def values_as_rows(self) -> Doubles:
-        """The values of each light in a row."""
-        return self.values.reshape(len(self.values), -1)
 
     def at(self, lights: Doubles) -> Doubles:
         """Return the factors for directions (m, 3) of length 1, shape (m, 3, K + 1)."""

@@ -21,20 +21,15 @@ import drjit as dr
 
 from ...backend.arrays import ArrayTypes, rcp, rsqrt, types_of
 from ...backend.types import Bool, DrJitArray, Float, Mask, UInt
-from ..evaluate import LN2, falloff, widen
-from ..lists import TileLists, build_lists
+from ..evaluate import LN2, falloff
 from ..parameters import (
-    KernelParameters,
-    kernel_covariance,
     pack_parameters,
     unpack_parameters,
 )
-from ..render import rasterize, to_tensor
-from ..tiles import Grid
 from .footprint import extreme_variances
 from .points import Packed, axes_of
 from .prefilter import sum_prefiltered
-from .size_classes import FOOTPRINT_REACH, SizeClasses
+from .size_classes import SizeClasses
 
 SAMPLE_DEVIATION = 0.65
 """Standard deviation of the Gaussians of a level, in spacings of its points."""
@@ -298,55 +293,19 @@ def levels_of(width: int, height: int, count: int, wrap: str) -> tuple[Level, ..
     return tuple(levels)
 
 
-def list_finest(shape: list, width: int, height: int, radius: float, adjoint: bool) -> TileLists:
-    """List the Gaussians of the finest level, for `build_pyramid`; colours do not matter.
-
-    Parameters
-    ----------
-    shape : list of 5 Float, shape (N,)
-    width, height, radius
-        As for `eigengs_dr.raster.lookup.cells.list_cells`.
-    adjoint : bool
-        Whether the colours or shapes of the pyramid have derivatives.
-    """
-    level = levels_of(width, height, dr.width(shape), "repeat")[0]
-    blurred, _ = _blurred(dr.detach(shape), level)
-    return build_lists(blurred, radius, Grid(level.nx, level.ny), adjoint=adjoint)
-
-
-def _blurred(shape: list, level: Level) -> tuple[list, Float]:
-    """Blur Gaussians for a level, whose points become pixels; return their amplitudes too."""
-    blur = kernel_covariance(_blur(types_of(shape[0]), level))
-    (x, y, a, b, c), amplitude = widen(shape, blur)
-    dx, dy = (dr.opaque(type(x), d) for d in (level.dx, level.dy))
-    return [x * rcp(dx), y * rcp(dy), a * dx, b * dy, c * dy], amplitude
-
-
 def _blur(types: ArrayTypes, level: Level) -> list:
     """Return the covariance xx, xy, yy by which the values of a level are blurred."""
     return [types.Float((SAMPLE_DEVIATION * d) ** 2) for d in (level.dx, 0, level.dy)]
 
 
-def build_pyramid(
-    sizes: SizeClasses, packed: Packed, finest: TileLists, shape: list, color: list
-) -> GaussianPyramid:
+def build_pyramid(sizes: SizeClasses, packed: Packed) -> GaussianPyramid:
     """Evaluate a sum of Gaussians at the points of all levels; differentiable.
 
-    Cost: a rendering of the blurred Gaussians for the finest level, and one
-    `eigengs_dr.raster.lookup.prefilter.sum_prefiltered` for each of its points at a border. Each
-    other level samples the previous level.
-
-    Parameters
-    ----------
-    sizes : SizeClasses
-    packed : Packed
-    finest : TileLists
-        From `list_finest`.
-    shape, color : list of Float, shape (N,)
-        The Gaussians, in the order of the set.
+    Cost: one `eigengs_dr.raster.lookup.prefilter.sum_prefiltered` for each point of the finest
+    level. Each other level samples the previous level.
     """
     types, one = types_of(packed.values), types_of(packed.values).Float(1)
-    levels = levels_of(sizes.width, sizes.height, dr.width(shape), sizes.wrap)
+    levels = levels_of(sizes.width, sizes.height, sizes.cells.count, sizes.wrap)
     parts = list[Float]()
     for number, level in enumerate(levels):
         index = dr.arange(types.UInt, level.columns * level.rows)
@@ -354,43 +313,15 @@ def build_pyramid(
             types.Int(k) - level.pad for k in (index % level.columns, index // level.columns)
         )
         x, y = (types.Float(column) + 0.5) * level.dx, (types.Float(row) + 0.5) * level.dy
-        blur = _blur(types, level)
+        blur, everywhere = _blur(types, level), types.Bool(True)
         if parts:
             finer = (replace(levels[number - 1], first=0),)
             pyramid = GaussianPyramid(sizes.wrap, packed.channels, finer, parts[-1], one)
-            seen = sum_pyramid(pyramid, x, y, blur, types.Bool(True))
+            seen = sum_pyramid(pyramid, x, y, blur, everywhere)
         else:
-            inner = _render(packed, finest, level, shape, color)
-            edge = (column < EDGE) | (column >= level.nx - EDGE)
-            edge |= (row < EDGE) | (row >= level.ny - EDGE)
-            ring = dr.compress(edge)
-            near_x, near_y = (dr.gather(types.Float, v, ring) for v in (x, y))
-            borders = sum_prefiltered(sizes, packed, near_x, near_y, blur, types.Bool(True))
-            dr.eval(borders)  # once for all channels
-            pixel = types.UInt(row) * level.nx + types.UInt(column)
-            seen = []
-            for k, border in enumerate(borders):
-                whole = dr.zeros(types.Float, dr.width(x))
-                dr.scatter(whole, border, ring)
-                dr.eval(whole)  # where all points are at a border, `select` returns it itself
-                inside = dr.gather(types.Float, inner, pixel * len(color) + k, ~edge)
-                seen.append(dr.select(edge, whole, inside))
+            seen = sum_prefiltered(sizes, packed, x, y, blur, everywhere)
         parts.append(pack_parameters(seen))
         dr.eval(parts[-1])
     values = dr.concat(parts)
     dr.eval(values)
     return GaussianPyramid(sizes.wrap, packed.channels, levels, values, one)
-
-
-EDGE = math.ceil(FOOTPRINT_REACH * SAMPLE_DEVIATION)
-"""Points of the finest level at a border. There, copies of the image and the part of a Gaussian
-inside the image count too: each of these points is looked up."""
-
-
-def _render(packed: Packed, lists: TileLists, level: Level, shape: list, color: list) -> Float:
-    """Return the blurred sum at the points of the image: widen all Gaussians, and render them."""
-    Float = types_of(packed.values).Float
-    shape, amplitude = _blurred(shape, level)
-    color = [amplitude * c for c in color]
-    parameters = KernelParameters(shape, color, [Float(0) for _ in color])
-    return to_tensor(rasterize(parameters, lists, packed.cutoff), lists.grid, len(color)).array

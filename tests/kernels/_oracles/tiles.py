@@ -4,7 +4,7 @@ import numpy as np
 
 from eigengs_dr.backend.arrays import types_in
 from eigengs_dr.backend.selection import select
-from eigengs_dr.raster.render import batch_to_tiles, to_tensor
+from eigengs_dr.raster import render
 from eigengs_dr.raster.tiles import Grid
 
 
@@ -14,9 +14,9 @@ def to_tiles(image, backend="llvm"):
     image = image[..., None] if image.ndim == 2 else image
     images = len(image) if image.ndim == 4 else 1
     grid = Grid(image.shape[-2], image.shape[-3], images=images)
-    return batch_to_tiles(types_in(select(backend)), image), grid
+    return render.to_tiles(types_in(select(backend)), image), grid
 
 
 def to_map(values, grid):
     """A map (H, W) from tile layout."""
-    return to_tensor(values, grid, 1).numpy()[..., 0]
+    return render.to_tensor(values, grid, 1).numpy()[..., 0]

@@ -23,11 +23,9 @@ from eigengs_dr.raster.lookup.pyramid import (
     build_pyramid,
     is_minified,
     levels_of,
-    list_finest,
     pyramid_mean,
     sum_pyramid,
 )
-from eigengs_dr.raster.render import decode_parameters
 
 FOOTPRINTS = [
     np.diag([1.0, 1.0]),
@@ -42,10 +40,8 @@ MANY = 130
 
 
 def lattice_of(gaussians, wrap="repeat", cutoff=CUTOFF):
-    p, size = decode_parameters(gaussians), (gaussians.width, gaussians.height)
     sizes, packed = classes_of(gaussians, wrap, cutoff)
-    finest = list_finest([dr.detach(r) for r in p.shape], *size, packed.radius, True)
-    return build_pyramid(sizes, packed, finest, p.shape, p.color)
+    return build_pyramid(sizes, packed)
 
 
 def looked_up(lattice, points, covariance):
