@@ -1,4 +1,4 @@
-"""What users see: warnings, text that is safe to print on a terminal, pictures in a notebook."""
+"""What users see: warnings, and text that is safe to print on a terminal."""
 
 from __future__ import annotations
 
@@ -45,10 +45,3 @@ def shown(value: object) -> str:
     text = repr(value)
     short = len(text) <= 60 and text.isprintable()
     return text if short else f"of the type {type(value).__name__}"
-
-
-def notebook_html(value: object) -> str:
-    """Return HTML, by the public name of its function, which lies above."""
-    import eigengs_dr as eg
-
-    return eg.to_html(value)

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..backend.doors import checks_types, shows_progress
-from ..backend.messages import notebook_html, shown, warn
+from ..backend.messages import shown, warn
 from ..backend.types import ArrayLike, Doubles, Singles
+from ..gaussian.gaussians import notebook_html
 from ..image.folder import TrainingImages, find_lists
 from ..image.io import check_member
 from ..image.notes import series

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..backend.doors import checks_types, door, shows_progress
-from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike, Doubles, Record, Singles
-from ..gaussian.gaussians import Gaussians, with_colors
+from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.io import Codes, check_member
 from ..image.pixels import EncodedImage, check_encoding
 from ..image.resize import resample

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from ..backend.doors import checks_types, door, shows_progress
 from ..backend.interrupts import Interrupted, defer_interrupts
-from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike
 from ..gaussian.file import FitFigures, write_set
-from ..gaussian.gaussians import Gaussians
+from ..gaussian.gaussians import Gaussians, notebook_html
 from ..image.pixels import check_weight
 from ..image.space import space_of
 from ..raster.render import picture_of

@@ -230,8 +230,8 @@ def members_of(data: SetData) -> Arrays:
     return members | {"size": np.array(data.size, np.int64), "cutoff": np.array(float(data.cutoff))}
 
 
-def read_head(path: Path) -> tuple[int, SetData]:
-    """Return the number of Gaussians in an ``.npz`` file, and its properties without arrays.
+def read_head(path: Path) -> tuple[int, tuple[int, int]]:
+    """Return the number of Gaussians in an ``.npz`` file, and its size; arrays are not read.
 
     Raises
     ------
@@ -244,9 +244,9 @@ def read_head(path: Path) -> tuple[int, SetData]:
     small = {name: field for name, field in layout.items() if name not in ARRAYS}
     shape = npz.read_shapes(path, kind, version, {"color": LAYOUT["color"]})["color"]
     with file_errors(path):
-        head = SetData({}, *_properties(npz.read(path, kind, version, small)))
-        space, maps = _check_properties(shape[1], *head[1:])
-    return shape[0], head._replace(space=space, maps=maps)
+        found = _properties(npz.read(path, kind, version, small))
+        _check_properties(shape[1], *found)
+    return shape[0], found[0]
 
 
 def _layout_of(path: Path) -> tuple[str, int, dict[str, Field]]:

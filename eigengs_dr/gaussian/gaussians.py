@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import settle, types_in, types_of, upload, upload_rows
 from ..backend.doors import class_of_doors, door
-from ..backend.messages import notebook_html, shown
+from ..backend.messages import shown
 from ..backend.selection import BackendError, select
 from ..backend.types import Array2f, Array3f, Float, FloatLike, Rows, Tensor, UInt
 from ..image.pixels import check_size
@@ -30,6 +30,13 @@ from .file import CUTOFF, Arrays, SetData, check, read_set, write_set
 MIN_DEVIATION = 0.25
 """Smallest standard deviation along an axis of the factor, in pixels. A narrower Gaussian can lie
 between pixel centres, where it has no gradient."""
+
+
+def notebook_html(value: object) -> str:
+    """Return HTML of a set, a fit, a basis or a model, by the public name of what lies above."""
+    import eigengs_dr as eg
+
+    return eg.to_html(value)
 
 
 @class_of_doors
@@ -592,15 +599,6 @@ def _columns_of(like: Rows, tensor: Tensor) -> Rows:
     values = types.Float(tensor.array)  # the tensor may have another precision
     index = dr.arange(types.UInt, dr.width(values) // number) * number
     return type(like)([dr.gather(types.Float, values, index + k) for k in range(number)])
-
-
-def scale_channels(gaussians: Gaussians, factors: Sequence[float]) -> Gaussians:
-    """Multiply colours and background by a factor for each channel."""
-
-    def scale(rows: Rows) -> Rows:
-        return type(rows)([row * float(f) for row, f in zip(rows, factors, strict=True)])
-
-    return replace(gaussians, color=scale(gaussians.color), background=scale(gaussians.background))
 
 
 def one_image(gaussians: Gaussians) -> Gaussians:

@@ -208,14 +208,14 @@ def find_result(source: RunImage, options: str, overwrite: bool) -> ImageRow | N
     if output is None or not os.path.lexists(output):  # a link that leads nowhere is not followed
         return None
     try:
-        count, head = read_head(output)
+        count, (width, height) = read_head(output)
         figures = read_figures(output)
     except (ValueError, OSError):
         reason = "exists and is not a set of Gaussians; move it, or use another folder"
         return source.row("failed", error=f"{output}: {reason}")
     if overwrite:
         return None
-    row = source.row("skipped", width=head.size[0], height=head.size[1], gaussians=count)
+    row = source.row("skipped", width=width, height=height, gaussians=count)
     if figures is None:
         return row
     if figures.options and figures.options != options:

@@ -25,7 +25,7 @@ from ..fitting.fit import Fit
 from ..fitting.problem import Map, read_maps
 from ..gaussian.channels import TextureMap, channel_weights, slices
 from ..gaussian.file import FORMAT, LIGHTS, MATERIAL, kind_of, write_packed
-from ..gaussian.gaussians import Gaussians, scale_channels, set_of
+from ..gaussian.gaussians import Gaussians, set_of
 from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
 from ..image.pixels import check_encoding
@@ -205,8 +205,12 @@ def pack(
         max_psnr_drop -= unseen - psnr_from_mse(compared.extra_error + compared.error(source))
         if max_psnr_drop <= 0:
             raise ValueError(TOO_FINE)
-    weighted = scale_channels(source, channel_weights(maps)) if maps else source
-    attempt, before = round_within(replace(weighted, maps=()), compared, max_psnr_drop, rows)
+    weighted = source
+    if maps:
+        weights = type(source.color)(channel_weights(maps))
+        color, background = source.color * weights, source.background * weights
+        weighted = replace(source, color=color, background=background, maps=())
+    attempt, before = round_within(weighted, compared, max_psnr_drop, rows)
     seen = psnr_from_mse(attempt.error)
     stored = seen if image is not None and not maps else math.nan
     after = psnr_from_mse(max(attempt.error + compared.extra_error, MIN_MSE))

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from ..backend.arrays import ArrayTypes, types_of
 from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
-from ..backend.messages import notebook_html
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..codec.egs import is_packed, read_egs
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
 from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
-from ..gaussian.gaussians import Gaussians, with_colors
+from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats
 from ..image.pixels import encoding_of

@@ -70,3 +70,18 @@ def albedo(scene):
 def photo(side=48):
     """A photo of a few pixels, shape (side, side, 3)."""
     return eg.sample("astronaut")[: 8 * side : 8, : 8 * side : 8]
+
+
+def quad(folder, matrix, flipped=False, normals=False):
+    """A parallelogram, its corners `matrix` times (2 u - 1, 2 v - 1); faces may be turned over."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    normal = np.cross(*matrix.T)
+    order = [1, 4, 3, 2] if flipped else [1, 2, 3, 4]
+    lines = [f"v {x} {y} {z}" for x, y, z in (2 * corners - 1) @ matrix.T]
+    lines += [f"vt {u} {v}" for u, v in corners]
+    lines += [f"vn {normal[0]} {normal[1]} {normal[2]}"] if normals else []
+    names = [f"{k}/{k}/1" if normals else f"{k}/{k}" for k in order]
+    lines += [f"f {names[0]} {names[k]} {names[k + 1]}" for k in (1, 2)]
+    path = folder / "quad.obj"
+    path.write_text("\n".join(lines))
+    return {"type": "obj", "filename": str(path), "flip_tex_coords": False}

@@ -19,19 +19,13 @@ def test_front_is_what_nothing_beats(points):
 
 
 def test_the_matrix_of_ends():
-    def cell(name, preset="default", **figures):
-        return row({"case": name, "preset": preset, "iterations": 9}, **figures)
+    def cell(name, end, seed=0, finite=True):
+        job = {"case": name, "preset": "default", "iterations": 9, "seed": seed}
+        return row(job, finite=finite, start_ycbcr=30.0, end_ycbcr=end, seconds=seed + 1.0)
 
-    usual = {"finite": True, "start_ycbcr": 30.0, "seconds": 2.0}
-    made = [
-        cell("better", **usual, end_ycbcr=40.0),
-        cell("exact", **usual, end_ycbcr=100.0),
-        cell("broken", **usual | {"finite": False}, end_ycbcr=None),
-        cell("thin", needs="a larger image"),
-    ]
-    for seed, end in enumerate((40.0, 40.5, 41.0)):
-        seeded = cell("seeds", **usual, end_ycbcr=end)
-        made.append(seeded | {"job": seeded["job"] | {"seed": seed}, "seconds": seed + 1.0})
+    made = [cell("better", 40.0), cell("exact", 100.0), cell("broken", None, finite=False)]
+    made += [cell("seeds", end, seed) for seed, end in enumerate((40.0, 40.5, 41.0))]
+    made.append(row(made[0]["job"] | {"case": "thin"}, needs="a larger image"))
     [ends] = stability.summarize(made).tables
     expected = {
         "better": "40.0 from 30.0",

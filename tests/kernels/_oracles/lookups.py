@@ -2,7 +2,7 @@
 
 import drjit as dr
 
-from _helpers.footprints import coordinates, stacked
+from _helpers.footprints import coordinates
 from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.raster.lookup.cells import list_cells
 from eigengs_dr.raster.lookup.points import Packed, invert, sum_at_points, value_terms
@@ -53,6 +53,3 @@ def filtered(gaussians, wrap, points, covariance, cutoff):
 def squares(rows):
     """The sum of the squares of rows, as a loss."""
     return dr.sum(sum(dr.square(row) for row in rows))
-
-
-__all__ = ["cells_of", "classes_of", "filtered", "footprint_of", "squares", "stacked", "sums_at"]

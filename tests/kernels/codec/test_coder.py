@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from eigengs_dr.codec.exact_math import angle_in_turns, cos_turns, exp2, log2, sin_turns
-from eigengs_dr.codec.range_coder import (
-    TAILS,
-    Decoder,
-    Encoder,
-    hilbert_encode,
-)
+from eigengs_dr.codec.range_coder import TAILS, Decoder, Encoder, hilbert_encode
 
 # --- Numbers ---
 

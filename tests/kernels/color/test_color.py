@@ -3,29 +3,12 @@
 import drjit as dr
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from skimage.color import rgb2ycbcr
 
 from eigengs_dr.backend.selection import select
-from eigengs_dr.image.color import (
-    from_log,
-    rgb_to_ycbcr,
-    to_coded,
-    to_linear,
-    to_log,
-)
-from eigengs_dr.image.space import YCBCR
+from eigengs_dr.image.color import from_log, rgb_to_ycbcr, to_coded, to_linear, to_log
 
 PRECISION = {np.float32: 2e-6, np.float64: 1e-14}
-
-images = hnp.arrays(
-    np.float64,
-    hnp.array_shapes(min_dims=0, max_dims=2, max_side=4).map(lambda shape: (*shape, 3)),
-    elements=st.floats(-2, 2),
-)
-
 
 # --- YCbCr -------------------------------------------------------------------------------------
 
@@ -36,23 +19,6 @@ def test_equals_scikit_image(dtype):
     result = rgb_to_ycbcr(image)
     assert result.dtype == dtype
     np.testing.assert_allclose(result, rgb2ycbcr(image) / 255, atol=PRECISION[dtype])
-
-
-@given(images)
-def test_round_trip(image):
-    for dtype, precision in PRECISION.items():
-        result = YCBCR.decode_image(rgb_to_ycbcr(image.astype(dtype)))
-        assert result.dtype == dtype
-        np.testing.assert_allclose(result, image, atol=10 * precision)
-
-
-def test_refuses_what_would_be_misread():
-    for convert in (rgb_to_ycbcr, to_linear, to_coded):
-        with pytest.raises(ValueError, match="uint8; convert to float32"):
-            convert(np.zeros((2, 2, 3), np.uint8))
-    for shape in ((), (2, 2), (2, 2, 4)):
-        with pytest.raises(ValueError, match="shape"):
-            rgb_to_ycbcr(np.zeros(shape))
 
 
 # --- sRGB and linear light ---------------------------------------------------------------------
@@ -66,32 +32,7 @@ def test_srgb_of_the_standard():
     codes = np.linspace(0.05, 1.5, 30)
     np.testing.assert_allclose(to_linear(codes), ((codes + 0.055) / 1.055) ** 2.4, rtol=1e-14)
     np.testing.assert_allclose(to_linear(-codes), -codes / 12.92, rtol=1e-14)
-
-
-@given(hnp.arrays(np.float64, 16, elements=st.floats(-1, 2)))
-def test_srgb_round_trip(values):
-    for dtype, precision in {np.float32: 2e-6, np.float64: 1e-7}.items():
-        for there, back in ((to_linear, to_coded), (to_coded, to_linear)):
-            result = back(there(values.astype(dtype)))
-            assert result.dtype == dtype
-            np.testing.assert_allclose(result, values, atol=precision)
-
-
-@pytest.mark.parametrize("convert", [to_linear, to_coded])
-def test_srgb_in_drjit_equals_numpy(backend, convert):
-    module = select(backend)
-    values = np.linspace(-0.5, 1.5, 24)
-    with np.errstate(invalid="raise"):
-        expected = convert(values)
-    single = values.astype(np.float32)
-    for array, precision in (
-        (module.Float64(values), 1e-12),
-        (module.Float(single), 2e-6),
-        (module.TensorXf(single.reshape(2, 4, 3)), 2e-6),
-    ):
-        result = convert(array)
-        assert type(result) is type(array)
-        np.testing.assert_allclose(np.ravel(result.numpy()), expected, atol=precision)
+    np.testing.assert_allclose(to_coded(to_linear(codes)), codes, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

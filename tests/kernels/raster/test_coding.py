@@ -47,24 +47,6 @@ def test_numbers_lose_what_their_bits_say(backend, is_filtered, channels, magnit
     np.testing.assert_allclose(color, exact, rtol=HALF)
 
 
-KEPT = {
-    "an endless one": ("factor", [1e-12, 0, 1.0]),
-    "a narrow one, for which a step of a mean is far": ("factor", [1e6, 0, 1.0]),
-    "one far away": ("mean", [1e6, 3.0]),
-    "no number": ("color", [np.nan, 0, 0]),
-    "one beside whose light the others would lose their bits": ("color", [1e7, 0, 0]),
-}
-"""What words do not hold: a parameter, and its value of one Gaussian."""
-
-
-@pytest.mark.parametrize("case", KEPT)
-def test_sets_that_words_do_not_hold_keep_floats(backend, case):
-    scene, (name, value) = random_scene(1, 60), KEPT[case]
-    array = getattr(scene, name).copy()
-    array[0] = value
-    assert coded(scene._replace(**{name: array}).on(backend)) is None
-
-
 def test_what_is_held(backend):
     """Not double precision, nor too much light; but no light at all, and means outside."""
     scene = random_scene(1, 60)

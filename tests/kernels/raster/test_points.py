@@ -52,14 +52,6 @@ def test_too_many_gaussians_of_one_cell_are_a_mistake(backend):
         cells_of(many(backend, 30.0)[1])
 
 
-def test_slopes_are_finite_differences(backend):
-    scene, step = random_scene(6), 1e-5
-    rows = sums_at(scene.on(backend, bits=64), POINTS, WIDE, terms=gradient_terms, number=3)
-    for k, direction in ((1, [step, 0]), (2, [0, step])):
-        up, down = (exact_at(scene, POINTS + s * np.array(direction), WIDE)[0] for s in (1, -1))
-        np.testing.assert_allclose(stacked(rows)[:, k::3], (up - down) / (2 * step), atol=1e-8)
-
-
 def test_the_gradient_is_a_finite_difference(backend):
     def loss(gaussians):
         return squares(sums_at(gaussians, POINTS, WIDE))
@@ -68,7 +60,7 @@ def test_the_gradient_is_a_finite_difference(backend):
 
 
 def test_the_gradient_reaches_the_point(backend):
-    """The loop hands on derivatives of where it is evaluated, which geometry may have."""
+    """The loop hands on derivatives of where it is evaluated: slopes, as `gradient_terms` gives."""
     gaussians = random_scene(8).on(backend, bits=64)
     x, y = coordinates(select(backend).Float64, POINTS)
     dr.enable_grad(x, y)

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, random_scene, scenes
+from _helpers.sets import COUNT, SIZE, covariances, distances, factors_of, few, scenes
 from eigengs_dr.backend.arrays import types_in, upload_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.lists import build_lists
-from eigengs_dr.raster.tiles import ON_CPU, ON_GPU, TILE, Grid
+from eigengs_dr.raster.tiles import ON_CPU, ON_GPU, Grid
 
 RADIUS = 3.0
 
@@ -104,22 +104,6 @@ def test_lists_of_extreme_shapes(backend, shapes, spread):
     mean, factor = mean.astype(np.float32), shapes(rng).astype(np.float32)
     member = check_lists(backend, mean, factor)
     assert member.any()
-
-
-@pytest.mark.parametrize(
-    ("size", "tile"),
-    [
-        *((size, TILE) for size in ((1, 1), (1, 9), (9, 1), (8, 4), (5, 5))),
-        *((SIZE, tile) for tile in ((1, 1), (8, 8), (3, 5))),
-    ],
-)
-def test_grids(backend, size, tile):
-    grid = Grid(*size, tile)
-    assert grid.nx == -(-size[0] // tile[0])
-    assert grid.tiles == grid.nx * grid.ny
-    assert grid.pixels == tile[0] * tile[1]
-    scene = random_scene(2)
-    check_lists(backend, scene.mean * np.array(size) / SIZE, scene.factor, grid)
 
 
 @pytest.mark.slow

@@ -10,8 +10,7 @@ from _helpers.derivatives import check_gradients
 from _helpers.light import to_coded
 from _helpers.lit_models import SIZE, LitFormula, to_light
 from _helpers.lit_spheres import directions, photos
-from _helpers.packed import few_groups
-from _helpers.poster import camera
+from _helpers.poster import camera, quad
 from _helpers.texture import in_front, mi, picture, texel_centres
 from _helpers.variants import in_variants
 from eigengs_dr.plugins import material_of, resident_bytes
@@ -49,21 +48,6 @@ def folded(place, wrap):
     tile = np.floor(place)
     odd = (wrap == "mirror") & (tile % 2 == 1)
     return np.where(odd, 1 - (place - tile), place - tile), np.where(odd, -1, 1)
-
-
-def quad(folder, matrix, flipped=False, normals=False):
-    """A parallelogram, its corners `matrix` times (2 u - 1, 2 v - 1); faces may be turned over."""
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    normal = np.cross(*matrix.T)
-    order = [1, 4, 3, 2] if flipped else [1, 2, 3, 4]
-    lines = [f"v {x} {y} {z}" for x, y, z in (2 * corners - 1) @ matrix.T]
-    lines += [f"vt {u} {v}" for u, v in corners]
-    lines += [f"vn {normal[0]} {normal[1]} {normal[2]}"] if normals else []
-    names = [f"{k}/{k}/1" if normals else f"{k}/{k}" for k in order]
-    lines += [f"f {names[0]} {names[k]} {names[k + 1]}" for k in (1, 2)]
-    path = folder / "quad.obj"
-    path.write_text("\n".join(lines))
-    return {"type": "obj", "filename": str(path), "flip_tex_coords": False}
 
 
 def values(shape, points, normals, lamps):
@@ -184,12 +168,11 @@ def test_an_update_of_to_uv_turns_the_light(saved):
 # --- Samples ---
 
 
-def on_a_wall(count):
-    """Points of a wall, seen from the side, and numbers to sample with."""
-    r = np.random.default_rng(0)
+def on_a_wall(count, u, v):
+    """Points of a wall, seen from the side."""
     si = in_front(dr.zeros(mi.SurfaceInteraction3f, count))
-    si.uv, si.wi = mi.Point2f(r.uniform(0, 1, (2, count))), mi.Vector3f(0, 0.6, 0.8)
-    return si, (mi.Float(r.uniform(0, 1, count)), mi.Point2f(r.uniform(0, 1, (2, count))))
+    si.uv, si.wi = mi.Point2f(u, v), mi.Vector3f(0, 0.6, 0.8)
+    return si
 
 
 def test_samples_have_their_density(saved):
@@ -197,26 +180,22 @@ def test_samples_have_their_density(saved):
 
     bsdf = mi.load_dict({"type": "gaussian_relightable", "model": saved})
 
-    def interaction(count):
-        si = in_front(dr.zeros(mi.SurfaceInteraction3f, count))
-        si.uv, si.wi = mi.Point2f(0.4, 0.6), mi.Vector3f(0, 0.6, 0.8)
-        return si
-
     def sample(numbers):
         first = mi.Float(dr.arange(mi.UInt32, dr.width(numbers)) % 1000) / 1000
-        bs, _ = bsdf.sample(mi.BSDFContext(), interaction(dr.width(numbers)), first, numbers)
-        return bs.wo
+        si = on_a_wall(dr.width(numbers), 0.4, 0.6)
+        return bsdf.sample(mi.BSDFContext(), si, first, numbers)[0].wo
 
     def density(wo):
-        return bsdf.pdf(mi.BSDFContext(), interaction(dr.width(wo)), wo)
+        return bsdf.pdf(mi.BSDFContext(), on_a_wall(dr.width(wo), 0.4, 0.6), wo)
 
     assert_density(sample, density, SphericalDomain(), 100_000, 32)
 
 
 def test_samples_weigh_the_value(saved):
     bsdf, ctx = mi.load_dict({"type": "gaussian_relightable", "model": saved}), mi.BSDFContext()
-    si, numbers = on_a_wall(1000)
-    bs, weight = bsdf.sample(ctx, si, *numbers)
+    first, *others = (mi.Float(k) for k in np.random.default_rng(0).uniform(0, 1, (5, 1000)))
+    si = on_a_wall(1000, *others[:2])
+    bs, weight = bsdf.sample(ctx, si, first, mi.Point2f(*others[2:]))
     value, density = bsdf.eval(ctx, si, bs.wo), bsdf.pdf(ctx, si, bs.wo)
     np.testing.assert_allclose(np.array(density), np.array(bs.pdf), rtol=1e-4)
     np.testing.assert_allclose(np.array(weight * density), np.array(value), atol=1e-5)
@@ -478,15 +457,6 @@ class TestTexture:
             found = picture(texture.eval_3(texel_centres(SIZE)), SIZE)
             expected = eg.picture_of(formula.model().relight(light)).clip(0, 1)
             np.testing.assert_allclose(found, to_light(expected), atol=1e-3)
-
-    @pytest.mark.slow
-    @few_groups()
-    def test_packed_models_are_read(self, formula, saved, tmp_path):
-        eg.pack(formula.model(), tmp_path / "m.egs", max_psnr_drop=0.1)
-        packed = mi.load_dict({"type": "gaussian_texture", "model": str(tmp_path / "m.egs")})
-        whole = mi.load_dict({"type": "gaussian_texture", "model": saved})
-        found, expected = (picture(t.eval_3(texel_centres(SIZE)), SIZE) for t in (packed, whole))
-        np.testing.assert_allclose(found, expected, atol=0.05)
 
     def test_a_light_that_an_optimiser_spoilt_is_that_of_the_camera(self, saved):
         texture = mi.load_dict({"type": "gaussian_texture", "model": saved, "memory": "exact"})

@@ -139,10 +139,10 @@ class TestLookups:
         )
 
 
-def seen_by_a_renderer(found, place, image, target=(0, 0, 0)):
+def seen_by_a_renderer(found, place, image):
     """PSNR of the albedo, as Mitsuba renders it, of the set against the image."""
     textures = texture_of(found.gaussians, wrap_mode="clamp"), bitmap(to_linear(image))
-    a, b = (albedo(scene_of(camera(place, target=target), texture=t)) for t in textures)
+    a, b = (albedo(scene_of(camera(place), texture=t)) for t in textures)
     return eg.psnr(to_coded(a.clip(0, 1)), to_coded(b.clip(0, 1)))
 
 
@@ -185,15 +185,6 @@ class TestFit:
         assert len(half.gaussians) < 0.75 * len(whole.gaussians)
         assert half.gaussians.to_arrays()["mean"][:, 0].max() < 30
         assert half.visibility.seen.shape == (48, 48)
-
-    @pytest.mark.slow
-    def test_a_part_from_close_by(self):
-        """A camera so close to a corner that a pixel is less than two texels."""
-        place, target = [0.7, 0.6, 0.4], [0.7, 0.6, 0]
-        found = fitted(camera(place, target=target))
-        assert 0 < found.visibility.seen.mean() < 0.25
-        assert min(found.psnr) >= BOUND
-        assert seen_by_a_renderer(found, place, photo(), target) > BOUND - 1
 
     def test_every_camera_is_content(self):
         found = fitted(camera([0, 0, 7.0]), camera([4, 0, 5.5]))

@@ -97,6 +97,8 @@ def test_what_is_no_sensor_is_refused(sensor, error, message):
     scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}})
     with refused(error, message):
         follow(scene, sensor)
+    with pytest.raises(TypeError, match=r"follow: scene is a .*; give a loaded one"):
+        follow(scene.sensors()[0], sensor)
 
 
 def test_all_textures_of_the_scene():

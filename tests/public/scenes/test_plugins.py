@@ -13,29 +13,17 @@ import eigengs_dr as eg
 from _helpers.process import run_python
 from _helpers.texture import at, gaussians, mi, texture
 from _helpers.variants import in_variants, on_both
-from eigengs_dr.plugins import environment_of, follow, gaussians_of, keep_in_bounds, texture_of
+from eigengs_dr.plugins import environment_of, gaussians_of, keep_in_bounds, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
 ROOT = Path(__file__).parents[3]
 
 
-class TestFound:
-    def test_a_file_beside_the_scene(self, tmp_path, monkeypatch):
-        gaussians().save(tmp_path / "x.npz")
-        (tmp_path / "scene.xml").write_text(
-            '<scene version="3.0.0"><shape type="rectangle"><bsdf type="diffuse">'
-            '<texture type="gaussian_texture" name="reflectance">'
-            '<string name="filename" value="x.npz"/></texture></bsdf></shape></scene>'
-        )
-        monkeypatch.chdir("/")
-        scene = mi.load_file(str(tmp_path / "scene.xml"))
-        assert any(key.endswith("reflectance.mean") for key, _ in mi.traverse(scene))
-
-    def test_registering_again_keeps_the_class(self):
-        before = type(texture(gaussians()))
-        eg.register_plugins()
-        assert type(texture(gaussians())) is before
+def test_registering_again_keeps_the_class():
+    before = type(texture(gaussians()))
+    eg.register_plugins()
+    assert type(texture(gaussians())) is before
 
 
 FIRST = """
@@ -247,11 +235,6 @@ class TestMistakes:
             for function in (gaussians_of, keep_in_bounds):
                 with pytest.raises(ValueError, match=f"no {name}.mean .* mitsuba.traverse"):
                     function(parameters, name, gaussians())
-
-    def test_no_scene_to_follow_in(self):
-        sensor = mi.load_dict({"type": "perspective"})
-        with pytest.raises(TypeError, match=r"follow: scene is a .*; give a loaded one"):
-            follow(sensor, sensor)
 
     def test_none_stands_for_the_default(self):
         """It ends the process in Mitsuba."""

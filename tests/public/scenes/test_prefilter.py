@@ -7,14 +7,7 @@ from _helpers.arrays import upload_rows
 from _helpers.footprints import brute_force
 from _helpers.poster import camera
 from _helpers.sets import SIZE, random_scene
-from _helpers.texture import (
-    at,
-    backend,
-    gaussians,
-    in_front,
-    mi,
-    texture,
-)
+from _helpers.texture import at, backend, gaussians, in_front, mi, texture
 from eigengs_dr.plugins import pixel_angle, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]

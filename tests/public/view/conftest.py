@@ -91,6 +91,16 @@ class Tab:
         frame = "await new Promise(requestAnimationFrame)"
         self.page.evaluate(f"async () => {{ while (!({condition})) {frame}; }}")
 
+    def fingers(self):
+        """Return what sends a touch event with the places of all fingers."""
+        session = self.page.context.new_cdp_session(self.page)
+
+        def send(kind, *places):
+            points = [{"x": x, "y": y} for x, y in places]
+            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+        return send
+
     def pixels(self):
         """The canvas, shape (H, W, 3); black where it is empty."""
         link = self.page.evaluate("() => { viewer.draw(); return viewer.canvas.toDataURL(); }")

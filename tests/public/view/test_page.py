@@ -177,12 +177,7 @@ def test_mouse_and_keyboard_move_the_picture(show):
 
 def test_two_fingers_zoom(show):
     tab = show(eg.view(make_set()), "phone")
-    touch = tab.page.context.new_cdp_session(tab.page)
-
-    def send(kind, *points):
-        points = [{"x": x, "y": y} for x, y in points]
-        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-
+    send = tab.fingers()
     before = tab.run("viewer.camera.scale")
     at = tab.run("viewer.camera.toImage(2 * 180, 2 * 150)")
     send("touchStart", (150, 150), (210, 150))
@@ -344,13 +339,12 @@ def test_the_light_follows_the_pointer(actual, lit):
 
 def test_the_light_follows_a_finger(show, lit):
     tab = show(eg.view(lit), "phone")
-    touch = tab.page.context.new_cdp_session(tab.page)
+    send = tab.fingers()
     left, top, width, height = (v / 2 for v in tab.run("viewer.camera.frame"))
     place = tab.run("[viewer.camera.x, viewer.camera.y]")
     for kind, share in (("touchStart", 0.5), ("touchMove", 0.7), ("touchMove", 0.9)):
-        at = {"x": left + share * width, "y": top + 0.5 * height}
-        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [at]})
-    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        send(kind, (left + share * width, top + 0.5 * height))
+    send("touchEnd")
     np.testing.assert_allclose(tab.run("lights.direction"), [0.8, 0, 0.6], atol=0.05)
     assert tab.run("[viewer.camera.x, viewer.camera.y]") == place
 
