@@ -51,7 +51,8 @@ def render():
 
 def scene():
     with eg.exclusive():
-        shown = scene_of(EYE, texture=texture_of(results[-1].gaussians))
+        texture = texture_of(results[-1].gaussians)
+        shown = scene_of(EYE, texture=texture, integrator={{"type": "direct"}})
         assert np.isfinite(mi.render(shown, spp=2).numpy()).all()
         loaded.extend([shown, grey_wall(counts["scene"])])
 

@@ -208,10 +208,15 @@ def stop_after(output, pixels, stage, share, settings=FEW, act=end):
     return stopped.value
 
 
-@pytest.mark.parametrize(("stage", "act"), [("fit", end), ("density", end), ("fit", press)])
-def test_interrupted_run_goes_on(tmp_path, stage, act, short, long):
+@pytest.mark.parametrize(
+    ("stage", "act"),
+    [("fit", end), pytest.param("density", end, marks=pytest.mark.slow), ("fit", press)],
+)
+def test_interrupted_run_goes_on(tmp_path, stage, act, short, request):
     pixels, output = mosaic(128), tmp_path / "a.npz"
-    settings, whole = (LONG, long) if stage == "density" else (FEW, short)
+    settings, whole = FEW, short
+    if stage == "density":
+        settings, whole = LONG, request.getfixturevalue("long")
     stopped = stop_after(output, pixels, stage, 0.5, settings, act)
     if act is press:
         row = stopped.result

@@ -201,6 +201,7 @@ def test_a_value_that_all_splats_share(backend):
     np.testing.assert_allclose(dr.grad(shared).numpy().ravel(), expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_through_selection_and_concatenation(backend):
     """A splat that is drawn twice has twice the gradient, one that is left out has none."""
     scene = random_scene(11, COUNT)
