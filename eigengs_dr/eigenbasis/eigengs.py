@@ -350,7 +350,7 @@ class EigenGS:
         return cls(**read_model(file, backend))
 
     def __getstate__(self) -> Record:
-        """Leave out the encoder, whose cached values are Dr.Jit arrays."""
+        """Leave out the encoder, whose factors cannot be copied."""
         return {key: value for key, value in self.__dict__.items() if key != "encoder"}
 
     @cached_property

@@ -57,7 +57,7 @@ def check_lists(backend, mean, factor, grid=GRID):
     member = membership(lists_of(backend, mean, factor, grid), len(mean))
     touched = touched_by_pixels(distances(mean, factor, (grid.width, grid.height)), grid)
     assert not (touched & ~member).any(), np.argwhere(touched & ~member)
-    assert (member & ~touched).sum() <= len(mean)  # rectangles without a pixel inside are few
+    assert (member & ~touched).sum() <= 3 * len(mean)  # few rectangles hold no pixel inside
     return member
 
 
