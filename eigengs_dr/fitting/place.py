@@ -231,7 +231,8 @@ def place_adaptive(
 
 def shift_of(seed: int) -> float:
     """Return the share of a piece by which a seed moves all cuts back, from 0 to 0.5; 0 for 0."""
-    return 0.5 * (seed * SEED_STEP % 2**32) / 2**32
+    folded = seed % (2**32 - 1)  # all bits of a seed count, also those above the lowest 32
+    return 0.5 * (folded * SEED_STEP % 2**32) / 2**32
 
 
 def planes_of(image: Float, grid: TileGrid) -> Singles:
