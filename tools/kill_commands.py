@@ -141,10 +141,8 @@ def differences(work: Path, whole: Path) -> list[str]:
     faults = []
     for path in sorted(whole.rglob("*.npz")) + sorted(whole.rglob("*.egs")):
         other = work / path.relative_to(whole)
-        if not other.exists():
-            faults.append(f"lacks: {other.name}")
-        elif other.read_bytes() != path.read_bytes():
-            faults.append(f"differs: {path.name}")
+        if not other.exists() or other.read_bytes() != path.read_bytes():
+            faults.append(f"lacks or differs: {other.name}")
     return faults
 
 
