@@ -27,6 +27,7 @@ def test_examples_in_docstrings(module):
     if module.startswith(("eigengs_dr.scene.", "eigengs_dr.plugins.")):
         mi = pytest.importorskip("mitsuba", reason="scenes need mitsuba")
         mi.set_variant("llvm_ad_rgb")
+        eg.register_plugins()
     found = doctest.testmod(importlib.import_module(module))
     assert found.failed == 0
 
