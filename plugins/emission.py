@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from eigengs_dr.backend.arrays import upload_rows
 from eigengs_dr.backend.recording import guest
 from eigengs_dr.backend.types import Float, Mask, Texture, UInt
 from eigengs_dr.gaussian.covariance import max_deviation
@@ -162,16 +163,23 @@ share of samples in the dark alone makes the noise of small lamps 14 %."""
 
 @dataclass(frozen=True)
 class Emission:
-    """A distribution of positions in the unit square.
+    """A distribution of positions in the unit square: of rows, and of the cells of each row.
+
+    Of a ``mitsuba.DiscreteDistribution2D`` of Mitsuba 3.9, `drjit.freeze` does not see the arrays:
+    a replay would read the memory where those of the recording were.
 
     Attributes
     ----------
-    cells : mitsuba.DiscreteDistribution2D
+    rows : Float, shape (rows,)
+        Cumulative distribution of the rows, up to 1.
+    cells : Float, shape (rows * columns,)
+        Cumulative distribution of the cells of each row, up to 1.
     densities : TensorXf, shape (rows, columns)
         Densities at the centres of the cells, between which they are interpolated linearly.
     """
 
-    cells: mi.DiscreteDistribution2D
+    rows: Float
+    cells: Float
     densities: mi.TensorXf
 
     @property
@@ -182,10 +190,11 @@ class Emission:
 
     def sample(self, sample: mi.Point2f, active: Mask) -> tuple[mi.Point2f, Float]:
         """Return positions (Point2f) and their densities for samples of the unit square."""
-        cell, _, rest = self.cells.sample(sample, active)
         rows, columns = self.densities.shape
+        row, y = _search(self.rows, mi.UInt32(0), rows, sample.y, active)
+        column, x = _search(self.cells, row * columns, columns, sample.x, active)
         # At the borders the tent of a cell folds back into the square.
-        p = mi.Point2f(cell) + 0.5 + mi.warp.square_to_tent(rest)
+        p = mi.Point2f(column, row) + 0.5 + mi.warp.square_to_tent(mi.Point2f(x, y))
         p = dr.abs(p) * mi.Point2f(1 / columns, 1 / rows)
         p = dr.minimum(p, 2 - p)
         return p, self.density(p, active)
@@ -210,6 +219,23 @@ class Emission:
         return dr.select(inside, dr.lerp(between(upper), between(lower), down), 0)
 
 
+def _search(
+    cumulative: Float, first: UInt, count: int, sample: Float, active: Mask
+) -> tuple[UInt, Float]:
+    """Return the entry of `count` from `first` on that a sample falls into, and where in it.
+
+    The place is uniform in [0, 1], so that it serves as another sample.
+    """
+
+    def sum_of(entry: UInt, active: Mask) -> Float:
+        return dr.gather(mi.Float, cumulative, first + entry, active)
+
+    entry = dr.binary_search(0, count - 1, lambda i: sum_of(i, active) <= sample)
+    below = sum_of(entry - 1, active & (entry > 0))
+    part = dr.maximum(sum_of(entry, active) - below, dr.smallest(mi.Float))
+    return entry, dr.clip((sample - below) / part, 0, 1)
+
+
 def _neighbours(u: Float, count: int) -> tuple[tuple, Float]:
     """Return the cells of `count` whose centres lie around u in [0, 1], and the way between them.
 
@@ -230,4 +256,8 @@ def emission_of(survey: Survey, over_sphere: bool = False) -> Emission:
     floor = DARKEST * density.mean() or 1.0
     density = np.maximum(density, floor)
     relative = density / density.mean(dtype=np.float64).astype(np.float32)
-    return Emission(mi.DiscreteDistribution2D(density), mi.TensorXf(relative))
+    cells = np.cumsum(density, axis=1, dtype=np.float64)
+    rows = np.cumsum(cells[:, -1])
+    sums = [rows / rows[-1], (cells / cells[:, -1:]).ravel(), relative.ravel()]
+    *sums, densities = upload_rows(mi.Float, sums)
+    return Emission(*sums, mi.TensorXf(densities, relative.shape))

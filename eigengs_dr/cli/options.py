@@ -261,10 +261,10 @@ class Run(NamedTuple):
         if not self.quiet:
             click.echo("\n".join(map(printable, lines)))
 
-    def write_report(self, figures: dict[str, object], backend: str | None = None) -> None:
-        """Write figures, the command and the machine as JSON; `backend` overrides the option."""
+    def write_report(self, figures: dict[str, object]) -> None:
+        """Write figures, the command and the machine as JSON."""
         if self.report:
-            content = plain(describe_run(self.context, backend or self.backend) | figures)
+            content = plain(describe_run(self.context, self.backend) | figures)
             with atomic_write(self.report) as temporary:
                 temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 

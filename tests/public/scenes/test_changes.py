@@ -136,4 +136,9 @@ class TestFrozen:
 
     def test_a_sky_that_turns(self):
         scene = lit(environment_of(sky()), "direct", 12)
-        check_frozen(scene, [[], *[["sky.to_world"]] * 3], most=4)
+        check_frozen(scene, [[], *[["sky.color", "sky.to_world"]] * 3], most=4)
+
+    def test_a_sky_whose_colours_change_is_sampled_anew(self):
+        light = mi.load_dict(environment_of(sky()))
+        scene = lit(light, "direct", 12)
+        check_frozen(scene, [[], *[["sky.color"]] * 4], most=4, plugins=[light])
