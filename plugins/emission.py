@@ -259,5 +259,5 @@ def emission_of(survey: Survey, over_sphere: bool = False) -> Emission:
     cells = np.cumsum(density, axis=1, dtype=np.float64)
     rows = np.cumsum(cells[:, -1])
     sums = [rows / rows[-1], (cells / cells[:, -1:]).ravel(), relative.ravel()]
-    *sums, densities = upload_rows(mi.Float, sums)
-    return Emission(*sums, mi.TensorXf(densities, relative.shape))
+    by_row, by_cell, densities = upload_rows(mi.Float, sums)
+    return Emission(by_row, by_cell, mi.TensorXf(densities, relative.shape))

@@ -245,7 +245,7 @@ def scaling() -> None:
     splats   100 to 2,000,000 Gaussians on images of one size
     small    images per second of whole fits of 100 steps, one by one and by fit_many
 
-    Every size runs in its own process. All up to 4096x4096 take about twenty minutes and 5 GB.
+    Every size runs in its own process. All up to 4096x4096 take about ten minutes and 5 GB.
     """
 
 

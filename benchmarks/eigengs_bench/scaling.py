@@ -1,9 +1,9 @@
 """The cost of size: seconds and memory of a fit over pixels and Gaussians, and of small fits.
 
 The row of a fit has start_seconds, of placing Gaussians and solving for their colours; step_ms, the
-mean of its last steps with one row of the trace; and peak_gib, the memory of its process with the
-interpreter and its libraries. The row of whole fits has images_per_second
-one by one, and many_per_second by `fit_many`.
+mean of its steps with the rows of the trace; and peak_gib, the memory of its process with the
+interpreter and its libraries. The row of whole fits has images_per_second one by one, and
+many_per_second by `fit_many`.
 """
 
 from __future__ import annotations
@@ -79,14 +79,13 @@ def _jobs(task: Task, parts: Sequence[str], max_side: int) -> Iterator[Job]:
 
 
 def measure_fit(case: Case, steps: int, backend: str | None) -> Row:
-    """Fit an image twice, at first to compile; the last rows of the trace time the steps."""
+    """Fit an image twice, at first to compile."""
     image = mosaic(case.width, case.height)
     fit = partial(eg.fit, image, case.gaussians, backend=backend, progress=False)
     fit(iterations=min(WARM_STEPS, steps))
     result = fit(iterations=steps)
-    before, last = result.trace[-2:]
-    taken = last["iteration"] - before["iteration"]
-    step_ms = 1e3 * (last["seconds"] - before["seconds"]) / taken
+    first, last = result.trace[0], result.trace[-1]
+    step_ms = 1e3 * (last["seconds"] - first["seconds"]) / last["iteration"]
     return {
         "start_seconds": result.seconds_init,
         "step_ms": step_ms,

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
@@ -327,7 +328,7 @@ def fit_problem(problem: Problem, started: float, progress: FitProgress | None =
             descent = Descent(
                 objective,
                 problem.options.method,
-                lambda g: problem.measure(g, objective, time.perf_counter() - started),
+                lambda g: problem.measure(g, objective, started),
                 problem.options.seed,
                 progress,
                 interrupted,
@@ -374,6 +375,7 @@ def _refined(
         objective = replace(objective, image=replace(objective.image, levels=counts[:-1]))
     elif begun is None:
         begun = method.place_and_solve(objective.image, problem.first_count, options.seed)
+    dr.sync_thread()  # the colour solve runs asynchronously
     seconds_init = (time.perf_counter() - started) / problem.images
     descent = replace(descent, objective=objective, method=method)
     if options.searches:

@@ -8,6 +8,7 @@ colour solve, or, where each map has a goal, over the error of its goal.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -190,14 +191,16 @@ class Problem:
         sums = np.array([s[0] for s in squares_by_channel(start, pixels)])
         return [float(sums[c.part].mean()) / np.prod(self.size) for c in self.channels]
 
-    def measure(self, gaussians: Gaussians, objective: Objective, seconds: float) -> list[Measured]:
+    def measure(self, gaussians: Gaussians, objective: Objective, started: float) -> list[Measured]:
         """Measure a set, or the sets of a batch.
 
-        Rows hold the seconds, what the objective judges, and psnr_ycbcr and psnr_rgb: means over
-        the maps that have them. Maps add maps, with both PSNRs of each, and with goals margin.
+        Rows hold the seconds since `started`, a `time.perf_counter`, what the objective judges, and
+        psnr_ycbcr and psnr_rgb: means over the maps that have them. Maps add maps, with both PSNRs
+        of each, and with goals margin.
         """
         figures = psnrs(gaussians, objective.image.pictures)
         judged, goal = objective.judged(gaussians), self.options.goal
+        seconds = time.perf_counter() - started  # steps run asynchronously, up to the figures
         measured = []
         for image in range(self.images):
             pairs = [dict(zip(_FIGURES, f.tolist(), strict=True)) for f in figures[..., image]]
