@@ -151,6 +151,16 @@ def test_light_comes_from_the_side_that_the_photo_has_on_a_sphere(formula, flip)
     assert np.percentile(abs(found - expected), 98) < TABLE
 
 
+def test_planes_may_be_texels(saved):
+    _, points, normals = of_a_wall(50)
+    bsdf = {"type": "gaussian_relightable", "model": saved}
+    found, expected = (
+        values({"type": "rectangle", "bsdf": bsdf | more}, points, normals, over(normals))
+        for more in ({"texels": 400}, {})
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
 def test_an_update_of_to_uv_turns_the_light(saved):
     _, points, normals = of_a_wall(50)
     bsdf = {"type": "gaussian_relightable", "model": saved}
