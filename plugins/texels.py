@@ -80,8 +80,9 @@ def neighbours(x: Float, count: int, wrap: str = "clamp") -> tuple[UInt, UInt, F
     left, right = mi.Int32(before), mi.Int32(before) + 1
     if wrap == "repeat":
         left, right = dr.select(left < 0, last, left), dr.select(right > last, 0, right)
-    first, second = (mi.UInt32(dr.clip(index, 0, last)) for index in (left, right))
-    return first, second, position - before
+    else:
+        left, right = dr.maximum(left, 0), dr.minimum(right, last)
+    return mi.UInt32(left), mi.UInt32(right), position - before
 
 
 def draw_texels(texture: Texture) -> Texels:
