@@ -179,7 +179,8 @@ def build_lists(
     types = types_of(shape[0])
     # Numbers are in arrays: as literals, each value would compile a program of its own.
     layout, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
-    pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
+    if isinstance(pad, float):  # one for each Gaussian, as from a fit: one program for both
+        pad = dr.opaque(types.Float, pad, dr.width(shape[0]))
     share = granularity_of(types)
     touched, totals = _count_tiles(shape, radius, wide, layout, pad)
     narrow, entries = divmod(int(totals[0]), 1 << 40)  # one copy to the host
@@ -362,7 +363,7 @@ def _find_tiles(
     owner = _search(count, last, i + 1)
     real = owner < count
     owner_shape = [dr.gather(types.Float, row, owner, real) for row in shape]
-    pad = pad if dr.width(pad) == 1 else dr.gather(types.Float, pad, owner, real)
+    pad = dr.gather(types.Float, pad, owner, real)
     row, stop = tile_rows(owner_shape, radius, grid, pad)
 
     def visit(row: UInt, left: UInt, tile: UInt) -> tuple:
