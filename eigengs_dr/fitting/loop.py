@@ -13,7 +13,7 @@ from ..backend.arrays import types_of
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
-from .control import Control
+from .control import act
 from .exchange import prune
 from .measure import Measured, Row
 from .method import Method, Schedule
@@ -62,7 +62,7 @@ def descend(
             acting = [control for control, steps in acts if step in steps]
             near = objective.near(state.gaussians) if acting else image
             for control in acting:
-                state = _checked(control(state, near, step, iterations, key), control)
+                state = act(control, state, near, step, iterations, key)
             if state.moving is None:
                 state = started(state, method, step, image.grid.images)
             if not state.lists or step >= state.until:
@@ -82,26 +82,6 @@ def descend(
             )
             state = replace(state, moving=moving, gaussians=moved, squares=None)
             yield state
-
-
-def _checked(state: State, control: Control) -> State:
-    """Return what a control returned, if its numbers of Gaussians agree.
-
-    Raises
-    ------
-    TypeError
-        If it is no state.
-    ValueError
-        If the set has fewer Gaussians than the state says, or more without a surplus.
-    """
-    if not isinstance(state, State):
-        raise TypeError(f"{control!r} returned {state!r}; a control returns the state")
-    if not state.count <= state.total <= state.count + state.surplus:
-        raise ValueError(
-            f"{control!r} left {state.total} Gaussians, but the count of the state is "
-            f"{state.count}; return replace(state.replaced(gaussians), count={state.total})"
-        )
-    return state
 
 
 def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussians:
