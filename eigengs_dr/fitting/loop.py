@@ -13,9 +13,9 @@ from ..backend.arrays import types_of
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
+from .channels import Measured, Row
 from .control import act
 from .exchange import prune
-from .measure import Measured, Row
 from .method import Method, Schedule
 from .objective import Objective
 from .state import State
@@ -205,7 +205,8 @@ class Best:
         self.descent, self.iterations = descent, iterations
         images = descent.objective.image.grid.images
         self.refinements = [Refinement(state.gaussians) for _ in range(images)]
-        self.marks, self.step, self.state = trace_steps(iterations), 0, state
+        marks = {0, 10, 20, 50, iterations}.union(range(100, iterations, 100))  # rows of the trace
+        self.marks, self.step, self.state = marks, 0, state
         self.row = Row()
         self.larger: tuple[float, int, Gaussians] | None = None
 
@@ -290,12 +291,6 @@ def refine(descent: Descent, state: State, iterations: int) -> list[Refinement]:
     if stopped:
         best.end_early()
     return best.refinements
-
-
-def trace_steps(iterations: int) -> set[int]:
-    """Return the steps with a row in the trace: 0, 10, 20, 50, every 100, and the last step."""
-    marks = {0, 10, 20, 50, iterations} | set(range(100, iterations, 100))
-    return {m for m in marks if m <= iterations}
 
 
 def split(batch: Gaussians) -> list[Gaussians]:

@@ -27,9 +27,8 @@ from ..image.metrics import MAX_PSNR
 from ..image.pixels import WHITE, EncodedImage, ImageError
 from ..image.space import DATA, YCBCR, Space, space_of
 from ..raster.tiles import Grid
-from .channels import Channels, Target, restored
+from .channels import Channels, Measured, Row, Target, psnrs, restored
 from .loss import PictureLoss
-from .measure import Measured, Row, psnrs
 from .method import Model
 from .objective import Objective, Pixels, squares_of
 from .options import FitOptions, Goal

@@ -26,13 +26,13 @@ from ..backend.arrays import rcp, types_of
 from ..backend.recording import record
 from ..backend.types import Float, Singles
 from ..gaussian.gaussians import Gaussians
-from ..raster.kernels import image_of, sum_by_image
+from ..raster.kernels import image_of, spread, sum_by_image
 from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import bin_gaussians, to_tiles
 from .objective import Pixels, Quadratic
 from .place import place_adaptive, planes_of, shrunk
-from .solve import Unknowns, apply, colors_of, correlate, for_channels, solve, spread
+from .solve import Unknowns, apply, colors_of, correlate, for_channels, solve
 
 ERROR_EXPONENT = 4 / 3
 """Exponent q of the decay of the squared error: twice as many Gaussians leave ``2^-q`` of it, which

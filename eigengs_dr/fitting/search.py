@@ -17,9 +17,9 @@ from typing import NamedTuple
 import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
+from .channels import Row
 from .exchange import densify, prune
 from .loop import Descent, Refinement, descend
-from .measure import Row
 from .objective import Pixels
 from .redistribution import redistribute
 from .state import State, begin

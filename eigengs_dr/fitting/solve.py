@@ -18,7 +18,7 @@ from ..backend.recording import record
 from ..backend.types import Float, UInt
 from ..gaussian.gaussians import Gaussians, broadcast_rows
 from ..raster.adjoint import adjoint
-from ..raster.kernels import channel_sums, difference, image_of, sum_by_image
+from ..raster.kernels import channel_sums, difference, image_of, spread, sum_by_image
 from ..raster.lists import TileLists
 from ..raster.parameters import (
     detached_shape,
@@ -339,11 +339,6 @@ def dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
 
 
 def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: UInt | None) -> Unknowns:
-    """Return ``x + factor y``; a factor has one value for each image, see `spread`."""
+    """Return ``x + factor y``; a factor has one value for each image."""
     color = [dr.fma(spread(f, image), b, a) for a, f, b in zip(x[0], factors, y[0], strict=True)]
     return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
-
-
-def spread(values: Float, image: UInt | None) -> Float:
-    """Return the value of the image of each entry; `image` is None if there is only one."""
-    return values if image is None else dr.gather(type(values), values, image)

@@ -24,9 +24,8 @@ from ..backend.doors import door, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.selection import backend_of, select
 from ..backend.types import ArrayLike, Texture
-from ..fitting.channels import restored
+from ..fitting.channels import Measured, restored
 from ..fitting.loop import Descent
-from ..fitting.measure import Measured
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Objective, Pixels
 from ..fitting.options import Goal
