@@ -376,7 +376,8 @@ def describe_model(
             (values[: len(d)] / np.maximum(d, np.finfo(float).tiny ** 0.5)).tolist()
             for values, d in zip(model.project(Codes(image)), deviations, strict=True)
         ]
-        photo = {"color": deflated(shortened(color)), "background": background.tolist(), "scores": scores}
+        photo = {"color": deflated(shortened(color)), "background": background.tolist()}
+        photo["scores"] = scores
     return {"matrix": space.to_rgb.tolist(), "channels": channels, "photo": photo}
 
 
