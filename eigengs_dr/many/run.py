@@ -35,7 +35,6 @@ from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write_set
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import read_ahead
-from ..image.io import read_floats
 from ..image.metrics import psnr
 from ..image.notes import NotedImages, kept_notes, series, tell_all
 from ..image.pixels import EncodedImage
@@ -100,11 +99,11 @@ class Job(NamedTuple):
     ----------
     work : callable
         ``work(images)`` returns the results of a group, in order.
+    read : callable
+        ``read(image, name)`` reads an image, whose warnings name it so if it is no file.
     may_join : callable
         ``may_join(group, image)`` returns whether an image may join a group that is not empty; by
         default none may.
-    read : callable
-        ``read(image, name)`` reads an image, whose warnings name it so if it is no file.
     steps : int
         Number of descent steps per image, as a measure of the work.
     options : str
@@ -114,8 +113,8 @@ class Job(NamedTuple):
     """
 
     work: Callable[[list[EncodedImage]], list[Fit] | list[Gaussians]]
+    read: Callable[[Any, str], EncodedImage]
     may_join: Callable[[list[EncodedImage], EncodedImage], bool] | None = None
-    read: Callable[[Any, str], EncodedImage] = lambda image, name: read_floats(image)
     steps: int = 0
     options: str = ""
     measures: bool = False
@@ -258,7 +257,10 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
 def _decode(source: RunImage, job: Job) -> Decoded:
     """Read one image. An array is copied, because its owner may overwrite it."""
     try:
-        return source, job.read(source.image, source.name)
+        image = job.read(source.image, source.name)
+        if source.path is None:
+            image = image._replace(pixels=np.array(image.pixels))
+        return source, image
     except FAILURES as error:
         return source, error
 

@@ -23,8 +23,8 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
-from ..image.io import Codes, codes_of, displayed, read_file, read_photo
-from ..image.pixels import check_encoding
+from ..image.io import Codes, displayed, read_photo
+from ..image.pixels import check_encoding, codes_of
 from ..image.resize import resample
 from ..raster.render import picture_of
 from ..relight.lights import check_lights
@@ -200,9 +200,7 @@ def view(
 
 def _stored(image: ArrayLike, encoding: str | None) -> NDArray[np.float32]:
     """Read a photo under a light as `Relightable.fit` does: lights belong to stored pixels."""
-    if isinstance(image, (str, os.PathLike)):
-        return codes_of(read_file(os.fspath(image), encoding=encoding, upright=False))
-    return codes_of(read_photo(image, encoding, arrays="srgb"))
+    return codes_of(read_photo(image, encoding, arrays="srgb", upright=False))
 
 
 # --- The data of a page: arrays in base64, with colours decoded to RGB ----------------------------
