@@ -7,6 +7,7 @@ has one warning for each note.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -34,10 +35,13 @@ _noted: ContextVar[NotedImages | None] = ContextVar("noted", default=None)
 
 
 def tell(name: str, note: str) -> None:
-    """Warn about an image: at once, or at the end of the series to which it belongs."""
+    """Warn about an image: at once, or at the end of the series to which it belongs.
+
+    Without a name, the note is not about an image.
+    """
     noted = _noted.get()
     if noted is None:
-        warn(f"{name}: {note}")
+        warn(f"{name}: {note}" if name else note)
     else:
         noted.setdefault(note, {})[name] = None
 
@@ -51,6 +55,15 @@ def kept_notes() -> Iterator[NotedImages]:
         yield noted
     finally:
         _noted.reset(token)
+
+
+@contextmanager
+def kept_warnings() -> Iterator[NotedImages]:
+    """Keep the notes of a block of a worker, and after it its other warnings, without names."""
+    with kept_notes() as noted, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield noted
+    noted |= {str(w.message): {"": None} for w in caught if issubclass(w.category, UserWarning)}
 
 
 def tell_all(noted: NotedImages) -> None:
@@ -72,7 +85,7 @@ def series() -> Iterator[None]:
             tell_all(noted)
         else:
             for note, (first, *others) in noted.items():
-                warn(f"{first}: {note}" + (f"; so for {len(others)} more" if others else ""))
+                tell(first, note + (f"; so for {len(others)} more" if others else ""))
 
 
 PROFILE_LEVELS = (0, 64, 128, 192, 255)
