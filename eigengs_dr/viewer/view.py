@@ -149,7 +149,7 @@ def view(
     if encoding and image is None:
         raise ValueError("encoding is for the pixels of an image; leave it out, or give one")
     model = source if isinstance(source, EigenGS) else None
-    lights, presets = None, []
+    lights, presets, pixels = None, [], None
     if isinstance(source, Relightable):
         if image is not None and light is None:
             raise ValueError(
@@ -161,12 +161,14 @@ def view(
         presets = light_presets(source)
         if image is not None:
             presets.insert(0, ("As in the photo", start))
-        pixels = None if image is None else _stored(image, encoding)
+            # Lights belong to the pixels that a file stores, as in `Relightable.fit`.
+            pixels = codes_of(read_photo(image, encoding, arrays="srgb", upright=False))
     else:
         if light is not None:
             raise ValueError("light is for a model of lights; leave it out")
         gaussians = one_image(set_of(source)) if model is None else model.gaussians
-        pixels = None if image is None else displayed(image, gaussians.space, encoding)
+        if image is not None:
+            pixels = displayed(image, gaussians.space, encoding)
     model_facts, note = None, ""
     if model is not None:
         counts = kept_counts(model)
@@ -203,11 +205,6 @@ def view(
         color_name="Colour" if gaussians.space.is_color else "Values",
     )
     return Page(html)
-
-
-def _stored(image: ArrayLike, encoding: str | None) -> NDArray[np.float32]:
-    """Read a photo under a light as `Relightable.fit` does: lights belong to stored pixels."""
-    return codes_of(read_photo(image, encoding, arrays="srgb", upright=False))
 
 
 # --- The data of a page: arrays in base64, with colours decoded to RGB ----------------------------
