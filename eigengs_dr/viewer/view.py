@@ -184,7 +184,7 @@ def view(
         shown = picture_of(gaussians, pixels.shape[1], pixels.shape[0])
         summary += f"; psnr_rgb {psnr(shown, pixels, 'rgb'):.2f} dB"
     if isinstance(source, Relightable) and np.isfinite(source.psnr_held_out):
-        summary += f"; left-out lights {source.psnr_held_out:.2f} dB"
+        summary += f"; left-out lights: psnr_rgb {source.psnr_held_out:.2f} dB"
     views = channel_views(gaussians.channels)
     facts = {
         "set": describe_set(gaussians, levels) | ({} if lights is None else {"color": None}),
