@@ -27,8 +27,8 @@ from ..fitting.solve import solve
 from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
 from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.color import to_linear
-from ..image.io import codes_of, read_file, read_floats, read_photo
-from ..image.pixels import ImageError, encoding_of
+from ..image.io import read_floats, read_photo
+from ..image.pixels import ImageError, codes_of, encoding_of
 from ..image.read import is_picture
 from ..image.resize import resample
 from ..image.space import DATA, LINEAR, RGB
@@ -262,9 +262,7 @@ class Relightable:
             If a file cannot be opened.
         """
         width, height = self.planes.width, self.planes.height
-        if isinstance(photo, (str, os.PathLike)):
-            photo = read_file(os.fspath(photo), encoding=encoding, upright=False)
-        pixels = codes_of(read_photo(photo, encoding))
+        pixels = codes_of(read_photo(photo, encoding, upright=False))
         if pixels.shape[:2] != (height, width):
             raise ImageError(
                 f"photo: is {pixels.shape[1]}x{pixels.shape[0]}, but those of the model are "
