@@ -298,22 +298,23 @@ def _display(g: Gaussians) -> Array:
 
 
 def _compare_planes(model: Relightable) -> Compared:
-    """Compare pictures under the lights of the photos, with the table as the file rounds it.
+    """Compare planes, whose errors add up to that of left-out photos, and pictures by the table.
 
-    With planes P and factors t, rounded to Q and s, they differ by ``s (Q - P) + (s - t) P``.
+    The file rounds the table, which adds the error of the pictures of the photos.
     """
     target, table = planes_of(model.planes), model.table
-    count = target.shape[2]
-    rounded_table = read_table(table_bytes(model), count)[0].at(table.lights)
-    change = rounded_table - table.at(table.lights)
-    factors = np.concatenate([rounded_table[..., :-1], change], axis=2).reshape(-1, 2 * count + 1)
-    moments = factors.T @ factors / len(factors)
-    plain = np.concatenate([target, np.ones_like(target[..., :1])], axis=2)
+    rounded_table, *_ = read_table(table_bytes(model), target.shape[2])
+    change = (rounded_table.at(table.lights) - table.at(table.lights)).reshape(
+        -1, target.shape[2] + 1
+    )
+    plain = np.concatenate([target, np.ones_like(target[..., :1])], axis=2).reshape(
+        -1, change.shape[1]
+    )
+    moments = plain.T @ plain / len(plain)
+    of_table = float(np.einsum("nk,kl,nl->n", change, moments, change).mean())
 
     def error(rounded: Gaussians) -> float:
-        values = np.concatenate([planes_of(rounded) - target, plain], axis=2)
-        values = values.reshape(-1, 2 * count + 1)
-        return float((moments * (values.T @ values / len(values))).sum())
+        return float(np.square(planes_of(rounded) - target).sum(axis=2).mean()) + of_table
 
     known = math.isfinite(model.psnr_held_out)
     unseen = 10 ** (-model.psnr_held_out / 10) if known else MSE_WITHOUT_IMAGE

@@ -27,6 +27,7 @@ from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_d
 from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats
+from ..image.metrics import MAX_PSNR
 from ..image.pixels import encoding_of
 from ..image.read import is_picture
 from ..image.resize import resample
@@ -35,7 +36,14 @@ from ..raster.render import render
 from ..storage import npz
 from ..storage.npz import BadValue, Field, file_errors
 from .directions import LatLong
-from .fit import find_planes, fit_planes, most_planes, read_photos
+from .fit import (
+    MAX_PSNR_DROP,
+    find_planes,
+    fit_fewest,
+    fit_planes,
+    most_planes,
+    read_photos,
+)
 from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
 VERSION = 1
@@ -64,7 +72,8 @@ class Relightable:
     Attributes
     ----------
     planes : Gaussians
-        The planes, in the space "data": a channel for each. A light is a sum of them.
+        The planes, in the space "data": a channel for each. A light is a sum of them. Their mean
+        squared errors add up to that of photos that were left out.
     table : LightTable
         The factors of the planes for every light.
     psnr_held_out : float
@@ -99,6 +108,7 @@ class Relightable:
         *,
         gaussians: int | None = None,
         planes: int | None = None,
+        max_psnr_drop: float | None = None,
         iterations: int = 300,
         seed: int = 0,
         encoding: str | None = None,
@@ -121,9 +131,13 @@ class Relightable:
             directions. By default the only such file in the folder. A list is paired with files by
             name, and with arrays in order.
         gaussians : int, optional
-            Number of Gaussians, by default one for 16 pixels.
+            Number of Gaussians. By default one for 16 pixels, halved up to three times within the
+            budget, as short tries predict.
         planes : int, optional
-            Number of planes. By default as many as left-out lights need.
+            Number of planes. By default the smallest within the budget.
+        max_psnr_drop : float, optional
+            The budget: decibels of left-out lights that a model may lose, by default 0.4. Half of
+            it may go to fewer planes than are best, and half to fewer Gaussians.
         iterations : int, optional
             Number of steps of the fit of the planes.
         encoding : {"srgb", "linear"}, optional
@@ -144,14 +158,26 @@ class Relightable:
             At Ctrl-C or SIGTERM during the fit of the planes; its ``result`` is the model of the
             best set so far.
         """
+        if max_psnr_drop is not None and gaussians is not None and planes is not None:
+            raise ValueError("max_psnr_drop finds numbers; leave out gaussians, planes or it")
+        budget = MAX_PSNR_DROP if max_psnr_drop is None else max_psnr_drop
+        if not 0 < budget <= MAX_PSNR:
+            raise ValueError(
+                f"max_psnr_drop is {budget:g}; it must be above 0 and at most {MAX_PSNR:g} dB, "
+                f"such as {MAX_PSNR_DROP}"
+            )
         read = read_photos(photos, lights, encoding)
         most = most_planes(len(read.lights))
         if planes is not None and not 1 <= planes <= most:
             raise ValueError(f"planes is {planes}; {len(read.lights)} photos have 1 to {most}")
         brightest = max(1.0, float(read.rows.max()))
-        found = find_planes(read, planes)
+        found = find_planes(read, planes, budget / 2).for_left_out()
         del read  # the photos take more memory than the fit
-        result = fit_planes(found.images, gaussians, iterations, seed, backend, progress)
+        options = iterations, seed, backend, progress
+        if gaussians is None:
+            result = fit_fewest(found, budget / 2, *options)
+        else:
+            result = fit_planes(found.images, gaussians, *options)
         shown = result.image.reshape(found.images.shape)
         model = cls(result.gaussians, found.table, found.psnr_held_out(shown), brightest)
         if result.stopped == "interrupted":
