@@ -76,9 +76,8 @@ Of ten sets, none shows left-out lights 0.1 dB worse than with a Gaussian for 16
 PIXELS_PER_GAUSSIAN, HALVINGS = 16, 3
 """Pixels of a photo for each Gaussian, and how often the number is halved at most."""
 
-TRY_SHARE, LEFT_SHARE = 0.1, 0.5
-"""Steps of a try as a fraction of those of a fit; and what these leave of the decibels that the try
-loses: 0.2 to 0.6 on ten sets."""
+TRY_SHARE = 0.1
+"""Steps of a try as a fraction of those of a fit."""
 
 
 class Photos(NamedTuple):
@@ -365,8 +364,9 @@ def fit_fewest(
 ) -> Fit:
     """Fit the smallest number of Gaussians that costs left-out lights at most so many decibels.
 
-    The number is halved while a try, a fit of few steps, predicts that. An interrupted try or fit
-    is returned as well.
+    The number is halved while a try, a fit of few steps, predicts that: the other steps lower its
+    loss by about as large a factor as its own lowered the error, 0.2 to 0.7 on ten sets. An
+    interrupted try or fit is returned as well.
     """
     height, width, _ = planes.images.shape
     count = max(1, height * width // PIXELS_PER_GAUSSIAN)
@@ -376,7 +376,7 @@ def fit_fewest(
         lost = exact - planes.psnr_held_out(tried.image.reshape(planes.images.shape))
         if tried.stopped == "interrupted":
             return tried
-        if LEFT_SHARE * lost > max_psnr_drop:
+        if lost * 10 ** ((tried.trace[0]["psnr_ycbcr"] - tried.psnr_ycbcr) / 10) > max_psnr_drop:
             break
         count = max(1, count // 2)
     return fit_planes(planes.images, count, iterations, seed, backend, progress)
