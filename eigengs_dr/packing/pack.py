@@ -199,12 +199,16 @@ def pack(
         compare = _compare_maps if source.maps else _compare
         maps, display, compared = compare(source, image, encoding)
     else:
-        maps, display, compared = _compare_planes(model)
         # The budget also pays for the rounding of the table, which is the error of equal planes.
-        unseen = psnr_from_mse(compared.extra_error)
-        max_psnr_drop -= unseen - psnr_from_mse(compared.extra_error + compared.error(source))
-        if max_psnr_drop <= 0:
+        for width in (1, 2):
+            maps, display, compared = _compare_planes(model, width)
+            unseen, lost = compared.extra_error, compared.error(source)
+            left = max_psnr_drop - psnr_from_mse(unseen) + psnr_from_mse(unseen + lost)
+            if left > TABLE_SHARE * max_psnr_drop:
+                break
+        if left <= 0:
             raise ValueError(TOO_FINE)
+        max_psnr_drop = left
     weighted = source
     if maps:
         weights = type(source.color)(channel_weights(maps))
@@ -218,7 +222,7 @@ def pack(
     if model is not None:
         before = compared.extra_error
         held_out = after if math.isfinite(model.psnr_held_out) else math.nan
-        lights = table_bytes(replace(model, psnr_held_out=held_out))
+        lights = table_bytes(replace(model, psnr_held_out=held_out), width)
     content = attempt.packed._replace(maps=maps, psnr=stored, lights=lights)
     size = write_packed(output, content)
     rounded = Gaussians.load(output, types_of(source.mean).backend)
@@ -297,18 +301,21 @@ def _display(g: Gaussians) -> Array:
 # --- The planes of a model of lights --------------------------------------------------------------
 
 
+TABLE_SHARE = 0.5
+"""Share of the budget that a table of bytes must leave; else a number of the table takes two."""
+
 LIGHTS_DEAD_ZONE = 0.2
 """Dead zone of planes, whose faint colours are mostly noise: 1 to 5 % fewer bytes and up to 0.1 dB
 more of left-out photos than with that of images (two sets)."""
 
 
-def _compare_planes(model: Relightable) -> Compared:
+def _compare_planes(model: Relightable, width: int) -> Compared:
     """Compare planes, whose errors add up to that of left-out photos, and pictures by the table.
 
-    The file rounds the table, which adds the error of the pictures of the photos.
+    The file rounds the table to bytes or pairs, which adds the error of the pictures of the photos.
     """
     target, table = planes_of(model.planes), model.table
-    rounded_table, *_ = read_table(table_bytes(model), target.shape[2])
+    rounded_table, *_ = read_table(table_bytes(model, width), target.shape[2])
     change = rounded_table.at(table.lights) - table.at(table.lights)
     plain = np.concatenate([target, np.ones_like(target[..., :1])], axis=2)
     moments = np.tensordot(plain, plain, ((0, 1), (0, 1))) / target[..., 0].size

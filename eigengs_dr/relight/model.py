@@ -36,14 +36,7 @@ from ..raster.render import render
 from ..storage import npz
 from ..storage.npz import BadValue, Field, file_errors
 from .directions import LatLong
-from .fit import (
-    MAX_PSNR_DROP,
-    find_planes,
-    fit_fewest,
-    fit_planes,
-    most_planes,
-    read_photos,
-)
+from .fit import MAX_PSNR_DROP, find_planes, fit_fewest, fit_planes, most_planes, read_photos
 from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
 VERSION = 1
@@ -398,22 +391,24 @@ _BRIGHTEST = struct.Struct("<f")
 """The largest code of photos."""
 
 
-def table_bytes(model: Relightable) -> bytes:
-    """Return the table of a model for an ``.egs`` file: 16 bits per coordinate, 8 per factor.
+def table_bytes(model: Relightable, width: int = 1) -> bytes:
+    """Return the table of a model for an ``.egs`` file: 16 bits per coordinate, 8 or 16 per factor.
 
     It has the kind and K, the number of planes, both uint8; n, the number of lights, uint16; the
     smoothing, float32; the PSNR of left-out photos, float64; K + 1 scales, float32; directions,
-    (n, 3) int16 over 32767; values, (n, 3, K + 1) int8 times the scales; and where photos are
-    brighter than white their largest code, float32. Rounding is 40 dB below the contrast of the
-    photos.
+    (n, 3) int16 over 32767; values, (n, 3, K + 1) int8 or int16 times the scales; and where photos
+    are brighter than white their largest code, float32. Rounding to 8 bits is 40 dB below the
+    contrast of the photos.
     """
     table, planes = model.table, model.planes.channels
     head = _HEAD.pack(
         KINDS.index(table.kind), planes, len(table.lights), table.smoothing, model.psnr_held_out
     )
-    scale = (np.abs(table.values).max(axis=(0, 1), initial=1e-6) / 127).astype("<f4")
+    kind = np.dtype(f"<i{width}")
+    scale = np.abs(table.values).max(axis=(0, 1), initial=1e-6) / np.iinfo(kind).max
+    scale = scale.astype("<f4")
     lights = np.round(table.lights * 32767).astype("<i2")
-    values = np.round(table.values / scale).astype(np.int8)
+    values = np.round(table.values / scale).astype(kind)
     brightest = _BRIGHTEST.pack(model.brightest) if model.brightest > 1 else b""
     return head + scale.tobytes() + lights.tobytes() + values.tobytes() + brightest
 
@@ -425,12 +420,14 @@ def read_table(content: bytes, channels: int) -> tuple[LightTable, float, float]
     kind, planes, count, smoothing, psnr = _HEAD.unpack_from(content)
     sizes = [4 * (planes + 1), 6 * count, 3 * (planes + 1) * count]
     rest = len(content) - _HEAD.size - sum(sizes)
+    width = 2 if rest >= sizes[2] else 1
+    rest, sizes[2] = rest - (width - 1) * sizes[2], width * sizes[2]
     if rest not in (0, _BRIGHTEST.size) or planes != channels:
         raise BadValue("the table of lights has another size; copy the file again")
     ends = (_HEAD.size + np.cumsum(sizes)).tolist()
     scale = np.frombuffer(content[_HEAD.size : ends[0]], "<f4").astype(np.float64)
     lights = np.frombuffer(content[ends[0] : ends[1]], "<i2").reshape(count, 3) / 32767
-    rounded = np.frombuffer(content[ends[1] : ends[2]], np.int8).reshape(count, 3, planes + 1)
+    rounded = np.frombuffer(content[ends[1] : ends[2]], f"<i{width}").reshape(count, 3, planes + 1)
     name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
     table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
     brightest = check_brightest(_BRIGHTEST.unpack_from(content, ends[2])[0] if rest else 1.0)

@@ -273,7 +273,16 @@ class TestNumber:
 
     def test_that_is_too_good_for_the_table_where_the_budget_is_tiny(self, model, tmp_path):
         with pytest.raises(ValueError, match="no rounding is fine enough"):
-            eg.pack(replace(model, psnr_held_out=70.0), tmp_path / "x.egs", max_psnr_drop=0.1)
+            eg.pack(replace(model, psnr_held_out=99.0), tmp_path / "x.egs", max_psnr_drop=0.1)
+
+    def test_that_is_good_takes_a_finer_table(self, model, tmp_path):
+        tables = []
+        for psnr in (30.0, 60.0):
+            sure = replace(model, psnr_held_out=psnr)
+            result, loaded = packed(sure, tmp_path / "x.egs", 0.5)
+            assert 0.2 < result.psnr_drop <= 0.5
+            tables.append(np.abs(loaded.table.values - model.table.values).max())
+        assert tables[1] < 0.01 * tables[0]
 
     def test_is_repeated_by_commands_and_the_page(self, tmp_path):
         lines = ["8"]
