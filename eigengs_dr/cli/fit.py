@@ -297,14 +297,14 @@ def _fit_at_once(
 def load_images(source: Path | dict[str, MapFile], space: str, encoding: str | None) -> Any:
     """Read an image, or the images of maps by name; grey data keeps one channel."""
     from ..gaussian.channels import usual_space
-    from ..image.io import read_file
+    from ..image.io import read_floats
 
     if isinstance(source, dict):
         return {
             name: load_images(m.path, m.space or usual_space(name), encoding)
             for name, m in source.items()
         }
-    return read_file(source, not space_of(space).is_color, encoding)
+    return read_floats(source, not space_of(space).is_color, encoding)
 
 
 UNREPORTED = ("gaussians", "image", "mean_image", "maps", "source", "resumed")

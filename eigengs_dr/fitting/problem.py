@@ -22,14 +22,13 @@ from ..backend.selection import select
 from ..backend.types import ArrayLike, PathLike, Values
 from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space
 from ..gaussian.gaussians import Gaussians, one_image
-from ..image.io import check_data, check_image, read_image
+from ..image.io import read_image
 from ..image.metrics import MAX_PSNR
-from ..image.pixels import WHITE, EncodedImage, ImageError
+from ..image.pixels import WHITE, EncodedImage, ImageError, codes_of, data_of, floats_of
 from ..image.space import DATA, YCBCR, Space, space_of
 from ..raster.tiles import Grid
-from .channels import Channels, Target, restored
+from .channels import Channels, Measured, Row, Target, psnrs, restored
 from .loss import PictureLoss
-from .measure import Measured, Row, psnrs
 from .method import Model
 from .objective import Objective, Pixels, squares_of
 from .options import FitOptions, Goal, conflict_in
@@ -434,15 +433,15 @@ def pixels_in(
     ImageError
         If the image is unusable.
     """
-    encoded = read_image(image, not space.is_color, encoding)
+    read = read_image(image, not space.is_color, encoding if space.is_color else "linear")
     if weight is not None:
-        encoded = encoded._replace(pixels=_filled(encoded, weight))
+        read = read._replace(pixels=_filled(read, weight))
     if not space.is_color:
-        pixels = check_data(encoded, copy=False)
+        pixels = data_of(read)
         space.check(pixels)
         return pixels, space
-    pixels = check_image(encoded, copy=False)
-    bright = encoded.encoding == "linear" and pixels.max() > WHITE
+    pixels = codes_of(floats_of(read))
+    bright = read.encoding == "linear" and pixels.max() > WHITE
     return pixels, space.above_white if bright else space
 
 

@@ -33,10 +33,10 @@ from ..fitting.fit import Fit, fit_problem
 from ..fitting.options import FitOptions
 from ..fitting.problem import Problem
 from ..image.color import MAX_CHANNELS
-from ..image.io import codes_of, is_pipe, read_file, read_photo
+from ..image.io import is_pipe, read_photo
 from ..image.metrics import psnr_from_mse
 from ..image.notes import series
-from ..image.pixels import ImageError, check_encoding
+from ..image.pixels import ImageError, check_encoding, codes_of
 from ..image.read import read_header
 from ..image.space import DATA
 from ..storage.memory import check_usable
@@ -163,9 +163,7 @@ def _stacked(photos: Sequence[object], lights: Doubles, encoding: str | None) ->
         )
     rows, shape = np.empty((0, 0), np.float32), (0, 0, 0)
     for k, photo in enumerate(photos):
-        if isinstance(photo, (str, os.PathLike)):
-            photo = read_file(os.fspath(photo), encoding=encoding, upright=False)
-        pixels = codes_of(read_photo(photo, encoding))
+        pixels = codes_of(read_photo(photo, encoding, upright=False))
         if k == 0:
             shape = pixels.shape
             what = f"{len(photos)} photos of {shape[1]}x{shape[0]} pixels"

@@ -366,7 +366,7 @@ def environment_lights(environment: object) -> tuple[Doubles, Doubles]:
     """
     told = isinstance(environment, (str, os.PathLike)) or is_picture(environment)
     encoding = None if told else encoding_of(environment) or "linear"
-    pixels, encoding = read_floats(environment, encoding=encoding)
+    pixels, encoding, _ = read_floats(environment, encoding=encoding)
     light = to_linear(pixels) if encoding == "srgb" else pixels
     if light.min() < 0:
         raise ValueError(

@@ -3,6 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
+from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.chi_square import assert_density
@@ -293,7 +294,7 @@ def test_pictures_and_bitmaps_are_environments_of_their_own_encoding(formula):
     expected = eg.picture_of(model.relight(light))
     coded = mi.Bitmap(codes)
     coded.set_srgb_gamma(True)
-    for environment in (coded, mi.Bitmap(np.float32(light))):
+    for environment in (coded, mi.Bitmap(np.float32(light)), Image.fromarray(codes)):
         found = eg.picture_of(model.relight(environment))
         np.testing.assert_allclose(found, expected, atol=2e-3)
 
