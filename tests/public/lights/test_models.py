@@ -99,9 +99,26 @@ class TestFit:
             (few, {"gaussians": 0}, "gaussians is 0"),
             (few, {"planes": 22}, "planes is 22; 8 photos .* to 21"),
             ((PHOTOS, LIGHTS), {"planes": 65}, "planes is 65; 40 photos .* to 64"),
+            (few, {"max_psnr_drop": 0}, "max_psnr_drop is 0; .* above 0"),
+            (few, {"gaussians": 9, "planes": 3, "max_psnr_drop": 1}, "max_psnr_drop finds numbers"),
         ):
             with pytest.raises(ValueError, match=message):
                 eg.Relightable.fit(*arguments, progress=False, **options)
+
+    def test_has_as_few_gaussians_as_the_budget_allows(self):
+        options = {"gaussians": None, "planes": 6, "iterations": 10}
+        some, fewer = (
+            model_of(PHOTOS[~LEFT_OUT], max_psnr_drop=drop, **options) for drop in (0.01, 20)
+        )
+        assert (len(some.planes), len(fewer.planes)) == (64, 8)
+        assert fewer.psnr_held_out < some.psnr_held_out
+
+    def test_planes_show_best_what_other_lights_need(self):
+        """Noise that no light repeats does not take the Gaussians from the object."""
+        noisy = PHOTOS + 0.1 * np.random.default_rng(2).standard_normal(PHOTOS.shape)
+        model = model_of(np.maximum(noisy, 0)[~LEFT_OUT].astype(np.float32), planes=12)
+        energy = np.square(eg.picture_of(model.planes)).mean((0, 1))
+        assert energy[:3].sum() > 5 * energy[3:].sum()
 
     def test_an_interrupted_fit_tells_how_far_it_came(self, model):
         def stop(done, total, row):
@@ -288,7 +305,16 @@ class TestNumber:
 
     def test_that_is_too_good_for_the_table_where_the_budget_is_tiny(self, model, tmp_path):
         with pytest.raises(ValueError, match="no rounding is fine enough"):
-            eg.pack(replace(model, psnr_held_out=70.0), tmp_path / "x.egs", max_psnr_drop=0.1)
+            eg.pack(replace(model, psnr_held_out=99.0), tmp_path / "x.egs", max_psnr_drop=0.1)
+
+    def test_that_is_good_takes_a_finer_table(self, model, tmp_path):
+        tables = []
+        for psnr in (30.0, 60.0):
+            sure = replace(model, psnr_held_out=psnr)
+            result, loaded = packed(sure, tmp_path / "x.egs", 0.5)
+            assert 0.2 < result.psnr_drop <= 0.5
+            tables.append(np.abs(loaded.table.values - model.table.values).max())
+        assert tables[1] < 0.01 * tables[0]
 
     def test_is_repeated_by_commands_and_the_page(self, tmp_path):
         lines = ["8"]
