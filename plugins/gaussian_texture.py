@@ -72,7 +72,7 @@ def gaussian_texture() -> type:
             of larger cells; ``exact``: floats.
         texels : integer, default: 0
             Texels along the longer side, into which the texture draws itself at every change, and
-            which lookups read, without `prefilter` and `memory`; 0: lookups sum Gaussians.
+            which lookups read, without `memory`; 0: lookups sum Gaussians.
         """
 
         transform_name, others = "to_uv", frozenset({"to_uv", "prefilter"})
@@ -168,7 +168,11 @@ def gaussian_texture() -> type:
             """Look up all channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
             (x, _), (y, _), inside = self.point(si.uv)
             seen = inside & active
-            channels = self.texels.at(x, y, seen) if self.drawn else self.display(self._sums(si))
+            if self.drawn:
+                level = self.texels.level_of(*self._metric(si)) if self.filtered() else None
+                channels = self.texels.at(x, y, seen, level)
+            else:
+                channels = self.display(self._sums(si))
             return [dr.select(seen, c, 0) for c in channels]
 
         def _sums(self, si: mi.SurfaceInteraction3f) -> list:
@@ -182,11 +186,6 @@ def gaussian_texture() -> type:
             (x, sx), (y, sy), inside = self.point(si.uv)
             if not self.filtered():
                 return self.sums_at((x, sx), (y, sy), inside)
-            # B of a transform with the rows of B^-1
-            turned = self.transform.inverse_transpose
-            inverse = tuple(turned[j, i] for i in range(2) for j in range(2))
-            angle = self.pixel()
-            seen = no_metric(self.label()) if angle is None else metric(si, inverse, angle)
             if self.wrap == "clamp":  # a footprint beyond the border may see what lies inside
                 u, v = self.transform @ si.uv
                 x, y = (
@@ -194,7 +193,15 @@ def gaussian_texture() -> type:
                     near_image(v * self.height, self.height),
                 )
                 sx = sy = type(x)(1)
-            return self.sums_at((x, sx), (y, sy), inside, seen)
+            return self.sums_at((x, sx), (y, sy), inside, self._metric(si))
+
+        def _metric(self, si: mi.SurfaceInteraction3f) -> tuple[list, Bool]:
+            """Return the metric of the footprint of a pixel, and whether there is one."""
+            if (angle := self.pixel()) is None:
+                return no_metric(self.label())
+            # B of a transform with the rows of B^-1
+            turned = self.transform.inverse_transpose
+            return metric(si, tuple(turned[j, i] for i in range(2) for j in range(2)), angle)
 
         def point(self, uv: mi.Point2f) -> tuple:
             """Fold uv into the image: x, y in pixels with their slopes; whether uv is finite."""

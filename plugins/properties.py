@@ -227,13 +227,13 @@ def texels(props: mi.Properties, start: Gaussians) -> tuple[int, int] | None:
     Raises
     ------
     ValueError
-        If it is not a number, or `prefilter` or `memory` is given too, which texels lack.
+        If it is not a number, or `memory` is given too, which texels lack.
     """
     longer = _count(props, "texels", "texels")
     if not longer:
         return None
-    if others := [key for key in ("prefilter", "memory") if props.get(key, False)]:
-        raise ValueError(f"{props.plugin_name()}: texels have no {others[0]}; give one of them")
+    if "memory" in props:
+        raise ValueError(f"{props.plugin_name()}: texels have no memory; give one of them")
     scale = longer / max(start.width, start.height)
     return max(1, round(scale * start.width)), max(1, round(scale * start.height))
 

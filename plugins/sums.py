@@ -80,8 +80,6 @@ def plugin_of_sums(base: type) -> Any:
                 callback.put(name, tensor, mi.ParamFlags.Differentiable)
             name = self.transform_name
             callback.put(name, getattr(self, name), mi.ParamFlags.NonDifferentiable)
-            if self.drawn:
-                return
             if self.sensor is not None:
                 self.prefilter = current_angle(self.sensor)
             callback.put("prefilter", self.prefilter, mi.ParamFlags.NonDifferentiable)
@@ -121,8 +119,6 @@ def plugin_of_sums(base: type) -> Any:
         def follow(self, sensor: mi.Sensor) -> None:
             """Take footprints of the pixels of a sensor from now on, see `follow`."""
             current_angle(sensor)  # it raises where there is none
-            if self.drawn:
-                return
             filtered, self.sensor = self.filtered(), sensor
             if not filtered:
                 self._take_over(True)

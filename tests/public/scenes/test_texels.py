@@ -1,5 +1,7 @@
 """A texture that draws itself into texels: a bitmap whose parameters are Gaussians."""
 
+from functools import partial
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from _helpers.materials import material
 from _helpers.sets import SIZE
 from _helpers.texture import at, backend, gaussians, in_front, mi, small_scene, texture
 from _helpers.variants import in_all
-from eigengs_dr.plugins import follow, resident_bytes, texture_of
+from eigengs_dr.plugins import follow, pixel_angle, resident_bytes, texture_of
 
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
@@ -63,6 +65,18 @@ class TestLookups:
         np.testing.assert_allclose(found, np.array(texture(two).eval_3(si)), atol=1e-3)
         assert (found[:, 2] == 0).all() and found.shape[0] == 3
 
+    def test_of_footprints_are_close_to_the_closed_form(self):
+        """From those of a texel to those of the whole image; without one it is at points."""
+        si, g, fine = in_front(anywhere()), gaussians("data"), {"texels": 4 * SIZE[0]}
+        si.t = mi.Float(np.geomspace(0.5, 2e3, 500))
+        si.t[::10] = 0.0
+        exact, levels, sharp = (
+            np.array(texture(g, **more).eval(si))
+            for more in ({"prefilter": 0.05}, {"prefilter": 0.05, **fine}, fine)
+        )
+        assert np.square(levels - exact).mean() < 0.04 * np.square(sharp - exact).mean()
+        np.testing.assert_array_equal(levels[:, ::10], sharp[:, ::10])
+
     def test_of_a_map_and_of_a_family(self, tmp_path):
         material(backend=backend()).save(tmp_path / "x.npz")
         small_model(backend()).save(tmp_path / "m.npz")
@@ -76,33 +90,21 @@ class TestLookups:
 
 
 class TestDerivatives:
-    @pytest.mark.parametrize("integrator", ["direct", "prb"])
-    def test_are_finite_differences(self, integrator):
-        check_gradients(wall(integrator, cutoff=6.0), "wall.bsdf.reflectance", PARAMETERS)
+    @pytest.mark.parametrize(("integrator", "angle"), [("direct", 0.1), ("prb", 0.0)])
+    def test_are_finite_differences(self, integrator, angle):
+        scene = wall(integrator, cutoff=6.0, prefilter=angle)
+        check_gradients(scene, "wall.bsdf.reflectance", PARAMETERS)
 
     def test_in_forward_mode(self):
-        check_forward_mode(lambda: wall("prb"), "wall.bsdf.reflectance", PARAMETERS)
-
-    def test_are_those_of_points(self):
-        """Where texels are fine."""
-        found = []
-        for texels in (0, 400):
-            tex = texture(gaussians("ycbcr"), texels=texels)
-            parameters = mi.traverse(tex)
-            for name in PARAMETERS:
-                dr.enable_grad(parameters[name])
-            parameters.update()
-            dr.backward(dr.sum(dr.squared_norm(tex.eval_3(anywhere()))))
-            found.append([np.array(dr.grad(parameters[name])) for name in PARAMETERS])
-        for points, fine in zip(*found, strict=True):
-            assert np.linalg.norm(fine - points) < 0.05 * np.linalg.norm(points)
+        scene = partial(wall, "prb", prefilter=0.1)
+        check_forward_mode(scene, "wall.bsdf.reflectance", PARAMETERS)
 
 
 class TestChanges:
     def test_of_some_parameters_give_the_lookups_of_a_new_texture(self):
         tex = texture(gaussians("linear"), texels=TEXELS)
         parameters = mi.traverse(tex)
-        assert [key for key, _ in parameters] == [*PARAMETERS, "to_uv"]
+        assert [key for key, _ in parameters] == [*PARAMETERS, "to_uv", "prefilter"]
         for name in (*PARAMETERS, "color"):
             before = np.array(tex.eval_3(anywhere()))
             parameters[name] = parameters[name] * 0.9
@@ -127,12 +129,27 @@ class TestChanges:
         with pytest.raises(Exception, match=r"color has shape \(5, 3\), expected"):
             parameters.update()
 
+    def test_of_the_prefilter(self):
+        """By `follow`, by hand, and back to none."""
+        scene = wall("direct")
+        angle, none = pixel_angle(scene.sensors()[0]), np.array(mi.render(scene, seed=1))
+        follow(scene)
+        fixed = np.array(mi.render(wall("direct", prefilter=angle), seed=1))
+        np.testing.assert_allclose(np.array(mi.render(scene, seed=1)), fixed, atol=1e-5)
+        assert np.abs(fixed - none).max() > 1e-3
+        parameters = mi.traverse(scene)
+        for number, expected in ((0.0, none), (angle, fixed)):
+            parameters["wall.bsdf.reflectance.prefilter"] = number
+            parameters.update()
+            np.testing.assert_allclose(np.array(mi.render(scene, seed=1)), expected, atol=1e-5)
+
     def test_in_frozen_renderings(self):
         """Of a wall, and of a light that was sampled before."""
         lamp = {"type": "area", "radiance": texture_of(gaussians("linear"), texels=TEXELS)}
-        for scene in (wall("path"), small_scene(None, emitter=lamp)):
+        for scene in (wall("path", prefilter=0.1), small_scene(None, emitter=lamp)):
             mi.render(scene, spp=1)
-            check_frozen(scene, [[], *([n] for n in PARAMETERS), PARAMETERS, ["color"], ["color"]])
+            changes = [[n] for n in (*PARAMETERS, "prefilter")]
+            check_frozen(scene, [[], *changes, PARAMETERS, ["color"], ["color"]])
 
 
 class TestEmission:
@@ -150,7 +167,7 @@ class TestEmission:
     def test_its_mean_and_maximum_are_those_of_the_texels(self):
         g = gaussians("ycbcr", quiet=False)
         light = to_linear(np.clip(eg.render(g, TEXELS).numpy(), 0, 1)) @ LUMINANCE
-        tex = texture(g, texels=TEXELS)
+        tex = texture(g, texels=TEXELS, prefilter=0.1)
         assert np.array(tex.mean()).item() == pytest.approx(light.mean(), rel=1e-4)
         assert tex.max() == pytest.approx(light.max(), rel=1e-4)
 
@@ -160,7 +177,6 @@ class TestEmission:
     [
         ({"texels": -1}, "texels is -1; it must be a number of texels"),
         ({"texels": 2.5}, "texels is 2.5; it must be a number of texels"),
-        ({"texels": 8, "prefilter": True}, "texels have no prefilter; give one"),
         ({"texels": 8, "memory": "small"}, "texels have no memory; give one"),
     ],
 )
@@ -170,15 +186,10 @@ def test_mistakes(properties, message):
     assert f"gaussian_texture: {message}" in str(caught.value).splitlines()[0]
 
 
-def test_follow_leaves_it_as_it_is():
-    scene = wall("direct")
-    before = np.array(mi.render(scene, seed=1))
-    follow(scene)
-    np.testing.assert_array_equal(np.array(mi.render(scene, seed=1)), before)
-
-
 @pytest.mark.parametrize(("channels", "size"), [(1, 8), (3, 16)])
 def test_bytes_of_a_texel(channels, size):
-    tex = texture(gaussians("data", channels), texels=500)
-    assert resident_bytes(tex) == pytest.approx(size * 500 * 386, rel=0.01)
-    assert "resolution = [500, 386]" in str(tex) and "texels = 500" in str(tex)
+    """Levels take a third more."""
+    for angle, levels in ((0.0, 1), (0.1, 4 / 3)):
+        tex = texture(gaussians("data", channels), texels=500, prefilter=angle)
+        assert resident_bytes(tex) == pytest.approx(size * 500 * 386 * levels, rel=0.01)
+        assert "resolution = [500, 386]" in str(tex) and "texels = 500" in str(tex)
