@@ -16,10 +16,10 @@ from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
 from eigengs_bench import alike, cases, inverse, kernels, rate, relight, scaling, texture
 from eigengs_bench.images import images_of
-from eigengs_bench.names import SETS, ImageSet
+from eigengs_bench.names import SETS, SUBJECTS_OF_SAMPLES, ImageSet
 from eigengs_bench.report import Section
 from eigengs_bench.rows import FILE, read
-from eigengs_bench.subjects import SUBJECTS
+from eigengs_bench.subjects import SUBJECTS, photos_of, scene_of
 
 slow = pytest.mark.slow
 
@@ -190,19 +190,36 @@ def test_texture(monkeypatch, tmp_path):
 @pytest.mark.mitsuba
 def test_inverse(monkeypatch, tmp_path):
     pytest.importorskip("mitsuba")
-    smaller(monkeypatch, inverse, STEPS=(4, 16), NOISES=(), WARM_UP=4, NOISY_STEPS=16)
+    smaller(monkeypatch, inverse, WARM_UP=4, STEPS_OF_MAPS=16)
     for name, subject in SUBJECTS.items():
-        one = subject._replace(texels=64, side=16, cameras=(2,))
+        one = subject._replace(texels=64, side=16, cameras=(2,), runs={4: (4, 16)})
         monkeypatch.setitem(SUBJECTS, name, one)
     scenes = ("--scene", "ball", "--scene", "material", "--seeds", "1")
     rows, text = answered(tmp_path / "out", "inverse", *scenes, "--backend", "llvm")
-    ball, material = rows[:6], rows[6:]
-    for first, then in zip(ball[:3], ball[3:], strict=True):
+    ball, material = rows[:8], rows[8:]
+    for first, then in zip(ball[:3], ball[3:6], strict=True):
         assert first["job"]["method"] == then["job"]["method"] in inverse.METHODS
         assert first["seconds"] > 0 and 5 < first["psnr_rgb"] < then["psnr_rgb"]
-    assert [row["job"]["method"] for row in material] == [*inverse.METHODS] * 2
+    descents = [(row["job"]["steps"], row["job"]["method"]) for row in material]
+    longer = [(24, method) for method in inverse.RIVALS]
+    assert descents == [(steps, m) for steps in (4, 16) for m in inverse.METHODS] + longer
     assert all(row["albedo"] > 5 and row["roughness_constant"] > 5 for row in material)
-    assert "ball, 2 cameras" in text and "at equal seconds" in text
+    assert "ball, 2 cameras" in text and "within equal seconds" in text
+
+
+@slow
+@pytest.mark.mitsuba
+def test_photos_of_all_scenes(monkeypatch):
+    """Each scene shows its texture: photos depend on most of it, and differ from those of grey."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    for name in SUBJECTS_OF_SAMPLES:
+        monkeypatch.setitem(SUBJECTS, name, SUBJECTS[name]._replace(texels=64, side=32))
+        scene = scene_of(mi, name, 3, None)
+        grey = photos_of(mi, scene.load(mi), 3)
+        for photo, other in zip(scene.photos[3:], grey, strict=True):
+            assert np.isfinite(photo).all() and np.abs(photo - other).mean() > 0.01
+        assert np.mean(scene.seen > 0) > 0.3
 
 
 # --- Photos under many lights ---
