@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 from threadpoolctl import threadpool_limits
 
@@ -41,10 +40,12 @@ from ..image.read import read_header
 from ..image.space import DATA
 from ..storage.memory import check_usable
 from .lights import (
+    FOLDS,
     LightTable,
     check_lights,
     check_spread,
     find_lists,
+    folds,
     functions_at,
     read_lights,
     solve_table,
@@ -56,9 +57,6 @@ stays the same from 24 on."""
 
 MIN_LIGHTS = 4
 """Smallest number of photos: a linear function of the direction has four factors."""
-
-FOLDS = 8
-"""Number of parts of the lights, each left out once."""
 
 ROUNDING = 1 / (12 * 255**2)
 """Mean squared error that rounding a picture to 8 bits adds."""
@@ -219,14 +217,9 @@ class Planes(NamedTuple):
 
     def _costs(self) -> Doubles:
         """Return ``1/3 sum_c t t^T - (t - u) (t - u)^T`` of each photo, (n, K, K)."""
-        lights, values = self.table.lights, self.table.values
-        change = values.copy()
-        for out in folds(lights):
-            others = replace(self.table, lights=lights[~out], values=values[~out])
-            change[out] -= others.at(lights[out])
         added, spared = (
             np.einsum("nck,ncl->nkl", factors[..., :-1], factors[..., :-1]) / 3
-            for factors in (values, change)
+            for factors in (self.table.values, self.table.changes())
         )
         return np.asarray(added - spared)
 
@@ -300,12 +293,6 @@ def _mean_psnr(errors: Doubles) -> float:
 def most_planes(photos: int) -> int:
     """Return the largest number of planes: as many as rows are left without one of the parts."""
     return min(MAX_CHANNELS, 3 * (photos - math.ceil(photos / FOLDS)))
-
-
-def folds(lights: Doubles) -> list[NDArray[np.bool_]]:
-    """Return which lights each part leaves out."""
-    count = min(FOLDS, len(lights))
-    return [np.arange(len(lights)) % count == fold for fold in range(count)]
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # more wait for each other, see `incremental`

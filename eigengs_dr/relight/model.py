@@ -21,14 +21,15 @@ from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..codec.egs import is_packed, read_egs
+from ..eigenbasis.incremental import product
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
 from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
 from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.color import to_linear
-from ..image.io import read_floats
+from ..image.io import read_floats, read_photo
 from ..image.metrics import MAX_PSNR
-from ..image.pixels import encoding_of
+from ..image.pixels import ImageError, codes_of, encoding_of
 from ..image.read import is_picture
 from ..image.resize import resample
 from ..image.space import DATA, LINEAR, RGB
@@ -36,7 +37,15 @@ from ..raster.render import render
 from ..storage import npz
 from ..storage.npz import BadValue, Field, file_errors
 from .directions import LatLong
-from .fit import MAX_PSNR_DROP, find_planes, fit_fewest, fit_planes, most_planes, read_photos
+from .fit import (
+    MAX_PSNR_DROP,
+    ROUNDING,
+    find_planes,
+    fit_fewest,
+    fit_planes,
+    most_planes,
+    read_photos,
+)
 from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
 VERSION = 1
@@ -253,6 +262,48 @@ class Relightable:
         start = with_colors(self.planes, np.zeros((len(self.planes) + 1, 3)), space)
         return solve(start, Pixels.plain(total, start, space.weight(total)))
 
+    def find_light(self, photo: Any, *, encoding: str | None = None) -> tuple[Doubles, float]:
+        """Find the light of a photo of the object, from the same camera with the same exposure.
+
+        Directions above the horizon are compared, by how well the photos of the model tell each
+        other: planes that are badly interpolated between lights count less.
+
+        Parameters
+        ----------
+        photo, encoding
+            As the photos of `fit`, and of their size.
+
+        Returns
+        -------
+        light : ndarray of float64, shape (3,)
+            The mean of the directions that the photo may have been lit from; a unit vector.
+        angle : float
+            Its uncertainty: the root mean square angle between these directions and their mean, in
+            degrees. Large where photos differ little, as those of a flat object may.
+
+        Raises
+        ------
+        ValueError
+            If the photo cannot be used, or is of another size than those of the model.
+        OSError
+            If a file cannot be opened.
+        """
+        width, height = self.planes.width, self.planes.height
+        pixels = codes_of(read_photo(photo, encoding, upright=False))
+        if pixels.shape[:2] != (height, width):
+            raise ImageError(
+                f"photo: is {pixels.shape[1]}x{pixels.shape[0]}, but those of the model are "
+                f"{width}x{height}; scale it to that size"
+            )
+        colors = pixels.reshape(-1, 3).T
+        images = render(self.planes).numpy().astype(np.float32).reshape(colors.shape[1], -1).T
+        images = np.vstack([images, np.ones((1, colors.shape[1]), np.float32)])
+        moments = product(images, images) / images.shape[1]
+        moments += UNSEEN * np.trace(moments) * np.eye(len(moments))
+        inverse = np.linalg.inv(moments)
+        shown = inverse @ product(images, colors) / images.shape[1]
+        return self.table.find(shown.T, ROUNDING * inverse)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
         table = self.table
@@ -346,6 +397,9 @@ def or_camera(light: Any) -> Any:
     length = dr.squared_norm(light)
     return dr.select(dr.isfinite(length) & (length > 0), light, type(light)(0, 0, 1))
 
+
+UNSEEN = 1e-7
+"""Added to the moments of planes, times their trace: what no Gaussian shows tells no light."""
 
 ENVIRONMENT_SIZE = (32, 16)
 """Width and height to which environments are averaged: 256 directions above the horizon."""

@@ -14,7 +14,7 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
-from _helpers.lit_models import LitFormula, changed
+from _helpers.lit_models import LitFormula, changed, to_light
 from _helpers.lit_spheres import directions, photos
 from _helpers.packed import few_groups
 
@@ -189,6 +189,38 @@ class TestRelight:
         with pytest.raises(error, match=says) as caught:
             model.relight(light)
         assert "\n" not in str(caught.value)
+
+
+class TestFindLight:
+    def test_finds_lights_within_the_angle_that_it_tells(self, model):
+        for k in np.flatnonzero(LEFT_OUT):
+            light, angle = model.find_light(PHOTOS[k], encoding="srgb")
+            wrong = np.degrees(np.arccos(min(light @ LIGHTS[k], 1)))
+            assert np.linalg.norm(light) == pytest.approx(1)
+            assert wrong < 4 and wrong < 2.5 * angle and angle < 8
+
+    def test_of_a_flat_object_is_a_guess_and_says_so(self):
+        """Brightness tells how high the light is, and nothing where from."""
+        flat = 0.5 * LIGHTS[:, 2, None, None, None] * np.linspace(0.5, 1, 16)[:, None, None]
+        photos = np.broadcast_to(flat, (40, 16, 16, 3)).astype(np.float32)
+        guess = model_of(photos[~LEFT_OUT], gaussians=20, planes=1, iterations=0)
+        _, angle = guess.find_light(photos[20], encoding="srgb")
+        assert angle > 20
+
+    def test_reads_a_file_as_it_is_stored_and_light_as_codes(self, model, tmp_path):
+        exif = Image.Exif()
+        exif[274] = 6  # turned by a quarter
+        codes = np.rint(PHOTOS[4].clip(0, 1) * 255).astype(np.uint8)
+        Image.fromarray(codes).save(tmp_path / "photo.png", exif=exif)
+        expected = model.find_light(codes)
+        for photo in (tmp_path / "photo.png", to_light(codes / 255)):
+            light, angle = model.find_light(photo)
+            np.testing.assert_allclose(light, expected[0], atol=1e-3)
+            assert angle == pytest.approx(expected[1], rel=1e-2)
+
+    def test_refuses_a_photo_of_another_size(self, model):
+        with pytest.raises(ValueError, match="is 32x20, but those of the model are 32x32"):
+            model.find_light(PHOTOS[4, :20])
 
 
 class TestFiles:
