@@ -11,18 +11,25 @@ from .backend import interrupts
 if interrupts.is_program():  # before the imports, which take half a second
     interrupts.end_at_signals()
 
-import lazy_loader
+import ast
+from importlib import import_module
+from pathlib import Path
 
 from .backend import messages
 from .backend.selection import import_drjit, select_libllvm
 from .version import __version__ as __version__
 
-# Dr.Jit looks for libLLVM once, while it is imported; lazy_loader imports it here if EAGER_IMPORT
-# is set.
-select_libllvm()
+select_libllvm()  # Dr.Jit looks for it once, while it is imported
 
-_import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_STUB = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+_MODULES = {
+    alias.name: node.module  # None of a module itself
+    for node in _STUB.body
+    if isinstance(node, ast.ImportFrom)
+    for alias in node.names
+}
 
+__all__ = sorted(_MODULES)
 
 WITHOUT_DRJIT = {"load_image", "psnr", "sample", "save_image"}
 WITHOUT_DRJIT |= {"BackendError", "ClusterError", "ImageError", "Interrupted"}
@@ -32,5 +39,10 @@ def __getattr__(name: str) -> object:
     if name in __all__:
         if name not in WITHOUT_DRJIT:
             import_drjit()  # quietly, and with one line on what to install where that fails
-        return _import_name(name)
+        module = import_module(f".{_MODULES[name] or name}", __name__)
+        return getattr(module, name) if _MODULES[name] else module
     raise messages.no_attribute(__name__, name, __all__)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,4 +1,4 @@
-"""The public names of eigengs_dr; `lazy_loader` and type checkers read this file."""
+"""The public names of eigengs_dr; the package and type checkers read this file."""
 
 from . import paper as paper
 from . import plugins as plugins

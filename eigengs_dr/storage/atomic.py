@@ -12,6 +12,7 @@ import platform
 import secrets
 import shutil
 import stat
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -259,13 +260,11 @@ def hold(path: Path, output: str | os.PathLike[str], wait: float = WAIT) -> Iter
 
 def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tuple[int, bool]:
     """Open and lock a file, and write the holder into it."""
-    from filelock import lock_descriptor  # takes 0.1 s, which `--help` does not need
-
     deadline = time.monotonic() + wait
     while True:
         descriptor, holder = _open(path, output)
         try:
-            locked = lock_descriptor(descriptor, blocking=False)
+            locked = _lock(descriptor)
             # The previous run may have deleted the file between the two calls.
             if locked and _is_file(path, descriptor):
                 text = HOLDER + f"{os.getpid()} on {platform.node()}".encode()
@@ -291,6 +290,23 @@ def _open_locked(path: Path, output: str | os.PathLike[str], wait: float) -> tup
                     f"wait for its end, or use another {kind}"
                 )
             time.sleep(POLL)
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock an open file; return False if another process holds it."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            os.lseek(descriptor, 0, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):  # of Unix, and of Windows
+        return False
+    return True
 
 
 def _open(path: Path, output: str | os.PathLike[str]) -> tuple[int, str]:

@@ -6,6 +6,7 @@ A page, which `view` makes, is one HTML file that needs neither other files nor 
 from __future__ import annotations
 
 import os
+import zlib
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,8 +24,9 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
-from ..image.io import Codes, codes_of, displayed, read_file, read_photo
-from ..image.pixels import check_encoding
+from ..image.io import Codes, displayed, read_photo
+from ..image.metrics import psnr
+from ..image.pixels import check_encoding, codes_of
 from ..image.resize import resample
 from ..raster.render import picture_of
 from ..relight.lights import check_lights
@@ -147,7 +149,7 @@ def view(
     if encoding and image is None:
         raise ValueError("encoding is for the pixels of an image; leave it out, or give one")
     model = source if isinstance(source, EigenGS) else None
-    lights, presets = None, []
+    lights, presets, pixels = None, [], None
     if isinstance(source, Relightable):
         if image is not None and light is None:
             raise ValueError(
@@ -159,12 +161,14 @@ def view(
         presets = light_presets(source)
         if image is not None:
             presets.insert(0, ("As in the photo", start))
-        pixels = None if image is None else _stored(image, encoding)
+            # Lights belong to the pixels that a file stores, as in `Relightable.fit`.
+            pixels = codes_of(read_photo(image, encoding, arrays="srgb", upright=False))
     else:
         if light is not None:
             raise ValueError("light is for a model of lights; leave it out")
         gaussians = one_image(set_of(source)) if model is None else model.gaussians
-        pixels = None if image is None else displayed(image, gaussians.space, encoding)
+        if image is not None:
+            pixels = displayed(image, gaussians.space, encoding)
     model_facts, note = None, ""
     if model is not None:
         counts = kept_counts(model)
@@ -174,11 +178,16 @@ def view(
     elif pixels is not None:
         check_aspect(pixels, (gaussians.width, gaussians.height))
     summary = f"{len(gaussians):,} Gaussians, {gaussians.width} x {gaussians.height} pixels"
+    if isinstance(source, Fit) and np.isfinite(source.psnr_rgb):
+        summary += f"; psnr_rgb {source.psnr_rgb:.2f} dB"
+    elif model is None and pixels is not None and gaussians.space.is_color:
+        shown = picture_of(gaussians, pixels.shape[1], pixels.shape[0])
+        summary += f"; psnr_rgb {psnr(shown, pixels, 'rgb'):.2f} dB"
     if isinstance(source, Relightable) and np.isfinite(source.psnr_held_out):
         summary += f"; left-out lights: psnr_rgb {source.psnr_held_out:.2f} dB"
     views = channel_views(gaussians.channels)
     facts = {
-        "set": describe_set(gaussians, levels),
+        "set": describe_set(gaussians, levels) | ({} if lights is None else {"color": None}),
         "light": gaussians.space.page_kind,
         "channels": views[0][1],
         "photo": None if pixels is None else photo_uri(pixels),
@@ -198,17 +207,14 @@ def view(
     return Page(html)
 
 
-def _stored(image: ArrayLike, encoding: str | None) -> NDArray[np.float32]:
-    """Read a photo under a light as `Relightable.fit` does: lights belong to stored pixels."""
-    if isinstance(image, (str, os.PathLike)):
-        return codes_of(read_file(os.fspath(image), encoding=encoding, upright=False))
-    return codes_of(read_photo(image, encoding, arrays="srgb"))
-
-
 # --- The data of a page: arrays in base64, with colours decoded to RGB ----------------------------
 
 MAX_GAUSSIANS = 1 << 20
-"""Largest number of Gaussians of a page; those of a photo take 43 bytes each."""
+"""Largest number of Gaussians of a page; those of a photo take 25 bytes each."""
+
+
+MEAN_STEP = 2.0**-10
+"""Pixels to whose multiples a page rounds means."""
 
 
 def check_count(count: int) -> None:
@@ -240,14 +246,15 @@ def describe_set(gaussians: Gaussians, levels: Sequence[int] = ()) -> Record:
     if marks != sorted(set(marks)) or (marks and not 1 <= marks[0] <= marks[-1] <= len(gaussians)):
         raise ValueError(f"levels are {marks}; expected ascending numbers up to {len(gaussians)}")
     color, background = decoded(gaussians)
+    mean = np.rint(data.arrays["mean"] / MEAN_STEP) * MEAN_STEP
     return {
         "width": gaussians.width,
         "height": gaussians.height,
         "cutoff": gaussians.cutoff,
         "levels": marks,
-        "mean": to_text(data.arrays["mean"]),
-        "factor": to_text(data.arrays["factor"]),
-        "color": to_text(color),
+        "mean": deflated(mean),
+        "factor": deflated(shortened(data.arrays["factor"])),
+        "color": deflated(shortened(color)),
         "background": background.tolist(),
     }
 
@@ -261,9 +268,26 @@ def decoded(gaussians: Gaussians) -> tuple[NDArray[np.float64], NDArray[np.float
     return rgb[:-2] - rgb[-1], rgb[-2]
 
 
-def to_text(array: NDArray[np.floating], kind: str = "<f4") -> str:
+def to_text(array: NDArray[np.floating], kind: str = "<f8") -> str:
     """Return the bytes of an array in base64."""
     return b64encode(np.ascontiguousarray(array, kind).tobytes()).decode()
+
+
+def shortened(array: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return numbers of 13 significant bits: the zeros behind them take no bytes in a page."""
+    fraction, exponent = np.frexp(array.astype(np.float64))
+    return np.ldexp(np.rint(fraction * 2**13) / 2**13, exponent)
+
+
+def deflated(rows: NDArray[np.floating], kind: str = "<f4") -> Record:
+    """Return rows of floats (N, C) for a page: column after column, deflated.
+
+    The bytes of a column are sorted by their place in a number, as deflate finds more that way.
+    """
+    columns = np.asfortranarray(rows, kind).T
+    sorted_bytes = columns.view("u1").reshape(*columns.shape, -1).swapaxes(1, 2)
+    data = b64encode(zlib.compress(sorted_bytes.tobytes(), 9)).decode()
+    return {"rows": len(rows), "columns": len(columns), "kind": kind, "deflated": data}
 
 
 def channel_views(channels: int) -> list[tuple[str, tuple[int, int, int]]]:
@@ -295,9 +319,9 @@ def describe_lights(model: Relightable) -> Record:
     scales = np.where(scales > 0, scales, 1)
     return {
         "kind": table.kind,
-        "lights": to_text(table.lights, "<f8"),
-        "coefficients": to_text(table.coefficients, "<f8"),
-        "planes": to_text(arrays["color"] / scales, "<f2"),
+        "lights": to_text(table.lights),
+        "coefficients": to_text(table.coefficients),
+        "planes": deflated(arrays["color"] / scales, "<f2"),
         "scales": scales.tolist(),
         "background": arrays["background"].tolist(),
     }
@@ -339,7 +363,7 @@ def describe_model(
         scales = np.abs(kept).max(axis=1, initial=0)
         scales = np.where(scales > 0, scales, 1)
         channel = {"name": name, "deviations": deviation.tolist(), "scales": scales.tolist()}
-        channels.append(channel | {"weights": to_text(kept / scales[:, None], "<f2")})
+        channels.append(channel | {"weights": deflated(kept.T / scales, "<f2")})
     photo = None
     if image is not None:
         color, background = decoded(model.encode(Codes(image)))
@@ -347,7 +371,8 @@ def describe_model(
             (values[: len(d)] / np.maximum(d, np.finfo(float).tiny ** 0.5)).tolist()
             for values, d in zip(model.project(Codes(image)), deviations, strict=True)
         ]
-        photo = {"color": to_text(color), "background": background.tolist(), "scores": scores}
+        photo = {"color": deflated(shortened(color)), "background": background.tolist()}
+        photo["scores"] = scores
     return {"matrix": space.to_rgb.tolist(), "channels": channels, "photo": photo}
 
 

@@ -1,21 +1,38 @@
 "use strict";
 
-/** Decode base64 to an array of a type, such as Float32Array. */
-function decodeArray(text, Type) {
-  const raw = atob(text);
-  const bytes = new Uint8Array(raw.length);
-  for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
-  return new Type(bytes.buffer);
-}
+/** Decode base64 to bytes. */
+const decodeBytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 
-/** Decode base64 of 16-bit floats to a Float32Array. */
-function decodeHalves(text) {
-  return Float32Array.from(decodeArray(text, Uint16Array), (bits) => {
+/** Decode 16-bit floats to a Float32Array. */
+function decodeHalves(codes) {
+  return Float32Array.from(codes, (bits) => {
     const sign = bits & 0x8000 ? -1 : 1;
     const exponent = (bits >> 10) & 31;
     const fraction = bits & 1023;
     return exponent ? sign * 2 ** (exponent - 25) * (1024 + fraction) : sign * 2 ** -24 * fraction;
   });
+}
+
+/** Decode rows of floats to a Float32Array, see `deflated` in view.py. */
+async function inflateRows({ rows, columns, kind, deflated }) {
+  const stream = new Blob([decodeBytes(deflated)]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
+  const size = bytes.length / Math.max(rows * columns, 1);
+  const numbers = new Uint8Array(bytes.length);
+  for (let c = 0; c < columns; c++) {
+    for (let k = 0; k < size; k++) {
+      for (let i = 0; i < rows; i++) numbers[(i * columns + c) * size + k] = bytes[(c * size + k) * rows + i];
+    }
+  }
+  return kind === "<f2" ? decodeHalves(new Uint16Array(numbers.buffer)) : new Float32Array(numbers.buffer);
+}
+
+/** Inflate all rows in the facts of a page. */
+async function inflateAll(facts) {
+  if (typeof facts !== "object" || facts === null) return facts;
+  if ("deflated" in facts) return inflateRows(facts);
+  const entries = await Promise.all(Object.entries(facts).map(async ([name, value]) => [name, await inflateAll(value)]));
+  return Array.isArray(facts) ? entries.map(([, value]) => value) : Object.fromEntries(entries);
 }
 
 /**
@@ -25,7 +42,7 @@ function decodeHalves(text) {
 class GaussianSet {
   constructor(facts) {
     Object.assign(this, { width: facts.width, height: facts.height, cutoff: facts.cutoff });
-    const factor = decodeArray(facts.factor, Float32Array);
+    const { factor } = facts;
     this.count = factor.length / 3;
     const order = Array.from({ length: this.count }, (_, i) => i);
     // Without levels, any first part of the file is arbitrary: show the large Gaussians first.
@@ -42,9 +59,10 @@ class GaussianSet {
     this.sorted = sorted;
     this.number = Uint32Array.from(order, (i) => i + 1);
     this.channels = facts.background.length;
-    this.mean = sorted(decodeArray(facts.mean, Float32Array), 2);
+    this.mean = sorted(facts.mean, 2);
     this.factor = sorted(factor, 3);
-    this.color = sorted(decodeArray(facts.color, Float32Array), this.channels);
+    // Lights have planes instead, whose sums they set.
+    this.color = facts.color ? sorted(facts.color, this.channels) : new Float32Array(this.count * this.channels);
     this.background = Float32Array.from(facts.background);
   }
 

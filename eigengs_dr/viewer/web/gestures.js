@@ -58,9 +58,10 @@ function listen(canvas, camera, { moved, steered, pointed, centred }) {
   canvas.addEventListener("pointerleave", (event) => {
     if (event.pointerType !== "touch") pointed(null);
   });
-  canvas.addEventListener("wheel", (event) => {
+  // The divider and the buttons lie over the picture, in the same element.
+  canvas.parentElement.addEventListener("wheel", (event) => {
     // Inside another page, the wheel scrolls that page until the picture is chosen.
-    if (self !== top && document.activeElement !== canvas && !event.ctrlKey) return;
+    if (self !== top && !canvas.parentElement.contains(document.activeElement) && !event.ctrlKey) return;
     event.preventDefault();
     const lines = event.deltaMode === 1 ? 16 * event.deltaY : event.deltaY;
     camera.zoom(2 ** (-Math.max(-300, Math.min(lines, 300)) / (event.ctrlKey ? 100 : 300)), ...pixel(event));
@@ -79,8 +80,9 @@ function listen(canvas, camera, { moved, steered, pointed, centred }) {
     0: () => camera.fit(),
     1: () => camera.showActualSize(),
   };
-  canvas.addEventListener("keydown", (event) => {
+  document.addEventListener("keydown", (event) => {
     if (!(event.key in keys) || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target.closest("input, select, [role=slider]")) return; // which have keys of their own
     event.preventDefault();
     keys[event.key]();
     moved();

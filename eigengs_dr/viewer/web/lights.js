@@ -4,10 +4,10 @@
 class Lights {
   constructor(facts, set) {
     Object.assign(this, { set, kind: facts.kind, background: facts.background });
-    this.lights = decodeArray(facts.lights, Float64Array);
-    this.coefficients = decodeArray(facts.coefficients, Float64Array);
+    this.lights = new Float64Array(decodeBytes(facts.lights).buffer);
+    this.coefficients = new Float64Array(decodeBytes(facts.coefficients).buffer);
     const count = facts.scales.length;
-    const rows = decodeHalves(facts.planes).map((value, at) => value * facts.scales[at % count]);
+    const rows = facts.planes.map((value, at) => value * facts.scales[at % count]);
     this.planes = set.sorted(rows, count);
     this.aim(...facts.start);
   }

@@ -1,8 +1,8 @@
 "use strict";
 
 /** Start the page: window.viewer, .model and .lights are for tests and for the curious. */
-function start() {
-  const facts = JSON.parse(byId("facts").textContent);
+async function start() {
+  const facts = await inflateAll(JSON.parse(byId("facts").textContent));
   const set = new GaussianSet(facts.set);
   const viewer = new Viewer(byId("view"), set, facts.light, facts.channels);
   window.viewer = viewer;
@@ -33,10 +33,8 @@ function start() {
   viewer.ready = performance.now();
 }
 
-try {
-  start();
-} catch (error) {
+start().catch((error) => {
   byId("failure").hidden = false;
   byId("failure").textContent = `The picture cannot be drawn: ${error.message}. Try a recent Firefox, Chrome, Edge or Safari.`;
   throw error;
-}
+});

@@ -9,18 +9,18 @@ class Model {
     this.set = set;
     this.matrix = facts.matrix; // from the channels of the model to RGB
     this.channels = facts.channels.map((channel) => {
-      const weights = decodeHalves(channel.weights);
-      const length = set.count + 1; // the background is last
-      const components = channel.deviations.map((deviation, j) => {
-        const row = weights.subarray(j * length, (j + 1) * length);
-        return { deviation: deviation * channel.scales[j], gaussians: set.sorted(row.subarray(0, -1), 1), background: row[length - 1] };
+      const { weights, deviations, scales } = channel;
+      const components = deviations.map((deviation, j) => {
+        const column = Float32Array.from({ length: set.count + 1 }, (_, i) => weights[i * deviations.length + j]);
+        // The background is last.
+        return { deviation: deviation * scales[j], gaussians: set.sorted(column.subarray(0, -1), 1), background: column[set.count] };
       });
       return { name: channel.name, components };
     });
     const zeros = this.channels.map(({ components }) => components.map(() => 0));
     this.bases = { mean: { color: set.color, background: set.background, scores: zeros } };
     if (facts.photo) {
-      const color = set.sorted(decodeArray(facts.photo.color, Float32Array), 3);
+      const color = set.sorted(facts.photo.color, 3);
       const background = Float32Array.from(facts.photo.background);
       this.bases.photo = { color, background, scores: facts.photo.scores };
     }

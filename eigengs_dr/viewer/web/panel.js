@@ -182,7 +182,7 @@ function connectView(viewer) {
     const percent = 100 * camera.scale;
     byId("zoom").textContent = `${percent < 10 ? percent.toPrecision(2) : percent < 1e7 ? withCommas(percent) : percent.toExponential(0)} %`;
     const part = `Shown for ${withCommas(MAX_OUTLINES)} of the ${withCommas(MAX_OUTLINES + viewer.hidden)} in view; zoom in to see all.`;
-    byId("note").textContent = viewer.outlined ? `At one standard deviation. ${viewer.hidden ? part : ""}` : "";
+    byId("note").textContent = viewer.outlined ? `At one standard deviation, orange for small Gaussians, blue for large ones. ${viewer.hidden ? part : ""}` : "";
   });
   byId("outlines").addEventListener("change", (event) => {
     viewer.outlined = event.target.checked;

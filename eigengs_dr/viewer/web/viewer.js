@@ -1,8 +1,8 @@
 "use strict";
 
-const MAX_OUTLINES = 1500; // more of them hide each other
+const MAX_OUTLINES = 2000; // more of them hide each other
 const SLOW_FRAME = 60; // milliseconds; after a slower one, a moving picture has a quarter of the pixels
-const INK = { all: [1, 0.6, 0.15], chosen: [0.1, 0.75, 1] };
+const INK = { small: [1, 0.55, 0.1], large: [0.25, 0.5, 1], chosen: [0.1, 1, 0.6] };
 
 /** The picture: a set, where one looks at it from, and what is drawn over it. */
 class Viewer {
@@ -16,6 +16,7 @@ class Viewer {
     let seed = 1;
     const keys = Float64Array.from(set.number, () => (seed = (seed * 48271) % 2147483647));
     this.shuffled = Uint32Array.from(keys.keys()).sort((i, j) => keys[i] - keys[j]);
+    this.inks = this.inksBySize();
     this.listeners = [];
     this.start();
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
@@ -86,22 +87,34 @@ class Viewer {
   /** Return the outlines to draw: of all Gaussians in view, or a part of them, and of the chosen one. */
   rings() {
     const { mean, factor } = this.set;
-    const gather = (indices, ink) => ({
+    const gather = (indices, inkOf) => ({
       mean: Float32Array.from(indices.flatMap((i) => [mean[2 * i], mean[2 * i + 1]])),
       factor: Float32Array.from(indices.flatMap((i) => [...factor.subarray(3 * i, 3 * i + 3)])),
-      color: Float32Array.from(indices.flatMap(() => ink)),
+      color: Float32Array.from(indices.flatMap(inkOf)),
     });
     const result = [];
     if (this.outlined) {
       const inView = this.inView();
-      const thickness = devicePixelRatio;
+      const thickness = 0.5 * devicePixelRatio; // the picture shows through
       this.hidden = Math.max(0, inView.length - MAX_OUTLINES);
-      result.push({ set: gather(inView.slice(0, MAX_OUTLINES), INK.all), thickness });
+      result.push({ set: gather(inView.slice(0, MAX_OUTLINES), (i) => this.inks[i]), thickness });
     }
     if (this.chosen !== null) {
-      result.push({ set: gather([this.chosen], INK.chosen), thickness: 2 * devicePixelRatio });
+      result.push({ set: gather([this.chosen], () => INK.chosen), thickness: 2 * devicePixelRatio });
     }
     return result;
+  }
+
+  /** Return colours of outlines, from small to large: in between by the logarithm of the area. */
+  inksBySize() {
+    const { factor } = this.set;
+    const sizes = Float64Array.from({ length: factor.length / 3 }, (_, i) => -Math.log(factor[3 * i] * factor[3 * i + 2]));
+    const ranked = sizes.slice().sort();
+    const [low, high] = [0.02, 0.98].map((share) => ranked[Math.floor(share * (ranked.length - 1))]);
+    return Array.from(sizes, (size) => {
+      const share = high > low ? Math.max(0, Math.min((size - low) / (high - low), 1)) : 1;
+      return INK.small.map((value, k) => value + share * (INK.large[k] - value));
+    });
   }
 
   inView() {

@@ -39,6 +39,22 @@ def test_a_fit_is_its_gaussians(fit):
     assert facts_of(page)["set"] == facts_of(eg.view(fit.gaussians))["set"]
 
 
+def test_the_heading_says_how_close_the_photo_is(fit):
+    def heading(page):
+        return re.search(r"<header>.*?<p>(.*?)</p>", page.html, re.DOTALL)[1]
+
+    expected = f"64 Gaussians, 32 x 32 pixels; psnr_rgb {fit.psnr_rgb:.2f} dB"
+    assert heading(eg.view(fit)) == heading(eg.view(fit.gaussians, coffee(32))) == expected
+    assert "psnr" not in heading(eg.view(fit.gaussians))
+
+
+def test_a_gaussian_takes_26_bytes_of_a_page():
+    """It takes 32 of a file without compression."""
+    gaussians = make_set(3000, (320, 240))
+    scripts = len(eg.view(gaussians[:1]).html)
+    assert len(eg.view(gaussians).html) - scripts < 27 * 3000
+
+
 def test_a_page_is_one_file(tmp_path):
     page = eg.view(make_set(), np.zeros((24, 32, 3), np.float32), title='a "title"')
     links = re.findall(r"(?:src|href|url)\s*[=(]\s*[\"']?(?!data:)\S+", page.html)
