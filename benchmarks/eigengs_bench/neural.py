@@ -21,7 +21,7 @@ Array = NDArray[Any]
 CODES = 9
 EPOCHS = 30
 # Theirs show all pixels under all lights in an epoch, 64 of these pairs in a step, with a rate that
-# falls when progress ends: two days of a core for 50 photos of 320 x 320.
+# falls when progress ends: for 50 photos 25 times as many pairs as here.
 SHARE = 0.5  # of the pixels, in each epoch
 LIGHTS = 4  # of each pixel, drawn anew
 BATCH = 256  # pixels of a step
