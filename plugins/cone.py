@@ -137,7 +137,7 @@ def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
 
     They follow the sensor: each rendering reads its field of view and the size of its film,
     so that a change of either changes the prefilter. A number that is written to the parameter
-    ``prefilter`` of a texture ends that.
+    ``prefilter`` of a texture ends that. Textures with ``texels`` have no prefilter.
 
     Parameters
     ----------

@@ -32,6 +32,7 @@ from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_covariance
 from eigengs_dr.relight.directions import LatLong
 
 from .color import brightness, keep_finite, shown_channels
+from .texels import neighbours
 
 RESOLVED = 0.65
 """Smallest standard deviation of a Gaussian that points resolve, in spacings of the points."""
@@ -87,6 +88,9 @@ def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
     spacing : Spacing, optional
     """
     with dr.suspend_grad():
+        if texture.drawn:
+            columns, lines, _ = _grid(texture, RESOLVED, Spacing())
+            return _survey(texture, columns, lines)
         table, size = dr.detach(texture.table), (texture.width, texture.height)
         parameters = texture.source.parameters()
         shape, color = parameters.shape, [keep_finite(c) for c in parameters.color]
@@ -102,24 +106,29 @@ def make_survey(texture: Texture, spacing: Spacing | None = None) -> Survey:
             side = max(cell_side(*size, cells.count), round(deviation))
             cells = list_cells([(shape, side)], *size, packed.radius)
             packed = Packed(cells.pack(shape, color), len(color), texture.cutoff)
-        index = dr.arange(mi.UInt32, columns * lines)
-        uv = mi.Point2f(index % columns, index // columns) + 0.5
-        light = _light_at(texture, uv * mi.Point2f(1 / columns, 1 / lines), cells, packed)
-        survey = Survey(mi.TensorXf(light, (lines, columns, 1)), dr.mean(light), dr.max(light))
-        dr.eval(survey.mean, survey.largest)
-    return survey
+        return _survey(texture, columns, lines, (cells, packed))
 
 
-def _light_at(texture: Texture, uv: mi.Point2f, cells: CellLists, packed: Packed) -> Float:
-    """Return the brightness of a texture with these Gaussians."""
-    (x, _), (y, _), _ = texture.point(uv)
-    sums = sum_at_points(cells, packed, x, y, mi.Bool(True), value_terms(packed))
-    sums = sums[texture.part] if packed.channels > texture.channels else sums
-    background = texture.table.background[texture.part]
-    seen = shown_channels(texture, [s + b for s, b in zip(sums, background, strict=True)])
-    light = brightness(texture, seen) + dr.zeros(mi.Float, dr.width(uv))
+def _survey(
+    texture: Texture, columns: int, rows: int, listed: tuple[CellLists, Packed] | None = None
+) -> Survey:
+    """Survey what texels show, or Gaussians in lists, in a grid of cells."""
+    index, everywhere = dr.arange(mi.UInt32, columns * rows), mi.Bool(True)
+    uv = mi.Point2f(index % columns, index // columns) + 0.5
+    (x, _), (y, _), _ = texture.point(uv * mi.Point2f(1 / columns, 1 / rows))
+    if listed is None:
+        seen = texture.texels.at(x, y, everywhere)
+    else:
+        cells, packed = listed
+        sums = sum_at_points(cells, packed, x, y, everywhere, value_terms(packed))
+        sums = sums[texture.part] if packed.channels > texture.channels else sums
+        background = texture.table.background[texture.part]
+        seen = shown_channels(texture, [s + b for s, b in zip(sums, background, strict=True)])
+    light = brightness(texture, seen) + dr.zeros(mi.Float, columns * rows)
     dr.eval(light)
-    return light
+    survey = Survey(mi.TensorXf(light, (rows, columns, 1)), dr.mean(light), dr.max(light))
+    dr.eval(survey.mean, survey.largest)
+    return survey
 
 
 def _smallest_deviation(shape: list, color: list) -> float:
@@ -205,8 +214,8 @@ class Emission:
         # without acceleration, and the fractions of an accelerated one have 8 bits.
         inside = active & dr.all((p >= 0) & (p <= 1))
         rows, columns = self.densities.shape
-        (left, right), along = _neighbours(p.x, columns)
-        (upper, lower), down = _neighbours(p.y, rows)
+        left, right, along = neighbours(p.x * columns, columns)
+        upper, lower, down = neighbours(p.y * rows, rows)
 
         def between(row: UInt) -> Float:
             """Return the density in a row."""
@@ -234,18 +243,6 @@ def _search(
     below = sum_of(entry - 1, active & (entry > 0))
     part = dr.maximum(sum_of(entry, active) - below, dr.smallest(mi.Float))
     return entry, dr.clip((sample - below) / part, 0, 1)
-
-
-def _neighbours(u: Float, count: int) -> tuple[tuple, Float]:
-    """Return the cells of `count` whose centres lie around u in [0, 1], and the way between them.
-
-    At the borders both are the outermost cell.
-    """
-    position = u * count - 0.5
-    below = dr.floor(position)
-    index, last = mi.Int32(below), count - 1
-    around = (mi.UInt32(dr.clip(i, 0, last)) for i in (index, index + 1))
-    return tuple(around), position - below
 
 
 def emission_of(survey: Survey, over_sphere: bool = False) -> Emission:

@@ -54,7 +54,7 @@ def gaussian_relightable() -> type:
             arrays of a model, as `eigengs_dr.plugins.material_of` writes them.
         scale : float, default: 1
             Factor of all values.
-        wrap_mode, to_uv, prefilter, memory
+        wrap_mode, to_uv, prefilter, memory, texels
             See ``gaussian_texture``.
 
         Raises

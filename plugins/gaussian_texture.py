@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eigengs_dr.backend.recording import collector_off, guest
-from eigengs_dr.backend.types import Float, Mask
+from eigengs_dr.backend.types import Bool, Float, Mask
 from eigengs_dr.raster.lookup.points import fold, gradient_terms, near_image, sum_at_points
 
 from . import properties
@@ -70,6 +70,9 @@ def gaussian_texture() -> type:
         memory : string, default: normal, of arrays exact
             ``normal``: a Gaussian takes 16 bytes until a parameter changes; ``small``: also lists
             of larger cells; ``exact``: floats.
+        texels : integer, default: 0
+            Texels along the longer side, into which the texture draws itself at every change, and
+            which lookups read, without `prefilter` and `memory`; 0: lookups sum Gaussians.
         """
 
         transform_name, others = "to_uv", frozenset({"to_uv", "prefilter"})
@@ -79,6 +82,9 @@ def gaussian_texture() -> type:
             super().__init__(props)
             self.read(props, properties.wrap_mode(props), properties.raw(props))
             self.to_uv = properties.to_uv(props)
+            self.drawn = properties.texels(props, self.source.start)
+            if self.drawn:
+                self.width, self.height = self.drawn
             properties.check_known(props)
             self.parameters_changed([])
 
@@ -134,20 +140,21 @@ def gaussian_texture() -> type:
                     "channels"
                 )
             (x, sx), (y, sy), inside = self.point(si.uv)
-            packed = self.table.packed
-            cells, terms, count = (
-                self.table.lists.cells,
-                gradient_terms(packed),
-                3 * packed.channels,
-            )
-            sums = sum_at_points(cells, packed, x, y, inside & active, terms, count)
-            values, along, down = (sums[k::3][self.part] for k in range(3))
-            background = self.table.background[self.part]
-            slope = [slope_of(self, v + b) for v, b in zip(values, background, strict=True)]
-            du = luminance([s * k for s, k in zip(slope, along, strict=True)]) * sx * self.width
-            dv = luminance([s * k for s, k in zip(slope, down, strict=True)]) * sy * self.height
+            slopes = self.texels.slopes if self.drawn else self._slopes
+            along, down = slopes(x, y, inside & active)
+            du, dv = luminance(along) * sx * self.width, luminance(down) * sy * self.height
             m = self.transform.matrix
             return mi.Vector2f(m[0, 0] * du + m[1, 0] * dv, m[0, 1] * du + m[1, 1] * dv)
+
+        def _slopes(self, x: Float, y: Float, active: Bool) -> list[list]:
+            """Return the derivatives of all channels by x, and by y."""
+            cells, packed = self.table.lists.cells, self.table.packed
+            terms = gradient_terms(packed)
+            sums = sum_at_points(cells, packed, x, y, active, terms, 3 * packed.channels)
+            values, *derivatives = (sums[k::3][self.part] for k in range(3))
+            background = self.table.background[self.part]
+            slope = [slope_of(self, v + b) for v, b in zip(values, background, strict=True)]
+            return [[s * k for s, k in zip(slope, ks, strict=True)] for ks in derivatives]
 
         def _color(self, si: mi.SurfaceInteraction3f, active: Mask) -> list:
             """Look up the channels of a colour, a number or a normal."""
@@ -159,11 +166,16 @@ def gaussian_texture() -> type:
 
         def values(self, si: mi.SurfaceInteraction3f, active: Mask) -> list:
             """Look up all channels, decoded and clamped unless `raw`; 0 where uv is not finite."""
+            (x, _), (y, _), inside = self.point(si.uv)
+            seen = inside & active
+            channels = self.texels.at(x, y, seen) if self.drawn else self.display(self._sums(si))
+            return [dr.select(seen, c, 0) for c in channels]
+
+        def _sums(self, si: mi.SurfaceInteraction3f) -> list:
+            """Return the sums of all channels of the table, perhaps those of an earlier lookup."""
             where = (self.wrap, self.angle, id(self.sensor), *np.array(self.to_uv.matrix).flat)
             inputs = ("uv", *(FOOTPRINT_INPUTS if self.filtered() else ()))
-            sums = reused(self.table, where, si, inputs, lambda: self._look_up(si))
-            _, _, inside = self.point(si.uv)
-            return [dr.select(inside & active, s, 0) for s in self.display(sums)]
+            return reused(self.table, where, si, inputs, lambda: self._look_up(si))
 
         def _look_up(self, si: mi.SurfaceInteraction3f) -> list:
             """Sum all channels of the table, in all lanes."""
@@ -261,6 +273,7 @@ def gaussian_texture() -> type:
                 f"  space = {self.space},\n  raw = {int(self.raw)},\n"
                 f"  wrap_mode = {self.wrap},\n  prefilter = {self.prefilter_name()},\n"
                 f"  cutoff = {self.cutoff:g},\n  memory = {self.memory.name},\n"
+                f"  texels = {max(self.drawn or (0,))},\n"
                 f"  resident_bytes = {resident_bytes(self)},\n"
                 f"  transform = {transform}\n]"
             )

@@ -37,7 +37,7 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     gaussians : Gaussians or Fit
     **properties
         Other properties of the texture: ``wrap_mode``, ``to_uv``, ``raw``, ``prefilter``,
-        ``cutoff``, ``memory``. None stands for the default.
+        ``cutoff``, ``memory``, ``texels``. None stands for the default.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def material_of(model: Relightable, **properties: object) -> Record:
         The dictionary for `mitsuba.load_dict` holds it: no file is needed.
     **properties
         Other properties of the material: ``scale``, ``wrap_mode``, ``to_uv``, ``prefilter``,
-        ``memory``. None stands for the default.
+        ``memory``, ``texels``. None stands for the default.
 
     Returns
     -------

@@ -35,7 +35,7 @@ FILES = ("filename", "model", "planes")
 """Properties that name the file of the Gaussians."""
 
 PLANES = (*FIELDS, "width", "height", "space", "cutoff")
-PLANES += ("wrap_mode", "to_uv", "prefilter", "memory")
+PLANES += ("wrap_mode", "to_uv", "prefilter", "memory", "texels")
 """Properties of a ``gaussian_relightable`` that are those of the texture of its planes."""
 
 UP = (0.0, 0.0, 1.0)
@@ -56,6 +56,14 @@ def _read(props: mi.Properties, key: str, default: object, kind: type, must: str
     if isinstance(value, bool) != (kind is bool) or not isinstance(value, allowed):
         raise _mistake(props, key, value, must)
     return kind(value)
+
+
+def _count(props: mi.Properties, key: str, things: str) -> int:
+    """Read a number of things, by default 0."""
+    value = int(_read(props, key, 0, int, f"a number of {things}"))
+    if value < 0:
+        raise _mistake(props, key, value, f"a number of {things}")
+    return value
 
 
 def source_of(props: mi.Properties) -> Source:
@@ -92,9 +100,7 @@ def source_of(props: mi.Properties) -> Source:
         shared = shared_file(path(props, "planes"), backend, None, memory(props).coded, read_planes)
         return FileSource(shared, None)
     if given[0] == "filename":
-        first = _read(props, "first", 0, int, "a number of Gaussians")
-        if first < 0:
-            raise _mistake(props, "first", first, "a number of Gaussians")
+        first = _count(props, "first", "Gaussians")
         name = _read(props, "map", "", str, "the name of a map")
         file = path(props, "filename")
         if Path(file).suffix.lower() in SUFFIXES:
@@ -213,6 +219,23 @@ def prefilter(props: mi.Properties) -> tuple[float, bool]:
         return 0.0, True
     value = _read(props, "prefilter", 0.0, float, "true, or the angle of a pixel in radians")
     return check_angle(value, props.plugin_name()), False
+
+
+def texels(props: mi.Properties, start: Gaussians) -> tuple[int, int] | None:
+    """Read ``texels``: columns and rows of texels for the picture of a set, or None.
+
+    Raises
+    ------
+    ValueError
+        If it is not a number, or `prefilter` or `memory` is given too, which texels lack.
+    """
+    longer = _count(props, "texels", "texels")
+    if not longer:
+        return None
+    if others := [key for key in ("prefilter", "memory") if props.get(key, False)]:
+        raise ValueError(f"{props.plugin_name()}: texels have no {others[0]}; give one of them")
+    scale = longer / max(start.width, start.height)
+    return max(1, round(scale * start.width)), max(1, round(scale * start.height))
 
 
 def light_scale(props: mi.Properties) -> float:

@@ -25,6 +25,7 @@ from .cone import current_angle
 from .emission import Emission
 from .lookup import list_gaussians, make_table, sum_over_footprint
 from .sources import SHAPES
+from .texels import draw_texels
 
 
 def plugin_of_sums(base: type) -> Any:
@@ -45,10 +46,13 @@ def plugin_of_sums(base: type) -> Any:
             Parameter that places the picture.
         others : set of str
             Parameters on which lists and sums do not depend.
+        drawn : (int, int) or None
+            Columns and rows of texels, which lookups read instead of Gaussians.
         """
 
         transform_name: str
         others: frozenset[str]
+        drawn: tuple[int, int] | None = None
 
         def read(self, props: mi.Properties, wrap: str, raw: bool) -> None:
             """Read the properties that all plugins have; `wrap` continues the picture."""
@@ -76,6 +80,8 @@ def plugin_of_sums(base: type) -> Any:
                 callback.put(name, tensor, mi.ParamFlags.Differentiable)
             name = self.transform_name
             callback.put(name, getattr(self, name), mi.ParamFlags.NonDifferentiable)
+            if self.drawn:
+                return
             if self.sensor is not None:
                 self.prefilter = current_angle(self.sensor)
             callback.put("prefilter", self.prefilter, mi.ParamFlags.NonDifferentiable)
@@ -90,6 +96,9 @@ def plugin_of_sums(base: type) -> Any:
 
         def _take_over(self, moved: bool) -> None:
             """Take over the Gaussians; with new lists if they have moved."""
+            if self.drawn:
+                self.texels = draw_texels(self)
+                return
             source, size = self.source, (self.width, self.height)
             settings = self.cutoff, self.wrap, self.filtered(), self.memory
             if shared := source.shared_table(*settings):
@@ -112,6 +121,8 @@ def plugin_of_sums(base: type) -> Any:
         def follow(self, sensor: mi.Sensor) -> None:
             """Take footprints of the pixels of a sensor from now on, see `follow`."""
             current_angle(sensor)  # it raises where there is none
+            if self.drawn:
+                return
             filtered, self.sensor = self.filtered(), sensor
             if not filtered:
                 self._take_over(True)

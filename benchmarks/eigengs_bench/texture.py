@@ -38,7 +38,7 @@ def run(task: Task, parts: Sequence[str] = TEXTURE_PARTS) -> list[Row]:
     `ratio_N` is rendering with N Gaussians over rendering with a bitmap, `ratio_filtered_N` with
     the prefilter, `ratio_step` picture and gradient of all
     parameters by `prb`, `ratio_step_filtered` these with the prefilter, and `ratio_step_drawn`
-    these by a bitmap that `eg.render` draws in each step. Each scene has a process of its own, as
+    these with `texels`. Each scene has a process of its own, as
     beside others Mitsuba takes longer.
     `bytes_N` is what a texture holds in memory, `held_N` that over the arrays of its file.
     For the other rows see `eigengs_bench.alike`.
@@ -190,7 +190,7 @@ def measure(variant: str, progress: Callable[..., None] = lambda *_: None) -> Ro
         ends = {"bitmap": "bitmap", "gaussians": f"gaussians_{SETTLED}"}
         ends["filtered"] = f"filtered_{SETTLED}"
         makers |= {f"step_{n}": partial(makers[end], by_step=True) for n, end in ends.items()}
-        makers["step_drawn"] = partial(_drawn_step, variant, SIDE, SPP, files[SETTLED])
+        makers["step_drawn"] = partial(shown, files[SETTLED], drawn=TEXELS, by_step=True)
         timed = interleaved_apart(makers, WARM_UP, ROUNDS, partial(progress, "pictures"))
     return {
         **hold(mi, progress),
@@ -210,6 +210,7 @@ def _picture(
     path: Path,
     texels: int = 0,
     prefilter: float = 0.0,
+    drawn: int = 0,
     by_step: bool = False,
 ) -> Callable[[], Any]:
     """Return what renders the ball with a set, or with a bitmap of it; or what differentiates it.
@@ -217,36 +218,14 @@ def _picture(
     It runs in a process of its own, see `interleaved_apart`.
     """
     mi = load_mitsuba(variant, quiet=False)
-    texture = {"type": "gaussian_texture", "filename": str(path), "prefilter": prefilter}
+    texture: Row = {"type": "gaussian_texture", "filename": str(path), "texels": drawn}
+    texture["prefilter"] = prefilter
     if texels:
         coded = np.clip(eg.picture_of(eg.Gaussians.load(path), texels, texels), 0, 1)
         data = mi.TensorXf(to_linear(coded).astype(np.float32))
         texture = {"type": "bitmap", "data": data, "raw": True}
     scene = _shown(mi, texture, side, samples)
     return _step(mi, scene) if by_step else partial(mi.render, scene)
-
-
-def _drawn_step(variant: str, side: int, samples: int, path: Path) -> Callable[[], Any]:
-    """Return what differentiates the ball by a set that is drawn into its bitmap.
-
-    It runs in a process of its own, see `interleaved_apart`.
-    """
-    mi = load_mitsuba(variant, quiet=False)
-    blank = {"type": "bitmap", "data": dr.zeros(mi.TensorXf, (TEXELS, TEXELS, 3)), "raw": True}
-    scene = _shown(mi, blank, side, samples)
-    gaussians, parameters = eg.Gaussians.load(path), mi.traverse(scene)
-    integrator = mi.load_dict({"type": "prb", "max_depth": 5})
-    (data,) = (name for name, _ in parameters if name.endswith("base_color.data"))
-
-    def step() -> Any:
-        moving = gaussians.mean, gaussians.factor, gaussians.color
-        dr.enable_grad(moving)
-        parameters[data] = to_linear(eg.render(gaussians, TEXELS, TEXELS))
-        parameters.update()
-        dr.backward(dr.mean(mi.render(scene, parameters, integrator=integrator), axis=None))
-        return dr.grad(moving)
-
-    return step
 
 
 def _shown(mi: Any, texture: dict[str, Any], side: int, samples: int) -> Any:

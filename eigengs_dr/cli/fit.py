@@ -44,8 +44,19 @@ PRESETS = ("default", "gaussianimage", "eigengs")
 DEFAULT_BASIS = "natural"
 """Name of the model from which the preset "eigengs" starts by default."""
 
-EXCLUDED_BY_MAPS = ("basis", "start", "space", "blocks", "cluster", "recursive")
-"""Options that cannot be combined with maps."""
+EXCLUDED_OPTIONS = (
+    ("images", "maps", "name all images: --map NAME=FILE"),
+    ("basis", "maps", "a model is for one image"),
+    ("blocks cluster recursive", "maps", "maps are fitted together, as one image"),
+    ("init start", "basis", "a model, as of --preset eigengs, has Gaussians of its own"),
+    ("init", "start", "a start has Gaussians of its own"),
+    ("target_psnr", "start basis", "the Gaussians of a search are placed anew"),
+    ("levels", "basis", "the Gaussians of levels are placed anew"),
+    ("init basis start", "blocks", "the Gaussians of blocks have a placement of their own"),
+    ("preset target_psnr levels", "blocks", "blocks are fitted by the default method"),
+    ("preview", "blocks cluster", "a preview needs the fit in this process"),
+)
+"""Options that exclude each other, besides those of `eigengs_dr.fitting.options.EXCLUSIONS`."""
 
 
 @click.command()
@@ -120,19 +131,16 @@ def fit(
       eigengs-dr fit sky.exr -o sky.npz --space log --gaussians 20000
       eigengs-dr fit --map albedo=a.jpg --map roughness=r.jpg --map normal=n.jpg -o bark.npz
     """
+    _check_options(run.context)
     recursive = choices["recursive"]
-    if maps:
-        _check_maps(run.context, images, output)
-    elif not images:
-        raise click.UsageError("no image is given; give image files, or maps with --map")
     files = [m.path for m in maps.values()]
     files = files or [file for given in images for file in _expand(given, recursive)]
     settings = _settings(choices, basis, run.backend)
     several = not maps and (len(files) > 1 or files != list(images))
     if recursive and files == list(images):
         raise ValueError("--recursive takes a folder of images")
-    if run.cluster and (preview or not (several or blocks)):
-        raise ValueError("--cluster takes several images, or --blocks, and no --preview")
+    if run.cluster and not (several or blocks):
+        raise ValueError("--cluster takes several images, or --blocks")
     inputs = files if several else files[:1]
     outputs = name_outputs(inputs, output, [".npz"], several)
     pictures = name_pictures(inputs, preview, several)
@@ -141,26 +149,21 @@ def fit(
         raise ValueError("--blocks fits one image; run the command for each image")
     if not several:
         check_replaceable(outputs[0], bool(maps))
-    has_blocks = _has_blocks(settings, preview)
     if not (several or maps or blocks):
         from .memory import check_memory
 
-        line = check_memory(files[0], settings, has_blocks)
+        line = check_memory(files[0], settings, not _conflict(run.context, blocks=1))
         if line and not run.quiet:
             print_message(line)
-    if blocks and not has_blocks:
-        raise ValueError(
-            "--blocks needs the default preset and init; leave out --basis, --start, "
-            "--target-psnr, --levels and --preview"
-        )
     if not run.cluster:
         select(run.backend)
     if settings.method.needs_model:
         print_message("note: the file holds only the Gaussians; the mean image stays in the basis")
     with open_cluster(run.cluster) as client, bar(run.quiet) as show:
         if several:
-            given = _given_options(run.context, settings) | {"overwrite": overwrite}
-            records, lines = _fit_several(show, files, outputs, pictures, settings, given, client)
+            records, lines = _fit_several(
+                show, files, outputs, pictures, settings, overwrite, client
+            )
         elif blocks:
             records, lines = _fit_by_blocks(show, files[0], outputs[0], settings, blocks, client)
         else:
@@ -175,18 +178,32 @@ def fit(
     run.context.exit(_exit_code(records, len(inputs), settings))
 
 
-def _check_maps(context: click.Context, images: Sequence[Path], output: Path | None) -> None:
-    """Reject images and options that cannot be combined with maps."""
-    if images:
-        raise ValueError(f"{images[0]}: the image has no name; with --map, name all images")
-    default = click.core.ParameterSource.DEFAULT
-    for name in EXCLUDED_BY_MAPS:
-        if context.get_parameter_source(name) is not default:
-            raise ValueError(
-                f"--{name} and --map exclude each other; --map NAME:SPACE=FILE sets a space"
-            )
-    if output is None:
+def _check_options(context: click.Context) -> None:
+    """Raise ValueError if options exclude each other, or one lacks another."""
+    if conflict := _conflict(context):
+        raise ValueError(conflict)
+    given = context.params
+    if not (given["images"] or given["maps"]):
+        raise click.UsageError("no image is given; give image files, or maps with --map")
+    if given["maps"] and given["output"] is None:
         raise ValueError("--map needs -o, the .npz file to write")
+    if given["keep"] and given["start"] is None:
+        raise ValueError("--keep is for the Gaussians of --start; give both")
+    has_limits = given["max_gaussians"] is not None or given["target_space"]
+    if has_limits and given["target_psnr"] is None:
+        raise ValueError("--max-gaussians and --target-space need --target-psnr")
+
+
+def _conflict(context: click.Context, **more: object) -> str | None:
+    """Return why options that are given, and more of them, exclude each other; or None."""
+    from ..fitting.options import EXCLUSIONS, conflict_in
+
+    source, default = context.get_parameter_source, click.core.ParameterSource.DEFAULT
+    given = {name: value for name, value in context.params.items() if source(name) != default}
+    if given.get("preset") == "eigengs":
+        more["basis"] = DEFAULT_BASIS
+    labels = {str(p.name): p.opts[-1] for p in context.command.params}
+    return conflict_in(given | more, EXCLUSIONS + EXCLUDED_OPTIONS, labels.__getitem__)
 
 
 def _settings(choices: dict[str, Any], basis: str | None, backend: str | None) -> FitOptions:
@@ -198,32 +215,18 @@ def _settings(choices: dict[str, Any], basis: str | None, backend: str | None) -
     method = _method(choices["preset"], choices["init"])
     if basis is not None or method.needs_model:
         start = eg.EigenGS.load(basis or DEFAULT_BASIS, backend)
-    if start is not None and (choices["init"] or choices["start"]):
-        name = "--start" if choices["start"] else "--init"
-        raise ValueError(f"{name} and --basis, or a preset that has one, exclude each other")
-    if choices["keep"] and choices["start"] is None:
-        raise ValueError("--keep is for the Gaussians of --start; give both")
     if choices["start"] is not None:
         start = eg.Gaussians.load(choices["start"], backend)
         method = method.without("redistribute") if choices["keep"] else method
     target, count, levels = (choices[name] for name in ("target_psnr", "gaussians", "levels"))
-    goal = None
-    if target is not None and count is not None:
-        raise ValueError(
-            "--gaussians and --target-psnr exclude each other; --max-gaussians limits a search"
-        )
     if target is not None:
-        goal = eg.Goal(target, choices["target_space"] or "rgb", choices["max_gaussians"])
-    elif choices["max_gaussians"] is not None or choices["target_space"]:
-        raise ValueError("--max-gaussians and --target-space need --target-psnr")
-    if goal and levels is not None:
-        raise ValueError("--levels and --target-psnr exclude each other; give one of them")
+        target = eg.Goal(target, choices["target_space"] or "rgb", choices["max_gaussians"])
     if isinstance(levels, tuple):
         count, levels = tuple(eg.level_counts(count or levels[-1], levels)), None
     return FitOptions(
         gaussians=count,
         iterations=choices["iterations"],
-        target_psnr=goal,
+        target_psnr=target,
         start=start,
         space=choices["space"] or (set_in(start).space if start else None),
         method=method,
@@ -294,14 +297,14 @@ def _fit_at_once(
 def load_images(source: Path | dict[str, MapFile], space: str, encoding: str | None) -> Any:
     """Read an image, or the images of maps by name; grey data keeps one channel."""
     from ..gaussian.channels import usual_space
-    from ..image.io import read_file
+    from ..image.io import read_floats
 
     if isinstance(source, dict):
         return {
             name: load_images(m.path, m.space or usual_space(name), encoding)
             for name, m in source.items()
         }
-    return read_file(source, not space_of(space).is_color, encoding)
+    return read_floats(source, not space_of(space).is_color, encoding)
 
 
 UNREPORTED = ("gaussians", "image", "mean_image", "maps", "source", "resumed")
@@ -430,7 +433,7 @@ def _fit_several(
     outputs: list[Path],
     pictures: Sequence[Path | None],
     settings: FitOptions,
-    given: Record,
+    overwrite: bool,
     client: Any,
 ) -> Fitted:
     """Fit images into a folder, and report failures at once."""
@@ -452,8 +455,11 @@ def _fit_several(
                 eg.save_image(picture, compared)
         show(folder.name, done, total, row)
 
+    choices = {name: value for name, value in vars(settings).items() if name != "loss"}
     try:
-        rows = eg.fit_many(files, folder, progress=note, client=client, **given)
+        rows = eg.fit_many(
+            files, folder, overwrite=overwrite, progress=note, client=client, **choices
+        )
     except eg.Interrupted as stop:
         rows = stop.result
         done = f"{len(rows)} of {len(files)} images are done"
@@ -476,28 +482,6 @@ def _compared(row: eg.ImageRow, settings: FitOptions) -> Any:
     if image.pixels.shape[:2] != (gaussians.height, gaussians.width):
         raise ValueError(f"{row.output} is of an image of {gaussians.width}x{gaussians.height}")
     return _comparison(image, gaussians, eg.picture_of(gaussians))
-
-
-def _given_options(context: click.Context, settings: FitOptions) -> dict[str, Any]:
-    """Return the fields of `FitOptions` that were set on the command line."""
-    default = click.core.ParameterSource.DEFAULT
-    given = [n for n in context.params if context.get_parameter_source(n) is not default]
-    names = {FIELD_OF_OPTION.get(name, name) for name in given}
-    if "levels" in names:
-        names.add("gaussians")
-    if settings.start is not None:
-        names.add("start")
-    return {name: value for name, value in vars(settings).items() if name in names}
-
-
-FIELD_OF_OPTION = {
-    "init": "method",
-    "keep": "method",
-    "preset": "method",
-    "target_space": "target_psnr",
-    "max_gaussians": "target_psnr",
-}
-"""Field of `FitOptions` for options of the command line that have another name."""
 
 
 def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space: str) -> list[str]:
@@ -524,12 +508,6 @@ def _summary_of_all(rows: list[eg.ImageRow], folder: Path, seconds: float, space
 # ---------------------------------------------------------------------------------------------
 #  A large image by blocks
 # ---------------------------------------------------------------------------------------------
-
-
-def _has_blocks(settings: FitOptions, preview: Path | None) -> bool:
-    """Return whether a fit by blocks supports these options."""
-    default = settings.method == eg.DEFAULT and settings.start is None
-    return default and settings.goal is None and not settings.has_levels and preview is None
 
 
 def _fit_by_blocks(

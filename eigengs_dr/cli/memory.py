@@ -56,12 +56,10 @@ def estimate_memory(width: int, height: int, channels: int, gaussians: int) -> i
         reach.
     """
     pixels = width * height
-    surplus = Surplus()
-    with_surplus = min((1 + surplus.share) * gaussians, surplus.max_density * pixels)
     return round(
         BASE_BYTES
         + pixels * (BYTES_PER_PIXEL + channels * BYTES_PER_VALUE)
-        + max(gaussians, with_surplus) * BYTES_PER_GAUSSIAN
+        + Surplus().most(gaussians, pixels) * BYTES_PER_GAUSSIAN
     )
 
 

@@ -46,6 +46,9 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
 @options.value(
     "--lights", "DIRS.lp", options.EXISTING, "The photos show one object under these lights."
 )
+@options.value(
+    "--max-psnr-drop", "DB", float, "Loss of left-out --lights for fewer Gaussians.  [default: 0.4]"
+)
 @options.shared("cluster", "backend", "report", "quiet")
 def train(
     run: options.Run,
@@ -65,9 +68,9 @@ def train(
 
     With --lights, the folder holds photos of one object from one camera; the list names each photo
     and the direction of its light. 'eigengs-dr render' shows the object under any light.
-    Then --components counts planes, by default as many as left-out lights need; the defaults are a
-    Gaussian per 16 pixels and 300 steps; and nothing resumes. If FOLDER holds one list (.lp), it is
-    taken without --lights, which a note says; PATTERN trains a family.
+    Then --components counts planes; by default, planes and Gaussians are as few as --max-psnr-drop
+    allows, with 300 steps; and nothing resumes. If FOLDER holds one list (.lp), it is taken without
+    --lights, which a note says; PATTERN trains a family.
 
     \b
     Examples:
@@ -80,6 +83,8 @@ def train(
     lights = lights or _find_lights(run, folder)
     if lights is not None:
         return _train_on_lights(run, folder, output, lights, preview, choices)
+    if choices.pop("max_psnr_drop") is not None:
+        raise click.UsageError("--max-psnr-drop needs --lights; leave it out")
     from ..backend.interrupts import Interrupted
     from ..eigenbasis.components import TrainOptions
     from ..eigenbasis.training import train_model
@@ -205,6 +210,7 @@ def _train_on_lights(
                 directions,
                 gaussians=choices["gaussians"],
                 planes=planes,
+                max_psnr_drop=choices["max_psnr_drop"],
                 seed=choices["seed"],
                 encoding=choices["encoding"],
                 backend=run.backend,

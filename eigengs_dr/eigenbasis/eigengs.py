@@ -309,7 +309,7 @@ class EigenGS:
         options = {"colors": colors, "mean": mean, "target_psnr": target_psnr, "encoding": encoding}
         options |= {"model": fingerprint(self)}
         read, has_picture = partial(_read, encoding=encoding), mean != "dense"
-        job = Job(work, None, read, 0, digest(options), has_picture)
+        job = Job(work, read, None, 0, digest(options), has_picture)
         return run_images(images, output, overwrite, job, progress, client)
 
     def _colored(self, columns: Doubles, size: tuple[int, int] | None) -> Gaussians:
@@ -369,9 +369,8 @@ def _encode_all(
 
 
 def _read(image: Any, name: str, encoding: str | None) -> EncodedImage:
-    """Read an image. An array is copied, because its owner may overwrite it."""
-    pixels = check_member(image, encoding, f"image {name}")
-    return EncodedImage(pixels if isinstance(image, Path | str) else pixels.copy(), "srgb")
+    """Read an image of a family."""
+    return EncodedImage(check_member(image, encoding, f"image {name}"), "srgb")
 
 
 def check_coding(colors: str, mean: str, target_psnr: float | None) -> None:

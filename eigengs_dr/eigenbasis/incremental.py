@@ -12,7 +12,6 @@ that a large family fits into 1 GB of memory.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
@@ -24,11 +23,10 @@ import numpy as np
 from scipy.linalg import eigh
 from threadpoolctl import threadpool_limits
 
-from ..backend.messages import warn
 from ..backend.types import Doubles, Singles, Values
 from ..cluster import completed, executor_for
 from ..image.folder import ReadProgress, TrainingImages, list_images, read_blocks
-from ..image.notes import NotedImages, kept_notes, tell_all
+from ..image.notes import NotedImages, kept_warnings, tell, tell_all
 from ..image.pixels import ImageError, local_path
 from ..storage.checkpoint import read_arrays, write_arrays
 from ..storage.memory import check_usable
@@ -358,10 +356,8 @@ def _merge_shards(images: Images, stream: Stream, client: object, folder: Path) 
     )
     waiting: dict[int, list[EigenState]] = {}
     with closing(completed(executor_for(client), make_shard, tasks, stream)) as ended:
-        for (k, part), (states, noted, notes) in ended:
+        for (k, part), (states, noted) in ended:
             tell_all(noted)
-            for note in notes:
-                warn(note)
             waiting[k] = states
             done += len(part)
             if client is not None:
@@ -382,25 +378,21 @@ def _merge_shards(images: Images, stream: Stream, client: object, folder: Path) 
     return result
 
 
-def make_shard(
-    task: tuple[int, Images], stream: Stream
-) -> tuple[list[EigenState], NotedImages, list[str]]:
-    """Compute the states of a shard, and return notes and other warnings; this runs on a worker.
+def make_shard(task: tuple[int, Images], stream: Stream) -> tuple[list[EigenState], NotedImages]:
+    """Compute the states of a shard, and return the warnings; this runs on a worker.
 
     If no file of a shard can be read, its states are empty; an invalid array is an error.
     """
     _, images = task
-    notes = []
-    with kept_notes() as noted, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
+    with kept_warnings() as noted:
         try:
             states = _find_states_of_part(images, stream)
         except ImageError as error:
             if not isinstance(images, Sequence):
                 raise
             states = [empty_state(stream.size) for _ in stream.ranks]
-            notes.append(str(error))
-    return states, noted, notes + [str(note.message) for note in caught]
+            tell("", str(error))
+    return states, noted
 
 
 def _find_states_of_part(images: Images, stream: Stream) -> list[EigenState]:

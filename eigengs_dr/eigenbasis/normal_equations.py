@@ -22,7 +22,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from ..backend.arrays import types_of, upload
 from ..backend.types import Doubles, Singles
 from ..gaussian.gaussians import Gaussians
-from ..image.strips import available_cores
+from ..image.pixels import available_cores
 from ..raster.evaluate import weights
 from ..raster.parameters import (
     NUM_SHAPE_PARAMS,

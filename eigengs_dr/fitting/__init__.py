@@ -11,5 +11,5 @@
 - ``place``: where Gaussians start; ``solve``: their colours by linear least squares
 - ``search``: the smallest number of Gaussians for a goal
 - ``coarse``, ``from_loss``: a fit without an image, by texels
-- ``measure``: PSNRs of a set
+- ``channels``: what the channels of a set should show, and the PSNRs of what they do
 """

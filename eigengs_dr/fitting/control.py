@@ -11,6 +11,7 @@ They say when and how often; what they do is in `eigengs_dr.fitting.exchange` an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Protocol, TypeAlias, runtime_checkable
@@ -54,6 +55,29 @@ class Control(Protocol):
         All random numbers depend on `key` and `step`. A control that changes how many Gaussians the
         result has sets the `count` of the state too.
         """
+
+
+def act(
+    control: Control, state: State, objective: Pixels, step: int, iterations: int, key: int
+) -> State:
+    """Return what a control returns, if its numbers of Gaussians agree.
+
+    Raises
+    ------
+    TypeError
+        If it is no state.
+    ValueError
+        If the set has fewer Gaussians than the state says, or more without a surplus.
+    """
+    state = control(state, objective, step, iterations, key)
+    if not isinstance(state, State):
+        raise TypeError(f"{control!r} returned {state!r}; a control returns the state")
+    if not state.count <= state.total <= state.most:
+        raise ValueError(
+            f"{control!r} left {state.total} Gaussians, but the count of the state is "
+            f"{state.count}; return replace(state.replaced(gaussians), count={state.total})"
+        )
+    return state
 
 
 def phase_of(control: Control) -> Phase | None:
@@ -137,12 +161,15 @@ class Surplus:
         self, state: State, objective: Pixels, step: int, iterations: int, key: int
     ) -> State:
         """Return the state with the surplus that a redistribution may place."""
-        count, (width, height) = state.count, objective.size
         none, whole = SURPLUS_ROUNDS if objective.model.curvature is None else (0, FULL_ROUNDS)
         strength = (len(round_steps(self.every, iterations)) - none) / (whole - none)
-        most = int(self.max_density * width * height) - count
-        share = self.share * min(1, strength)
-        return replace(state, surplus=max(0, min(int(share * count), most)))
+        most = self.most(state.count, math.prod(objective.size), min(1, strength))
+        return replace(state, surplus=most - state.count)
+
+    def most(self, count: int, pixels: int, strength: float = 1.0) -> int:
+        """Return the largest number of Gaussians of a descent that shall end with `count`."""
+        with_surplus = count + int(self.share * strength * count)
+        return max(count, min(with_surplus, int(self.max_density * pixels)))
 
 
 @dataclass(frozen=True)
@@ -192,10 +219,10 @@ class Redistribute:
         """Return the state with a new set and its surplus."""
         if objective.levels or objective.part:
             return state
-        current, count = dr.detach(state.gaussians), state.count + state.surplus
-        placed = redistribute(current, objective, count, self.solve_steps, key)
+        current = dr.detach(state.gaussians)
+        placed = redistribute(current, objective, state.most, self.solve_steps, key)
         if state.chosen:
-            placed, _ = merged(current, placed, objective, count, MAX_ERROR, self.solve_steps)
+            placed, _ = merged(current, placed, objective, state.most, MAX_ERROR, self.solve_steps)
         return state.replaced(placed)
 
 

@@ -20,7 +20,7 @@ from ..backend.types import Bool, Float, UInt
 from ..gaussian.gaussians import Gaussians, broadcast_rows, concatenate, take
 from ..raster.kernels import channel_sums
 from ..raster.lists import TileLists
-from ..raster.parameters import detached_shape
+from ..raster.parameters import detached_shape, pack_parameters
 from ..raster.render import bin_gaussians, to_tiles
 from ..raster.tiles import Grid
 from .objective import Part, Pixels, Quadratic
@@ -67,7 +67,8 @@ class _Comparison:
 
     def slope(self, colors: Unknowns) -> tuple[Float, list]:
         """Return ``h (p - t)`` for some colours, and the sums of ``h (p - t)^2`` by channels."""
-        return apply(self.shape, colors, self.lists, self.cutoff, self.model)
+        packed = pack_parameters([*self.shape, *colors[0]])
+        return apply(packed, colors[1], self.lists, self.cutoff, self.model)
 
     def weigh(self, slope: Float) -> tuple[Float, Unknowns]:
         """Return the removal costs of a set with a known slope, see `removal_cost`.
@@ -77,7 +78,8 @@ class _Comparison:
         color, channels = self.colors[0], len(self.colors[0])
         factors = self.model.curvatures(self.lists.grid)
         dr.eval(factors, slope)
-        along, diagonal = weigh(self.shape, slope, channels, self.lists, self.cutoff, factors)
+        packed = pack_parameters([*self.shape, *color])
+        along, diagonal = weigh(packed, slope, channels, self.lists, self.cutoff, factors)
         squares = for_channels(diagonal[0], channels)
         cost = sum(c * (c * s - 2 * a) for c, s, a in zip(color, squares, along, strict=True))
         return cost, diagonal

@@ -21,12 +21,12 @@ from ..gaussian.gaussians import Gaussians, notebook_html
 from ..image.pixels import check_weight
 from ..image.space import space_of
 from ..raster.render import picture_of
+from .channels import Row
 from .coarse import COARSE_TO_FINE
 from .exchange import sort_levels
 from .from_loss import fit_loss
 from .loop import Descent, FitProgress, Refinement, refine, sets_of
 from .loss import Loss, LossFunction
-from .measure import Row
 from .method import DEFAULT, Method, Model
 from .objective import Objective, Pixels
 from .options import FitOptions, Goal, Start, named_options

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ..backend.types import Float
 from ..gaussian.gaussians import Gaussians
 from ..raster.render import to_tensor
+from .channels import Measured, Row
 from .coarse import Coarse, texel_sums
 from .loop import Descent, FitProgress, Refinement, descend, last, refine
 from .loss import PictureLoss
-from .measure import Measured, Row
 from .method import DEFAULT
 from .objective import Objective, Pixels
 from .place import Adaptive

@@ -13,9 +13,9 @@ from ..backend.arrays import types_of
 from ..backend.recording import freeze_program, release_later
 from ..gaussian.gaussians import Gaussians, like
 from ..image.metrics import MAX_PSNR
-from .control import Control
+from .channels import Measured, Row
+from .control import act
 from .exchange import prune
-from .measure import Measured, Row
 from .method import Method, Schedule
 from .objective import Objective
 from .state import State
@@ -62,7 +62,7 @@ def descend(
             acting = [control for control, steps in acts if step in steps]
             near = objective.near(state.gaussians) if acting else image
             for control in acting:
-                state = _checked(control(state, near, step, iterations, key), control)
+                state = act(control, state, near, step, iterations, key)
             if state.moving is None:
                 state = started(state, method, step, image.grid.images)
             if not state.lists or step >= state.until:
@@ -82,26 +82,6 @@ def descend(
             )
             state = replace(state, moving=moving, gaussians=moved, squares=None)
             yield state
-
-
-def _checked(state: State, control: Control) -> State:
-    """Return what a control returned, if its numbers of Gaussians agree.
-
-    Raises
-    ------
-    TypeError
-        If it is no state.
-    ValueError
-        If the set has fewer Gaussians than the state says, or more without a surplus.
-    """
-    if not isinstance(state, State):
-        raise TypeError(f"{control!r} returned {state!r}; a control returns the state")
-    if not state.count <= state.total <= state.count + state.surplus:
-        raise ValueError(
-            f"{control!r} left {state.total} Gaussians, but the count of the state is "
-            f"{state.count}; return replace(state.replaced(gaussians), count={state.total})"
-        )
-    return state
 
 
 def last(states: Generator[State, None, None], gaussians: Gaussians) -> Gaussians:
@@ -225,7 +205,8 @@ class Best:
         self.descent, self.iterations = descent, iterations
         images = descent.objective.image.grid.images
         self.refinements = [Refinement(state.gaussians) for _ in range(images)]
-        self.marks, self.step, self.state = trace_steps(iterations), 0, state
+        marks = {0, 10, 20, 50, iterations}.union(range(100, iterations, 100))  # rows of the trace
+        self.marks, self.step, self.state = marks, 0, state
         self.row = Row()
         self.larger: tuple[float, int, Gaussians] | None = None
 
@@ -310,12 +291,6 @@ def refine(descent: Descent, state: State, iterations: int) -> list[Refinement]:
     if stopped:
         best.end_early()
     return best.refinements
-
-
-def trace_steps(iterations: int) -> set[int]:
-    """Return the steps with a row in the trace: 0, 10, 20, 50, every 100, and the last step."""
-    marks = {0, 10, 20, 50, iterations} | set(range(100, iterations, 100))
-    return {m for m in marks if m <= iterations}
 
 
 def split(batch: Gaussians) -> list[Gaussians]:

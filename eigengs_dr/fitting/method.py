@@ -181,8 +181,9 @@ class Method:
         """
         first, factors = self.first_phase(iterations), []
         for length in (first, iterations - first):
-            falling = [0.5 * (1 + math.cos(math.pi * step / length)) for step in range(length)]
-            factors += [self.decay + (1 - self.decay) * along for along in falling]
+            for step in range(length):
+                falling = 0.5 * (1 + math.cos(math.pi * step / length))
+                factors.append(self.decay + (1 - self.decay) * falling)
         return factors
 
     def first_phase(self, iterations: int) -> int:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import wraps
 from inspect import signature
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
 from ..backend.doors import check_types, checks_types
-from ..backend.messages import printable, shown
+from ..backend.messages import shown
 from ..gaussian.file import check_index_range, check_sides
 from ..gaussian.gaussians import Fitted, Gaussians
 from ..image.metrics import MAX_PSNR
@@ -44,6 +44,24 @@ spacing."""
 Start: TypeAlias = "Gaussians | Fitted | Model | str | os.PathLike[str]"
 """What a fit starts from: a set, the file of a set, or a model."""
 
+Exclusion = tuple[str, str, str]
+"""Names of parameters, names of others that each of them excludes, and why, or what to give."""
+
+EXCLUSIONS: tuple[Exclusion, ...] = (
+    ("gaussians levels", "target_psnr Map.goal", "a search finds how many, up to max_gaussians"),
+    ("gaussians levels", "loss.target", "a search finds how many"),
+    ("target_psnr Map.goal", "loss.target", "a search has one target"),
+    ("levels", "loss", "levels are for the squared error"),
+    ("levels", "start", "the Gaussians of levels are placed anew"),
+    ("start", "maps", "a start is for one image"),
+    ("space", "maps", "give each map a space of its own"),
+    ("size", "image maps", "size is for a loss without an image"),
+    ("target_psnr", "size", "without an image there is no PSNR; give the loss a target"),
+    ("encoding", "size", "encoding is for the pixels of an image"),
+)
+"""What `eigengs_dr.fit` does not take together. "levels" are also several numbers of Gaussians,
+"maps" a mapping of images."""
+
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -68,6 +86,22 @@ def named_options(function: Function) -> Function:
         return function(*arguments, **options)
 
     return call  # type: ignore[return-value]
+
+
+def conflict_in(
+    given: Mapping[str, object],
+    exclusions: Sequence[Exclusion] = EXCLUSIONS,
+    label: Callable[[str], str] = str,
+) -> str | None:
+    """Return why two parameters exclude each other, in one line, if neither is None.
+
+    It calls them by their labels: on the command line, by its options.
+    """
+    for names, others, reason in exclusions:
+        for one, other in product(names.split(), others.split()):
+            if given.get(one) is not None and given.get(other) is not None:
+                return f"{label(one)} and {label(other)} exclude each other: {reason}"
+    return None
 
 
 @dataclass(frozen=True)
@@ -143,7 +177,7 @@ class FitOptions:
     def __post_init__(self) -> None:
         given = self.gaussians
         if isinstance(given, (Sequence, np.ndarray)) and not isinstance(given, (str, bytes)):
-            object.__setattr__(self, "gaussians", tuple(_check_counts(None, list(given))))
+            object.__setattr__(self, "gaussians", tuple(_check_rising("gaussians", given)))
         if self.target_psnr is not None and not isinstance(self.target_psnr, Goal):
             object.__setattr__(self, "target_psnr", Goal(self.target_psnr))
         kinds = FitOptions.__annotations__
@@ -175,32 +209,26 @@ class FitOptions:
 
     def _check_nested(self) -> None:
         """Raise ValueError if other options exclude what a search or levels need."""
-        places = self.method.place == Adaptive() and self.start is None
+        if conflict := conflict_in(self.given):
+            raise ValueError(conflict)
         if self.levels and isinstance(self.gaussians, tuple):
             raise ValueError("levels and numbers of Gaussians up to each exclude each other")
-        if self.has_levels and self.loss is not None:
-            raise ValueError("levels are for the squared error; leave them or the loss out")
-        if self.has_levels and not (places and not self.method.needs_model):
-            raise ValueError("levels need the placement Adaptive and no start; leave them out")
-        if self.goal and self.loss is not None and self.loss.target is not None:
-            raise ValueError("target_psnr and the target of a loss exclude each other; give one")
-        if not self.searches:
+        is_adaptive = self.method.place == Adaptive()
+        if self.has_levels and not is_adaptive:
+            raise ValueError("levels need the placement Adaptive; leave them or the method out")
+        if not self.searches or isinstance(self.method.place, Coarse):
             return
-        target = "target_psnr" if self.goal else "the target of a loss"
-        if self.levels:
-            raise ValueError(f"levels and {target} exclude each other; give one of them")
-        if self.gaussians is not None:
+        if not is_adaptive or self.start is not None or not self.method.in_phase("redistribute"):
             raise ValueError(
-                f"gaussians and {target} exclude each other; give one of them, or "
-                "target_psnr=Goal(psnr, max_gaussians=...)"
+                f"{'target_psnr' if self.goal else 'loss.target'} needs a method that places "
+                "Gaussians by the image and redistributes them, such as DEFAULT, and no start"
             )
-        if isinstance(self.method.place, Coarse):
-            return
-        if not places or not self.method.in_phase("redistribute"):
-            raise ValueError(
-                f"{target} needs a method that places Gaussians by the image and redistributes "
-                "them, such as DEFAULT, and no start"
-            )
+
+    @property
+    def given(self) -> dict[str, object]:
+        """The options by the names in `EXCLUSIONS`; None for what is not given."""
+        target = self.loss.target if self.loss else None
+        return vars(self) | {"levels": self.has_levels or None, "loss.target": target}
 
     @property
     def goal(self) -> Goal | None:
@@ -297,6 +325,8 @@ def level_counts(count: int, levels: Levels) -> list[int]:
     ValueError
         If the first level would have no Gaussian, levels is not positive, or numbers of Gaussians
         do not rise up to `count`.
+    TypeError
+        If a number is not whole.
 
     Examples
     --------
@@ -308,7 +338,12 @@ def level_counts(count: int, levels: Levels) -> list[int]:
     if count < 1:
         raise ValueError(f"count is {count}; it must be at least 1")
     if isinstance(levels, Sequence):
-        return _check_counts(count, levels)
+        counts = _check_rising("levels", levels)
+        if counts[-1] != count:
+            raise ValueError(
+                f"levels is {shown(levels)}; the last must be the number of Gaussians, {count}"
+            )
+        return counts
     check_types({"levels": levels}, {"levels": "int"})
     max_levels = 1
     while count >= LEVEL_RATIO**max_levels:
@@ -318,13 +353,9 @@ def level_counts(count: int, levels: Levels) -> list[int]:
     return [count // LEVEL_RATIO**k for k in reversed(range(levels))]
 
 
-def _check_counts(count: int | None, levels: Sequence[int]) -> list[int]:
-    """Return numbers of Gaussians that rise up to `count`, if that is known."""
-    counts, written = list(levels), printable(", ".join(map(str, levels)))[:60]
-    if not all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) for n in counts):
-        raise ValueError(f"levels {written}: numbers of Gaussians must be whole")
-    if not counts or not all(a < b for a, b in pairwise([0, *counts])):
-        raise ValueError(f"levels {written}: numbers of Gaussians must rise, from 1 or more")
-    if count is not None and counts[-1] != count:
-        raise ValueError(f"levels {written}: the last must be the number of Gaussians, {count}")
+def _check_rising(name: str, counts: Sequence[int]) -> list[int]:
+    """Return numbers of Gaussians up to each level, which must be whole and rise."""
+    check_types({name: counts}, {name: "Sequence[int]"})
+    if not len(counts) or not all(a < b for a, b in pairwise([0, *counts])):
+        raise ValueError(f"{name} is {shown(counts)}; its numbers must rise, from 1 or more")
     return [int(n) for n in counts]

@@ -22,17 +22,16 @@ from ..backend.selection import select
 from ..backend.types import ArrayLike, PathLike, Values
 from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space
 from ..gaussian.gaussians import Gaussians, one_image
-from ..image.io import check_data, check_image, read_image
+from ..image.io import read_image
 from ..image.metrics import MAX_PSNR
-from ..image.pixels import WHITE, EncodedImage, ImageError
+from ..image.pixels import WHITE, EncodedImage, ImageError, codes_of, data_of, floats_of
 from ..image.space import DATA, YCBCR, Space, space_of
 from ..raster.tiles import Grid
-from .channels import Channels, Target, restored
+from .channels import Channels, Measured, Row, Target, psnrs, restored
 from .loss import PictureLoss
-from .measure import Measured, Row, psnrs
 from .method import Model
 from .objective import Objective, Pixels, squares_of
-from .options import FitOptions, Goal
+from .options import FitOptions, Goal, conflict_in
 from .redistribution import squares_by_channel
 from .start import check_start, load_start, set_in
 
@@ -271,16 +270,13 @@ def problem_of(
     ValueError
         If an image is unusable, or an argument would not be used.
     """
+    given = options.given | {"size": size, "space": spaces}
+    kind = "maps" if isinstance(image, Mapping) else "image"
+    if conflict := conflict_in(given | {kind: image}):
+        raise ValueError(conflict)
     if image is None:
         return _problem_of_loss(options, weight, size, spaces)
-    if size is not None:
-        raise ValueError("size is for a loss without an image; leave it or the image out")
     if isinstance(image, Mapping):
-        if options.start is not None or spaces is not None:
-            raise ValueError(
-                "maps take no start and no space; a Map says the space of one: "
-                "Map(image, space='data')"
-            )
         return _problem_of_maps(image, options, weight)
     if isinstance(spaces, Mapping):
         raise ValueError("spaces by name are for the maps of a loss; give an image one space")
@@ -292,8 +288,6 @@ def problem_of_images(
 ) -> Problem:
     """Return the problem of an image, or of a batch of images of one size."""
     start = None if options.start is None else load_start(options.start, options.backend)
-    if start is not None and len(images) > 1:
-        raise ValueError("a start is for one image; fit_many fits each image from it on its own")
     if isinstance(start, Gaussians):
         one_image(start)
     requested = options.space or (YCBCR if start is None else set_in(start).space)
@@ -312,8 +306,8 @@ def _problem_of_maps(maps: Mapping[str, Any], options: FitOptions, weight: Image
     """Return the problem of the images of maps."""
     channels = read_maps(maps, options.goal, weight, options.encoding)
     if options.goal is None and channels[0].goal is not None:
-        if options.gaussians is not None:
-            raise ValueError("gaussians and goals of maps exclude each other; give one of them")
+        if conflict := conflict_in(options.given | {"Map.goal": channels[0].goal}):
+            raise ValueError(conflict)
         options = replace(options, target_psnr=Goal(channels[0].goal))
     height, width = channels[0].targets[0].pixels.shape[:2]
     options.check_image(width, height, channels[-1].part.stop)
@@ -333,12 +327,6 @@ def _problem_of_loss(
         )
     if np.shape(size) != (2,) or np.asarray(size).dtype.kind not in "iu":
         raise ValueError(f"size is {size!r}; give (width, height) in whole pixels")
-    if options.goal is not None or options.has_levels:
-        raise ValueError(
-            "without an image there is no PSNR and there are no levels; give the loss a target"
-        )
-    if options.encoding is not None:
-        raise ValueError("encoding is for the pixels of an image; leave it out, or give an image")
     start = None if options.start is None else load_start(options.start, options.backend)
     if start is not None and not isinstance(start, Gaussians):
         raise ValueError("a model needs an image to start from; give a set")
@@ -445,15 +433,15 @@ def pixels_in(
     ImageError
         If the image is unusable.
     """
-    encoded = read_image(image, not space.is_color, encoding)
+    read = read_image(image, not space.is_color, encoding if space.is_color else "linear")
     if weight is not None:
-        encoded = encoded._replace(pixels=_filled(encoded, weight))
+        read = read._replace(pixels=_filled(read, weight))
     if not space.is_color:
-        pixels = check_data(encoded, copy=False)
+        pixels = data_of(read)
         space.check(pixels)
         return pixels, space
-    pixels = check_image(encoded, copy=False)
-    bright = encoded.encoding == "linear" and pixels.max() > WHITE
+    pixels = codes_of(floats_of(read))
+    bright = read.encoding == "linear" and pixels.max() > WHITE
     return pixels, space.above_white if bright else space
 
 

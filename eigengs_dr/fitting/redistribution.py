@@ -26,13 +26,13 @@ from ..backend.arrays import rcp, types_of
 from ..backend.recording import record
 from ..backend.types import Float, Singles
 from ..gaussian.gaussians import Gaussians
-from ..raster.kernels import image_of, sum_by_image
+from ..raster.kernels import image_of, spread, sum_by_image
 from ..raster.lists import TileLists
 from ..raster.parameters import detached_shape, kernel_radius, pack_parameters
 from ..raster.render import bin_gaussians, to_tiles
 from .objective import Pixels, Quadratic
 from .place import place_adaptive, planes_of, shrunk
-from .solve import Unknowns, apply, colors_of, correlate, for_channels, solve, spread
+from .solve import Unknowns, apply, colors_of, correlate, for_channels, solve
 
 ERROR_EXPONENT = 4 / 3
 """Exponent q of the decay of the squared error: twice as many Gaussians leave ``2^-q`` of it, which
@@ -58,6 +58,8 @@ class Owners:
     ----------
     shape : list of Float, shape (N,)
         See `eigengs_dr.raster.parameters.detached_shape`.
+    packed : Float
+        The Gaussians with one channel, which is 1.
     lists : TileLists
     cutoff : float
     total : Float, shape (pixels,)
@@ -65,6 +67,7 @@ class Owners:
     """
 
     shape: list
+    packed: Float
     lists: TileLists
     cutoff: float
     total: Float
@@ -73,9 +76,9 @@ class Owners:
     def of(cls, gaussians: Gaussians, images: int = 1) -> Owners:
         """Return the parts of a set, or of the sets of a batch of images."""
         types, shape = types_of(gaussians.mean), detached_shape(gaussians)
-        lists = bin_gaussians(gaussians, images=images)
-        total = _sum_weights(shape, types.Float(1), lists, gaussians.cutoff)
-        return cls(shape, lists, gaussians.cutoff, total)
+        lists, cutoff = bin_gaussians(gaussians, images=images), gaussians.cutoff
+        packed = pack_parameters([*shape, dr.opaque(types.Float, 1, len(gaussians))])
+        return cls(shape, packed, lists, cutoff, _sum_weights(packed, lists, cutoff))
 
     def collect(self, first: Float, second: Float) -> list:
         """Return the sums of two maps (pixels,) over what each Gaussian owns, Floats (N,)."""
@@ -85,20 +88,21 @@ class Owners:
         rows = types.FloatX([first * inverse, second * inverse])
         dr.scatter(both, rows, dr.arange(types.UInt, dr.width(first)))
         dr.eval(both)
-        return correlate(self.shape, both, 2, self.lists, self.cutoff)
+        # Two channels are packed as one is, in 8 numbers for each Gaussian.
+        return correlate(self.packed, both, 2, self.lists, self.cutoff)
 
     def average(self, values: Float) -> Float:
         """Return the average of values (N,) over the owners of each pixel."""
-        sums = _sum_weights(self.shape, values, self.lists, self.cutoff)
+        packed = pack_parameters([*self.shape, values])
+        sums = _sum_weights(packed, self.lists, self.cutoff)
         tile = dr.arange(types_of(values).UInt, dr.width(sums)) // self.lists.grid.pixels
         mean = spread(_mean_by_image(values, self.lists), self.lists.layout.image_of(tile))
         return dr.fma(NO_WEIGHT, mean, sums) / (self.total + NO_WEIGHT)
 
 
-def _sum_weights(shape: list, values: Float, lists: TileLists, cutoff: float) -> Float:
-    """Return ``sum_n values_n w_n(x)`` in tile layout; evaluated."""
-    packed = pack_parameters([*shape, values])
-    return image_of(packed, [type(values)(0)], lists, kernel_radius(cutoff))
+def _sum_weights(packed: Float, lists: TileLists, cutoff: float) -> Float:
+    """Return ``sum_n values_n w_n(x)`` in tile layout, of the packed values; evaluated."""
+    return image_of(packed, [type(packed)(0)], lists, kernel_radius(cutoff))
 
 
 def _mean_by_image(values: Float, lists: TileLists) -> Float:
@@ -109,7 +113,8 @@ def _mean_by_image(values: Float, lists: TileLists) -> Float:
 def _squares(shape: list, x: Unknowns, model: Quadratic, lists: TileLists, cutoff: float) -> Float:
     """Return ``h (p - t)^2`` of every pixel, added over the channels; evaluated."""
     types, channels = types_of(model.target), len(x[0])
-    error, _ = apply(shape, x, lists, cutoff, Quadratic(model.target))
+    packed = pack_parameters([*shape, *x[0]])
+    error, _ = apply(packed, x[1], lists, cutoff, Quadratic(model.target))
     dr.eval(error)
     curvature = model.curvatures(lists.grid)
     pixel = dr.arange(types.UInt, lists.grid.tiles * lists.grid.pixels)
@@ -150,9 +155,10 @@ def error_by_pixel(
 def squares_by_channel(gaussians: Gaussians, objective: Pixels) -> list:
     """Return ``sum h (p - t)^2`` over the pixels for each channel, a Float (images,)."""
     lists = bin_gaussians(gaussians, adjoint=False, images=objective.grid.images)
-    shape, colors = detached_shape(gaussians), colors_of(gaussians)
+    color, background = colors_of(gaussians)
     with dr.suspend_grad():
-        return apply(shape, colors, lists, gaussians.cutoff, objective.model)[1]
+        packed = pack_parameters([*detached_shape(gaussians), *color])
+        return apply(packed, background, lists, gaussians.cutoff, objective.model)[1]
 
 
 def density_ratio(owners: Owners, error: Float, bending: Float) -> Float:

@@ -11,18 +11,18 @@ from __future__ import annotations
 
 import math
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import drjit as dr
 
 from ..gaussian.gaussians import Gaussians
+from .channels import Row
 from .exchange import densify, prune
 from .loop import Descent, Refinement, descend
-from .measure import Row
 from .objective import Pixels
 from .redistribution import redistribute
-from .state import begin
+from .state import State, begin
 
 # The constants of a search, chosen on training photos of ImageNet classes. With a surplus in the
 # fit, a fit of 1.0 and a margin of 1.1 take 4.6 and 1.6 % fewer Gaussians for 32 and 36 dB on 9
@@ -166,16 +166,13 @@ class _Run:
     def __post_init__(self) -> None:
         self.best = _Trial(self.start, math.inf, {})
 
-    def descend(
-        self, gaussians: Gaussians, steps: int, share: float = 1.0, surplus: int = 0
-    ) -> _Trial:
+    def descend(self, current: State, steps: int, share: float = 1.0) -> _Trial:
         """Take some steps at a fraction of the learning rates, and score the pruned set."""
         descent = self.descent
         method = descent.method.at_rates(share).without("densify", "redistribute")
         if share < 1:  # a polish moves Gaussians by itself
             method = method.without("relocate", "perturb")
         self.planned, before = max(self.planned, self.step + steps), self.step
-        current = replace(begin(gaussians), count=len(gaussians) - surplus, surplus=surplus)
         states = descend(descent.objective, method, current, steps, descent.key + before)
         try:
             with closing(states):
@@ -241,7 +238,7 @@ def _estimate(run: _Run, max_count: int, steps: int) -> tuple[Gaussians, Gaussia
     """
     placed, before, last = run.start, run.best, None
     for _ in range(MAX_TRIES):
-        trial = run.descend(placed, steps)
+        trial = run.descend(begin(placed), steps)
         # Few steps at full rates may lose more than they gain.
         trial = min(trial, before, key=lambda one: one.shortfall_db)
         _update_slope(run, last, trial)
@@ -276,10 +273,9 @@ def _fit(run: _Run, tried: Gaussians, placed: Gaussians, steps: int) -> _Trial:
     state = begin(placed)
     for control in run.descent.method.in_phase("densify"):
         state = control(state, run.descent.objective.image, 0, steps, 0)
-    more = state.surplus
-    if more:
-        placed = run.redistribute(tried, len(placed) + more)
-    return run.descend(placed, steps, surplus=more)
+    if state.surplus:
+        state = state.replaced(run.redistribute(tried, state.most))
+    return run.descend(state, steps)
 
 
 def _update_slope(run: _Run, last: _Trial | None, trial: _Trial) -> None:
@@ -335,7 +331,7 @@ def _polish(run: _Run, trial: _Trial, max_count: int, steps: int, max_steps: int
             least_growth = 2 * least_growth - 1
         rounds += 1
         expected = trial.shortfall_db + run.db_per_doubling * math.log2(count / len(changed))
-        trial = run.descend(changed, steps, POLISH_RATE)
+        trial = run.descend(begin(changed), steps, POLISH_RATE)
         gain = GAIN_DECAY * max(0.0, expected - trial.shortfall_db)
 
 

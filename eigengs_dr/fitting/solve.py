@@ -18,7 +18,7 @@ from ..backend.recording import record
 from ..backend.types import Float, UInt
 from ..gaussian.gaussians import Gaussians, broadcast_rows
 from ..raster.adjoint import adjoint
-from ..raster.kernels import channel_sums, difference, image_of, sum_by_image
+from ..raster.kernels import channel_sums, difference, image_of, spread, sum_by_image
 from ..raster.lists import TileLists
 from ..raster.parameters import (
     detached_shape,
@@ -128,8 +128,9 @@ def _begin(
     A held background keeps its value.
     """
     channels, grid, types = len(x[0]), lists.grid, types_of(model.target)
-    error, squares = apply(shape, x, lists, cutoff, model)
-    color, diagonal = weigh(shape, error, channels, lists, cutoff, model.curvatures(grid))
+    packed = pack_parameters([*shape, *x[0]])
+    error, squares = apply(packed, x[1], lists, cutoff, model)
+    color, diagonal = weigh(packed, error, channels, lists, cutoff, model.curvatures(grid))
     inverse = preconditioner(diagonal, channels)
     inverse = held_background(inverse) if held else inverse
     r = negate((color, channel_sums(error, channels, grid)))
@@ -160,8 +161,9 @@ def _step(
     """
     x, p, r, rz = state
     Float, grid, channels = type(shape[0]), lists.grid, len(rz)
-    x, q, alpha = _advance(shape, x, p, rz, curvature, lists, cutoff)
-    change = apply_transposed(shape, q, channels, lists, cutoff)
+    packed = pack_parameters([*shape, *p[0]])
+    x, q, alpha = _advance(packed, x, p, rz, curvature, lists, cutoff)
+    change = apply_transposed(packed, q, channels, lists, cutoff)
     r = add_multiple(r, [-a for a in alpha], change, lists.image)
     z = multiply(r, inverse)
     new_rz = dots(r, z, grid)
@@ -205,16 +207,18 @@ def take_step(
     lists : TileLists
     cutoff : float
     """
-    r = negate(apply_transposed(shape, error, len(inverse[0]), lists, cutoff))
+    packed = pack_parameters([*shape, *x[0]])
+    r = negate(apply_transposed(packed, error, len(inverse[0]), lists, cutoff))
     p = multiply(r, inverse)
     rz = dots(r, p, lists.grid)
-    x, q, alpha = _advance(shape, x, p, rz, curvature, lists, cutoff)
+    packed = pack_parameters([*shape, *p[0]])
+    x, q, alpha = _advance(packed, x, p, rz, curvature, lists, cutoff)
     _add_in_place(error, q, alpha, lists)
     return x
 
 
 def _advance(
-    shape: list,
+    packed: Float,
     x: Unknowns,
     p: Unknowns,
     rz: list,
@@ -222,11 +226,11 @@ def _advance(
     lists: TileLists,
     cutoff: float,
 ) -> tuple[Unknowns, Float, list]:
-    """Move x along p to the least error.
+    """Move x along p to the least error; `packed` has the colours of p.
 
     Return x, ``q = H A p``, and ``alpha = rz / <A p, q>``.
     """
-    image = image_of(pack_parameters([*shape, *p[0]]), p[1], lists, kernel_radius(cutoff))
+    image = image_of(packed, p[1], lists, kernel_radius(cutoff))
     q, lengths = difference(image, lists, None, curvature)
     # A channel that is solved except for rounding stops: its directions would grow without bound.
     alpha = [dr.select(k > 0, a / k, 0) for a, k in zip(rz, lengths, strict=True)]
@@ -252,23 +256,23 @@ def _add_in_place(image: Float, step: Float, factors: list, lists: TileLists) ->
 
 
 def apply(
-    shape: list, x: Unknowns, lists: TileLists, cutoff: float, model: Quadratic
+    packed: Float, background: list, lists: TileLists, cutoff: float, model: Quadratic
 ) -> tuple[Float, list]:
     """Return ``H (A x - D)``, and the sums of ``h (A x - D)^2`` of every channel and image."""
-    image = image_of(pack_parameters([*shape, *x[0]]), x[1], lists, kernel_radius(cutoff))
+    image = image_of(packed, background, lists, kernel_radius(cutoff))
     return difference(image, lists, model.target, model.curvature)
 
 
 def apply_transposed(
-    shape: list, delta: Float, channels: int, lists: TileLists, cutoff: float
+    packed: Float, delta: Float, channels: int, lists: TileLists, cutoff: float
 ) -> Unknowns:
     """Return ``A^T d``: correlations with every Gaussian, and the sum of every channel."""
-    color = correlate(shape, delta, channels, lists, cutoff)
+    color = correlate(packed, delta, channels, lists, cutoff)
     return color, channel_sums(delta, channels, lists.grid)
 
 
 def correlate(
-    shape: list,
+    packed: Float,
     delta: Float,
     channels: int,
     lists: TileLists,
@@ -277,21 +281,21 @@ def correlate(
 ) -> list:
     """Return for each channel the correlations of an image with every Gaussian.
 
-    After them come the products of the squared weights with one or more images of factors.
+    After them come the products of the squared weights with one or more images of factors. The
+    colours in `packed` do not matter, but their number.
     """
-    packed = pack_parameters([*shape, *[type(delta)(0)] * channels])
     return adjoint(packed, delta, channels, lists, kernel_radius(cutoff), True, factors)
 
 
 def weigh(
-    shape: list, delta: Float, channels: int, lists: TileLists, cutoff: float, factors: Float
+    packed: Float, delta: Float, channels: int, lists: TileLists, cutoff: float, factors: Float
 ) -> tuple[list, Unknowns]:
     """Return the correlations of an image d with every Gaussian, and the diagonal of ``A^T F A``.
 
     F holds factors of the squares of errors, one for all channels or one for each. Cost: one pass
     over the lists.
     """
-    products = correlate(shape, delta, channels, lists, cutoff, factors)
+    products = correlate(packed, delta, channels, lists, cutoff, factors)
     diagonal = products[channels:]
     return products[:channels], (diagonal, channel_sums(factors, len(diagonal), lists.grid))
 
@@ -335,11 +339,6 @@ def dots(x: Unknowns, y: Unknowns, grid: Grid) -> list:
 
 
 def add_multiple(x: Unknowns, factors: list, y: Unknowns, image: UInt | None) -> Unknowns:
-    """Return ``x + factor y``; a factor has one value for each image, see `spread`."""
+    """Return ``x + factor y``; a factor has one value for each image."""
     color = [dr.fma(spread(f, image), b, a) for a, f, b in zip(x[0], factors, y[0], strict=True)]
     return color, [dr.fma(f, b, a) for a, f, b in zip(x[1], factors, y[1], strict=True)]
-
-
-def spread(values: Float, image: UInt | None) -> Float:
-    """Return the value of the image of each entry; `image` is None if there is only one."""
-    return values if image is None else dr.gather(type(values), values, image)

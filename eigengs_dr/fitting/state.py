@@ -269,6 +269,11 @@ class State:
         return replace(self, gaussians=gaussians, squares=None, fixed=None, moving=None, lists=())
 
     @property
+    def most(self) -> int:
+        """Largest number of Gaussians of an image."""
+        return self.count + self.surplus
+
+    @property
     def total(self) -> int:
         """Number of Gaussians of an image."""
         return len(self.gaussians) // dr.width(self.gaussians.background[0])

@@ -46,7 +46,8 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
     if unknown := set(method.rates) - set(encoded):
         raise ValueError(f"rates name {min(unknown)!r}; the variables are {', '.join(encoded)}")
     variables = {name: dr.detach(encoded[name]) for name in method.rates}
-    dr.eval(variables)
+    shape = kernel_shape(gaussians)
+    dr.eval(variables, shape)
     moments = {name: method.optimizer.start(value) for name, value in variables.items()}
     types, scale = types_of(gaussians.mean), None
     if method.rate_exponent:
@@ -55,7 +56,7 @@ def started(state: State, method: Method, step: int, images: int = 1) -> State:
         )
         dr.eval(scale)
     time = dr.opaque(types.Float, 0)
-    packed = pack_parameters([*kernel_shape(gaussians), *gaussians.color])
+    packed = pack_parameters([*shape, *gaussians.color])
     moving = Moving(variables, moments, time, packed, scale)
     return replace(state, fixed=gaussians, moving=moving, since=step, lists=())
 

@@ -21,10 +21,9 @@ from ..backend.types import PathLike, Record, Values
 from .formats import READ_SUFFIXES, UNREAD_SUFFIXES
 from .io import check_member
 from .notes import NotedImages, kept_notes, tell_all
-from .pixels import ImageError, check_size, is_bitmap, is_drjit, local_path
+from .pixels import ImageError, available_cores, check_size, is_bitmap, is_drjit, local_path
 from .resize import center_crop
 from .space import FAMILY_SPACES, space_of, to_planes
-from .strips import available_cores
 
 THREADS = min(8, available_cores())
 """Number of threads that decode files; Pillow and NumPy release the interpreter lock."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..backend.types import Record
-from .strips import Pixels
+from .pixels import Pixels
 
 STARTS = {
     b"II*\0": "tiff",

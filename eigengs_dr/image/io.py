@@ -20,32 +20,30 @@ from ..storage.atomic import atomic_write, refuse_url
 from ..storage.memory import SETTING, stream_limit
 from .color import to_coded, to_linear
 from .formats import BITS, SUFFIXES, write_file
-from .notes import ABOVE_WHITE, tell
+from .notes import ABOVE_WHITE, Notes, kept_notes, tell
 from .pixels import (
     MAX_PIXEL,
     WHITE,
     EncodedImage,
     ImageError,
+    Pixels,
+    by_strips,
     check_encoding,
     check_floats,
+    codes_of,
+    data_of,
     encoding_of,
+    floats_of,
     is_bitmap,
     is_drjit,
     local_path,
+    over_background,
     peak_of,
     reason_of,
     to_floats,
 )
-from .read import (
-    decode,
-    is_picture,
-    over_background,
-    picture_pixels,
-    read_header,
-    transparency_note,
-)
+from .read import decode, is_picture, picture_pixels, read_header
 from .space import Space
-from .strips import Pixels, by_strips
 
 
 @checks_types
@@ -93,39 +91,42 @@ def load_image(
     OSError
         If a pipe cannot be read, or the name is a URL, which nothing here fetches.
     """
-    return read_file(path, keep_grey, upright=upright).pixels
+    return read_floats(path, keep_grey, upright=upright).pixels
 
 
-def read_file(
-    path: PathLike,
-    keep_grey: bool = False,
-    encoding: str | None = None,
-    upright: bool = True,
+def read_image(
+    image: object, keep_grey: bool = False, encoding: str | None = None, upright: bool = True
 ) -> EncodedImage:
-    """Read an image file as `load_image` does, and return its encoding too.
+    """Read an image of any kind: a file, a picture of Pillow, or an array, which stays as it is.
 
-    `encoding` overrides the default: files of floats hold linear light, others sRGB.
+    Pixels are grey or RGB without alpha, in their own type. For files see `load_image`; `encoding`
+    overrides that of the image, see `eigengs_dr.image.pixels.encoding_of`. Masked values are
+    refused, because NumPy would take what is below the mask.
     """
-    check_encoding(encoding)
-    if not is_pipe(path):
-        return _read_local(local_path(path), str(path), keep_grey, encoding, upright)
-    with _copy_of(path) as file:
+    if isinstance(image, EncodedImage):
+        return image._replace(encoding=encoding or image.encoding)
+    pixels: Any = image
+    name, alpha, notes = "image", "none", Notes()
+    if isinstance(image, (str, os.PathLike)):
+        with _local_file(image) as file:
+            header = read_header(file, upright)
+            header.check_memory(file)
+            pixels, alpha = decode(file, header, keep_grey)
+        name, notes, encoding = str(image), header.notes, encoding or header.encoding
+    elif is_picture(image):
         try:
-            return _read_local(file, str(path), keep_grey, encoding, upright)
+            pixels, alpha = picture_pixels(image)
         except ImageError as error:
-            raise ImageError(str(error).replace(printable(str(file)), str(path))) from None
-
-
-def _read_local(
-    path: Path, name: str, keep_grey: bool, encoding: str | None, upright: bool
-) -> EncodedImage:
-    """Read a file that warnings refer to as `name`."""
-    header = read_header(path, upright)
-    header.check_memory(path)
-    decoded = decode(path, header, keep_grey, name)
-    encoding = encoding or decoded.encoding
-    pixels = to_floats(decoded.pixels, name, keep_grey, copy=False, encoding=encoding)
-    return EncodedImage(pixels, encoding)
+            raise ImageError(f"image: {error}") from None
+    elif np.ma.is_masked(image):
+        raise ImageError(
+            f"image: {np.ma.count_masked(image)} values are masked; fill them, as in "
+            "image.filled(0), and give pixels that do not count the weight 0"
+        )
+    pixels, shown = over_background(pixels, alpha)
+    for note in (*notes, *shown):
+        tell(name, note)
+    return EncodedImage(pixels, encoding_of(image, encoding), name)
 
 
 def is_pipe(name: object) -> bool:
@@ -135,16 +136,19 @@ def is_pipe(name: object) -> bool:
 
 
 @contextmanager
-def _copy_of(name: PathLike) -> Iterator[Path]:
-    """Copy a pipe to a temporary file, which exists during the block.
+def _local_file(name: PathLike) -> Iterator[Path]:
+    """Yield the path of a file; for a pipe, that of a temporary copy.
 
     Raises
     ------
     ImageError
-        If there are more bytes than `stream_limit`.
+        If a pipe has more bytes than `stream_limit`. Errors of the block name the pipe.
     OSError
         If it cannot be read; the message has the name.
     """
+    if not is_pipe(name):
+        yield local_path(name)
+        return
     limit = stream_limit()
     with TemporaryDirectory() as folder:
         file = Path(folder) / "image"
@@ -159,57 +163,24 @@ def _copy_of(name: PathLike) -> Iterator[Path]:
                     copy.write(part)
         except OSError as error:
             raise OSError(f"{name}: cannot be read ({reason_of(error)})") from error
-        yield file
-
-
-def read_image(image: object, keep_grey: bool = False, encoding: str | None = None) -> EncodedImage:
-    """Read an image from a file; add the encoding to any other image.
-
-    For parameters and errors see `read_file` and `eigengs_dr.image.pixels.encoding_of`. Pixels
-    without a known encoding count as sRGB.
-    """
-    if isinstance(image, (str, os.PathLike)):
-        return read_file(image, keep_grey, encoding)
-    if isinstance(image, EncodedImage):
-        return image._replace(encoding=encoding or image.encoding)
-    return EncodedImage(pixels_of(image), encoding_of(image, encoding) or "srgb")
-
-
-def pixels_of(image: object) -> Any:
-    """Return a `PIL.Image.Image` as grey or RGB pixels over white; anything else unchanged.
-
-    Masked values are refused, because NumPy would take what is below the mask.
-    """
-    if np.ma.is_masked(image):
-        raise ImageError(
-            f"image: {np.ma.count_masked(image)} values are masked; fill them, as in "
-            "image.filled(0), and give pixels that do not count the weight 0"
-        )
-    if not is_picture(image):
-        return image
-    try:
-        pixels, alpha = picture_pixels(image)
-    except ImageError as error:
-        raise ImageError(f"image: {error}") from None
-    pixels, transparent = over_background(pixels, alpha)
-    if transparent:
-        tell("image", transparency_note(alpha))
-    return pixels
+        try:
+            yield file
+        except ImageError as error:
+            raise ImageError(str(error).replace(printable(str(file)), str(name))) from None
 
 
 def read_floats(
-    image: object, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
+    image: object, keep_grey: bool = False, encoding: str | None = None, upright: bool = True
 ) -> EncodedImage:
     """Read an image and convert it to float32 as `load_image` does, without changing its encoding.
 
     For parameters and errors see `check_image`.
     """
-    pixels, encoding = read_image(image, keep_grey, encoding)
-    return EncodedImage(to_floats(pixels, "image", keep_grey, copy, encoding), encoding)
+    return floats_of(read_image(image, keep_grey, encoding, upright), keep_grey)
 
 
 def check_image(
-    image: object, keep_grey: bool = False, copy: bool = True, encoding: str | None = None
+    image: object, keep_grey: bool = False, encoding: str | None = None
 ) -> NDArray[np.float32]:
     """Convert an image to sRGB in float32, and reject what is not an image.
 
@@ -221,8 +192,6 @@ def check_image(
         finite value. The encoding of a file or a ``mitsuba.Bitmap`` is known.
     keep_grey : bool, optional
         Return one channel if the image is grey.
-    copy : bool, optional
-        If false, a C-contiguous float32 image in sRGB is returned without a copy.
     encoding : {"srgb", "linear"}, optional
         The encoding of the pixels. By default that of the image if it is known, else "srgb".
 
@@ -230,7 +199,7 @@ def check_image(
     -------
     ndarray of float32, shape (H, W, 3) or (H, W, 1)
         sRGB: light above 1 gives codes above 1, see `eigengs_dr.image.color.to_coded`. The array is
-        C-contiguous. It shares no memory with `image`, unless `copy` is False.
+        C-contiguous, and may be the image itself.
 
     Raises
     ------
@@ -246,17 +215,12 @@ def check_image(
     array([[0. , 0.2],
            [0.4, 1. ]], dtype=float32)
     """
-    encoded = read_image(image, keep_grey, encoding)
-    light = encoded.encoding == "linear"
-    return codes_of(read_floats(encoded, keep_grey, copy and not light))
+    return codes_of(read_floats(image, keep_grey, encoding))
 
 
-def codes_of(image: EncodedImage) -> NDArray[np.float32]:
-    """Return checked pixels as sRGB codes, above 1 for light above 1."""
-    return by_strips(to_coded, image.pixels) if image.encoding == "linear" else image.pixels
-
-
-def read_photo(photo: object, encoding: str | None = None, arrays: str = "linear") -> EncodedImage:
+def read_photo(
+    photo: object, encoding: str | None = None, arrays: str = "linear", upright: bool = True
+) -> EncodedImage:
     """Read a photo that may be a rendering, as float32; its encoding is not changed.
 
     Floats in a tensor of Dr.Jit are linear light, as those of `mitsuba.render`; floats in a list
@@ -272,7 +236,7 @@ def read_photo(photo: object, encoding: str | None = None, arrays: str = "linear
             encoding = "linear" if is_rendering else arrays
             if encoding == "linear":
                 _refuse_bytes(photo)
-    return read_floats(photo, copy=False, encoding=encoding)
+    return read_floats(photo, encoding=encoding, upright=upright)
 
 
 class Codes(NamedTuple):
@@ -294,7 +258,7 @@ def check_member(
     encoded = read_photo(image, encoding, arrays="srgb")
     pixels = codes_of(encoded)
     if encoded.encoding == "linear" and pixels.max() > WHITE:
-        tell(str(image) if isinstance(image, (str, os.PathLike)) else name, ABOVE_WHITE)
+        tell(encoded.name if encoded.name != "image" else name, ABOVE_WHITE)
     return pixels
 
 
@@ -318,21 +282,20 @@ def _refuse_bytes(photo: NDArray[np.floating]) -> None:
         )
 
 
-def check_data(image: object, copy: bool = True) -> NDArray[np.float32]:
+def check_data(image: object) -> NDArray[np.float32]:
     """Convert an image of data to float32: one to three channels, of any finite values.
 
     For parameters, result and errors see `check_image`; integers are scaled to [0, 1], and values
     are not converted to sRGB.
     """
-    pixels, said = read_image(image, keep_grey=True, encoding="linear")
-    return to_floats(pixels, "image", keep_grey=True, copy=copy, encoding=said, known=(1, 2, 3))
+    return data_of(read_image(image, keep_grey=True, encoding="linear"))
 
 
 def displayed(image: ArrayLike, space: Space, encoding: str | None = None) -> NDArray[np.float32]:
     """Return an image as display values, for sets of a space: sRGB, or data."""
     if space.is_color:
-        return check_image(image, copy=False, encoding=encoding)
-    return check_data(image, copy=False)
+        return check_image(image, encoding=encoding)
+    return check_data(image)
 
 
 @checks_types
@@ -372,13 +335,12 @@ def save_image(
     refuse_url(path)
     path = Path(path)
     bits = bits_of(path, bits)
-    image = pixels_of(image)
-    encoding = encoding_of(image, encoding)
-    if bits == 8 and encoding != "linear" and getattr(image, "dtype", None) == np.uint8:
-        array = np.asarray(image)
+    pixels, encoding, _ = read = read_image(image, keep_grey=True, encoding=encoding)
+    if bits == 8 and encoding != "linear" and getattr(pixels, "dtype", None) == np.uint8:
+        array = np.asarray(pixels)
         if array.size and array.shape[2:] in ((1,), (3,)):
             return write_pixels(path, array, bits)  # large pictures need no copy
-    floats = to_floats(image, "image", keep_grey=True, copy=False)
+    floats = to_floats(read, keep_grey=True)
     kind = dtype_of(path, bits)
     if encoding != "linear" and kind != np.float32 and MAX_PIXEL < floats.mean() <= 255:
         raise ImageError(
@@ -516,5 +478,5 @@ def sample(name: str) -> NDArray[np.float32]:
     # find_spec locates the folder without the slow import of scikit-image.
     [folder] = find_spec("skimage").submodule_search_locations  # type: ignore[union-attr, misc]
     path = Path(folder) / "data" / SAMPLES[name]
-    header = read_header(path)._replace(notes=())  # one photo has another colour profile
-    return to_floats(decode(path, header, keep_grey=False).pixels, name)
+    with kept_notes():  # one photo has another colour profile
+        return load_image(path)

@@ -7,6 +7,7 @@ to its memory takes as long as the sum. SSIM is that of `eigengs_dr.image.struct
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
@@ -17,9 +18,8 @@ from numpy.typing import NDArray
 from ..backend.doors import checks_types
 from ..backend.types import ArrayLike, Doubles, DrJitArray, Float, Singles
 from .color import RGB_TO_YCBCR, rgb_to_ycbcr, to_linear, to_pu21
-from .io import pixels_of, to_8bit
-from .pixels import check_weight, is_tensor, peak_of
-from .strips import Pixels, map_threads, strips
+from .io import read_image, to_8bit
+from .pixels import Pixels, check_weight, is_tensor, map_threads, peak_of, strips
 
 MAX_PSNR = 100.0
 """Upper bound of reported PSNRs, in dB: above it, differences are rounding errors."""
@@ -83,7 +83,7 @@ def squared_error(a: ArrayLike, b: ArrayLike, space: str, weight: ArrayLike | No
     """
     if space not in COMPARED:
         raise ValueError(f"space {space!r} is unknown; use one of {', '.join(COMPARED)}")
-    a, b = pixels_of(a), pixels_of(b)
+    a, b = _pixels(a), _pixels(b)
     x, y = _pair(a, b)
     factors = _weight_of(np.shape(a), weight)
 
@@ -215,7 +215,7 @@ def ssim(a: Any, b: Any, weight: Any = None) -> Any:
         x, y = (v if is_tensor(v) else _scaled(v) for v in (a, b))
         _check_shapes(x.shape, y.shape)
         return similarity(x, y, _weight_of_windows(x.shape, weight), _window(x.shape))
-    a, b = pixels_of(a), pixels_of(b)
+    a, b = _pixels(a), _pixels(b)
     x, y = _pair(a, b)
     factors = _weight_of_windows(np.shape(a), weight)
     return float(_similarity(x, y, lambda rows: np.clip(rows, 0, 1), factors)[0].mean())
@@ -281,9 +281,16 @@ def ms_ssim(a: ArrayLike, b: ArrayLike, space: str = "ycbcr") -> float:
     return float(product.mean())
 
 
+def _pixels(image: ArrayLike) -> Pixels:
+    """Return the pixels of an array or a picture of Pillow; a file may hold light."""
+    if isinstance(image, (str, os.PathLike)):
+        raise TypeError(f"{image}: is a path; compare the pixels, as from eigengs_dr.load_image")
+    return np.asarray(read_image(image, True, "srgb").pixels)
+
+
 def _scaled(image: ArrayLike) -> Pixels:
     """Scale integers to [0, 1] by their type; floats are not changed."""
-    image = np.asarray(pixels_of(image))
+    image = _pixels(image)
     peak = peak_of(image.dtype)
     return image if image.dtype.kind == "f" else image / np.float64(peak)
 

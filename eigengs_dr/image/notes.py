@@ -7,12 +7,12 @@ has one warning for each note.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
 from io import BytesIO
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,10 +35,13 @@ _noted: ContextVar[NotedImages | None] = ContextVar("noted", default=None)
 
 
 def tell(name: str, note: str) -> None:
-    """Warn about an image: at once, or at the end of the series to which it belongs."""
+    """Warn about an image: at once, or at the end of the series to which it belongs.
+
+    Without a name, the note is not about an image.
+    """
     noted = _noted.get()
     if noted is None:
-        warn(f"{name}: {note}")
+        warn(f"{name}: {note}" if name else note)
     else:
         noted.setdefault(note, {})[name] = None
 
@@ -52,6 +55,15 @@ def kept_notes() -> Iterator[NotedImages]:
         yield noted
     finally:
         _noted.reset(token)
+
+
+@contextmanager
+def kept_warnings() -> Iterator[NotedImages]:
+    """Keep the notes of a block of a worker, and after it its other warnings, without names."""
+    with kept_notes() as noted, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        yield noted
+    noted |= {str(w.message): {"": None} for w in caught if issubclass(w.category, UserWarning)}
 
 
 def tell_all(noted: NotedImages) -> None:
@@ -73,7 +85,7 @@ def series() -> Iterator[None]:
             tell_all(noted)
         else:
             for note, (first, *others) in noted.items():
-                warn(f"{first}: {note}" + (f"; so for {len(others)} more" if others else ""))
+                tell(first, note + (f"; so for {len(others)} more" if others else ""))
 
 
 PROFILE_LEVELS = (0, 64, 128, 192, 255)
@@ -136,6 +148,13 @@ def primaries_note(primaries: Sequence[float], tolerance: float) -> Notes:
     return ("its primaries are not those of sRGB, which is ignored",)
 
 
+def transparency_note(alpha: str) -> Notes:
+    """Return the warning about transparent pixels by what alpha is, see `Header` of `read`."""
+    if alpha == "none":
+        return ()
+    return (f"transparent pixels are shown over {'black' if alpha == 'light' else 'white'}",)
+
+
 GAIN_MAP: Notes = ("its gain map, for light above white, is left out",)
 
 ABOVE_WHITE = "its light above white is kept, but displays and textures clamp it"
@@ -171,13 +190,12 @@ _NCLX = re.compile(rb"colrnclx(..)(..)", re.S)
 _SIZ = re.compile(rb"\xff\x4f\xff\x51.{38}(.)", re.S)
 
 
-def depth_notes(path: Path, image: Image) -> Notes:
-    """Return warnings about properties of AVIF, HEIF and JPEG 2000 files that Pillow ignores."""
-    kind, notes = image.format, Notes()
-    if kind not in ("AVIF", "HEIF", "JPEG2000"):
-        return ()
-    with path.open("rb") as file:
-        start = file.read(1 << 14)
+def depth_notes(image: Image, start: bytes) -> Notes:
+    """Return warnings about what Pillow ignores in AVIF, HEIF and JPEG 2000 files, by their start.
+
+    The other kinds that it reads have no notes.
+    """
+    kind, notes, bits = image.format, Notes(), 8
     if kind == "HEIF":
         bits, color = image.info.get("bit_depth", 8), image.info.get("nclx_profile") or {}
         names = ("color_primaries", "transfer_characteristics")
@@ -186,7 +204,7 @@ def depth_notes(path: Path, image: Image) -> Notes:
         bits = max((match[1][0] for match in _PIXI.finditer(start)), default=8)
         if match := _NCLX.search(start):
             notes = video_note(*(int.from_bytes(code, "big") for code in match.groups()))
-    else:
+    elif kind == "JPEG2000":
         match = _SIZ.search(start)
         bits = (match[1][0] & 127) + 1 if match else 8
         grey = match is not None and match[0][-3:-1] == b"\0\1"

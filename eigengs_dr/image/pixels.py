@@ -1,4 +1,4 @@
-"""Pixels in arrays: their encoding, and the checks of an image.
+"""Pixels in arrays: their encoding, the checks of an image, and strips of its rows.
 
 A photo holds sRGB codes, a rendering holds linear light. The values do not show which: light that
 is decoded as sRGB is too dark. Files of integers hold sRGB, files of floats hold light, and a
@@ -8,21 +8,30 @@ is decoded as sRGB is too dark. Files of integers hold sRGB, files of floats hol
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from operator import index
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple, TypeGuard, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.doors import check_types
 from ..backend.messages import printable, shown, warn
-from ..backend.types import ArrayLike, PathLike, Singles, Tensor
+from ..backend.types import ArrayLike, PathLike, Singles, Tensor, Values
 from ..storage.atomic import is_url
 from ..storage.memory import ALWAYS, check_usable
-from .strips import Pixels, by_strips
+from .color import to_coded
+from .notes import Notes, transparency_note
+
+Pixels = Values
+"""Pixels (H, W, C) of any dtype."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 ENCODINGS = ("srgb", "linear")
 """Names of the encodings of pixels."""
@@ -67,16 +76,20 @@ def reason_of(error: BaseException) -> str:
 
 
 class EncodedImage(NamedTuple):
-    """The pixels of an image, and their encoding.
+    """The pixels of an image, and what is known about them.
 
     Attributes
     ----------
     pixels : array_like, shape (H, W), (H, W, 1) or (H, W, 3)
-    encoding : {"srgb", "linear"}
+    encoding : {"srgb", "linear"} or None
+        None if it is unknown; such pixels count as sRGB.
+    name : str
+        What errors call the image: the path of a file.
     """
 
     pixels: Any
-    encoding: str
+    encoding: str | None
+    name: str = "image"
 
 
 def check_encoding(encoding: str | None) -> None:
@@ -156,23 +169,62 @@ def scale_to_white(pixels: Pixels, peak: int) -> NDArray[np.float32]:
         return np.divide(pixels, peak, dtype=np.float32)
 
 
+def over_background(pixels: Pixels, alpha: str) -> tuple[Pixels, Notes]:
+    """Return colours without alpha, and a warning if some pixels were transparent.
+
+    Parameters
+    ----------
+    pixels : ndarray, shape (H, W, C)
+    alpha : str
+        See `eigengs_dr.image.read.Header`.
+    """
+    if alpha == "none":
+        return pixels, ()
+    peak = peak_of(pixels.dtype)
+    if not (pixels[..., -1] < peak).any():
+        return pixels[..., :-1], ()
+    if alpha == "light":
+        return pixels[..., :-1], transparency_note(alpha)
+
+    def blend(rows: Pixels) -> NDArray[np.float32]:
+        rows = scale_to_white(rows, peak)
+        if alpha == "associated":
+            return rows[..., :-1] + (1 - rows[..., -1:])
+        return 1 - rows[..., -1:] * (1 - rows[..., :-1])
+
+    return by_strips(blend, pixels, channels=pixels.shape[2] - 1), transparency_note(alpha)
+
+
+def floats_of(image: EncodedImage, keep_grey: bool = False) -> EncodedImage:
+    """Return an image in float32, see `to_floats`, after a check of its range."""
+    pixels, encoding = to_floats(image, keep_grey), image.encoding or "srgb"
+    _check_range(pixels, image.name, encoding)
+    return EncodedImage(pixels, encoding, image.name)
+
+
+def data_of(image: EncodedImage) -> NDArray[np.float32]:
+    """Return data in float32: one to three channels, of any finite values."""
+    pixels = to_floats(image, keep_grey=True, known=(1, 2, 3))
+    _check_range(pixels, image.name, "linear")
+    return pixels
+
+
+def codes_of(image: EncodedImage) -> NDArray[np.float32]:
+    """Return checked pixels as sRGB codes, above 1 for light above 1."""
+    return by_strips(to_coded, image.pixels) if image.encoding == "linear" else image.pixels
+
+
 def to_floats(
-    image: ArrayLike,
-    name: str,
-    keep_grey: bool = False,
-    copy: bool = True,
-    encoding: str | None = None,
-    known: tuple[int, ...] = (1, 3),
+    image: EncodedImage, keep_grey: bool = False, known: tuple[int, ...] = (1, 3)
 ) -> NDArray[np.float32]:
-    """Scale to float32 and replicate grey to RGB; errors refer to the image as `name`.
+    """Scale to float32 and replicate grey to RGB; pixels that need neither are not copied.
 
     Numbers of channels that are not `known` are refused.
-
-    The range of the pixels is checked if the encoding is given.
     """
-    check_floats(image, name, 1 if keep_grey else 3)
+    name = image.name
+    check_floats(image.pixels, name, 1 if keep_grey else 3)
     try:
-        array = np.asarray(image)
+        array = np.asarray(image.pixels)
     except ValueError:  # rows of unequal length
         raise ImageError(
             f"{name}: not an array; expected shape (H, W, 3); fit_many takes several images"
@@ -203,10 +255,8 @@ def to_floats(
     channels = array.shape[2] if keep_grey else 3
     pixels: NDArray[np.float32] = array
     usable = array.dtype == np.float32 and array.shape[2] == channels
-    if copy or not usable or not array.flags.c_contiguous:
+    if not usable or not array.flags.c_contiguous:
         pixels = by_strips(partial(scale_to_white, peak=peak), array, channels=channels)
-    if encoding is not None:
-        _check_range(pixels, name, encoding)
     return pixels
 
 
@@ -298,3 +348,97 @@ def is_tensor(value: object) -> TypeGuard[Tensor]:
     import drjit as dr
 
     return dr.is_tensor_v(kind) and dr.is_float_v(kind)
+
+
+# ---------------------------------------------------------------------------------------------
+#  Strips of rows
+# ---------------------------------------------------------------------------------------------
+
+# Temporary arrays are bounded, and several threads work. The borders of the strips depend only on
+# the size of the image, so a result does not depend on the number of threads.
+
+STRIP_PIXELS = 1 << 19
+"""Number of pixels of a strip. One plane of it takes 2 MB in single precision: larger strips do not
+fit into the cache; with smaller ones, threads wait for each other and borders of filters are
+computed twice."""
+
+MAX_THREADS = 8
+"""Largest number of threads: in Python, only one of them starts an operation at a time."""
+
+
+def strips(height: int, width: int) -> list[slice]:
+    """Divide an image into strips of about `STRIP_PIXELS` pixels.
+
+    Parameters
+    ----------
+    height, width : int
+        Size of the image in pixels.
+
+    Returns
+    -------
+    list of slice
+        The rows of each strip, from top to bottom.
+    """
+    rows = max(1, STRIP_PIXELS // max(width, 1))
+    return [slice(first, min(first + rows, height)) for first in range(0, height, rows)]
+
+
+def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """Call a function for every item on several threads, and return the results in order.
+
+    Parameters
+    ----------
+    function : callable
+        NumPy releases the interpreter lock, so operations on large arrays run in parallel.
+    items : iterable
+        A single item is processed in the calling thread.
+
+    Returns
+    -------
+    list
+        ``[function(item) for item in items]``; the first error is raised.
+    """
+    items = list(items)
+    threads = min(MAX_THREADS, available_cores(), len(items))
+    if threads < 2:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, items))
+
+
+def by_strips(
+    function: Callable[[Pixels], Pixels],
+    image: Pixels,
+    dtype: type[np.generic] = np.float32,
+    channels: int | None = None,
+) -> Pixels:
+    """Apply a pixelwise function to an image without large temporary arrays.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(rows)`` returns rows of the result, or one channel that is broadcast.
+    image : ndarray, shape (H, W, C)
+    dtype : dtype, optional
+        Type of the result.
+    channels : int, optional
+        Number of channels of the result, by default that of the image.
+
+    Returns
+    -------
+    ndarray of type `dtype`, shape (H, W, channels)
+    """
+    result = np.empty((*image.shape[:2], channels or image.shape[2]), dtype)
+
+    def fill(rows: slice) -> None:
+        result[rows] = function(image[rows])
+
+    map_threads(fill, strips(*image.shape[:2]))
+    return result
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -18,14 +18,12 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..backend.messages import printable
 from ..storage.memory import check_content
 from .formats import HAS_HEIF, HEIF_SUFFIXES, STARTS
-from .notes import GAIN_MAP, depth_notes, png_notes, primaries_note, profile_note, tell
-from .pixels import EncodedImage, ImageError, peak_of, reason_of, scale_to_white
-from .strips import Pixels, by_strips
+from .notes import GAIN_MAP, depth_notes, png_notes, primaries_note, profile_note
+from .pixels import ImageError, Pixels, by_strips, over_background, reason_of, scale_to_white
 
 if TYPE_CHECKING:
     import OpenImageIO as oiio
@@ -61,6 +59,8 @@ class Header(NamedTuple):
         Warnings about the file.
     upright : bool
         Whether `decode` applies the orientation.
+    kind : str or None
+        OpenImageIO's name of the format; None if Pillow reads the file.
     """
 
     width: int
@@ -73,6 +73,7 @@ class Header(NamedTuple):
     alpha: str = "none"
     notes: tuple[str, ...] = ()
     upright: bool = True
+    kind: str | None = None
 
     def check_memory(self, path: Path, as_floats: bool = True) -> None:
         """Reject a file whose pixels take too much memory; see `check_content`.
@@ -109,35 +110,30 @@ def read_header(path: Path, upright: bool = True) -> Header:
         If the header cannot be read or is not supported; see `load_image`.
     """
     with _image_errors(path):
-        if not _format_of(path):
+        kind = _format_of(path)
+        if not kind:
             return _picture_header(path, upright)
-        with _opened(path) as file:
+        with _opened(path, kind) as file:
             if not _has_gain_map(file):
                 return _header(path, file, upright)
         header = _picture_header(path, upright)
         return header._replace(notes=header.notes + GAIN_MAP)
 
 
-def decode(path: Path, header: Header, keep_grey: bool, name: str = "") -> EncodedImage:
-    """Return the pixels of a file, grey or RGB in the type of the file, and their encoding.
+def decode(path: Path, header: Header, keep_grey: bool) -> tuple[Pixels, str]:
+    """Return the pixels of a file, grey or RGB in its type, and what their alpha is.
 
-    Warnings refer to the file as `name`, by default its path. For warnings and errors see
-    `load_image`.
+    For errors see `load_image`.
     """
     with _image_errors(path):
-        kind = _format_of(path)
-        if kind == "openexr" and header.channels == 1 and not keep_grey:
+        if header.kind == "openexr" and header.channels == 1 and not keep_grey:
             raise ImageError(
                 "holds one channel, not R, G and B; read it as data (keep_grey=True, "
                 "--space data), or export it as RGB"
             )
-        pixels, alpha = _pixels(path, header) if kind else _picture(path, header.upright)
-    for note in header.notes:
-        tell(name or str(path), note)
-    pixels, transparent = over_background(pixels, alpha)
-    if transparent:
-        tell(name or str(path), transparency_note(alpha))
-    return EncodedImage(pixels, header.encoding)
+        if header.kind:
+            return _pixels(path, header, header.kind)
+        return _picture(path, header.upright)
 
 
 def _format_of(path: Path) -> str | None:
@@ -148,10 +144,15 @@ def _format_of(path: Path) -> str | None:
     OSError
         If the file cannot be opened.
     """
-    with path.open("rb") as file:
-        start = file.read(8)
+    start = _start_of(path, 8)
     kind = next((kind for first, kind in STARTS.items() if start.startswith(first)), None)
     return None if kind == "pnm" and not start[2:3].isspace() else kind
+
+
+def _start_of(path: Path, length: int) -> bytes:
+    """Return the first bytes of a file."""
+    with path.open("rb") as file:
+        return file.read(length)
 
 
 @contextmanager
@@ -196,37 +197,6 @@ def oriented(pixels: Pixels, orientation: int) -> Pixels:
     return pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
 
 
-def over_background(pixels: Pixels, alpha: str) -> tuple[Pixels, bool]:
-    """Return colours without alpha, and whether some pixels were transparent.
-
-    Parameters
-    ----------
-    pixels : ndarray, shape (H, W, C)
-    alpha : str
-        See `Header`.
-    """
-    if alpha == "none":
-        return pixels, False
-    peak = peak_of(pixels.dtype)
-    if not (pixels[..., -1] < peak).any():
-        return pixels[..., :-1], False
-    if alpha == "light":
-        return pixels[..., :-1], True
-
-    def blend(rows: Pixels) -> NDArray[np.float32]:
-        rows = scale_to_white(rows, peak)
-        if alpha == "associated":
-            return rows[..., :-1] + (1 - rows[..., -1:])
-        return 1 - rows[..., -1:] * (1 - rows[..., :-1])
-
-    return by_strips(blend, pixels, channels=pixels.shape[2] - 1), True
-
-
-def transparency_note(alpha: str) -> str:
-    """Return the warning about transparent pixels."""
-    return f"transparent pixels are shown over {'black' if alpha == 'light' else 'white'}"
-
-
 def _frames_note(frames: int) -> tuple[str, ...]:
     return (f"holds {frames} frames, the first is used",) if frames > 1 else ()
 
@@ -237,20 +207,20 @@ def _frames_note(frames: int) -> tuple[str, ...]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[oiio.ImageInput]:
+def _opened(path: Path, kind: str) -> Iterator[oiio.ImageInput]:
     """Open a file at its first image that is no thumbnail or mask, with alpha as it is stored."""
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
-    if _format_of(path) == "png":
+    if kind == "png":
         _check_png(path, b"IDAT")
     with _text_of(path) as name:
         file = oiio.ImageInput.open(name, config)
     if not file:
         raise _Unread(oiio.geterror().strip())
     try:
-        if file.format_name() != _format_of(path):  # some go by the suffix alone
+        if file.format_name() != kind:  # some go by the suffix alone
             raise ImageError(f"its suffix {path.suffix} is that of other files; rename it")
         while _is_reduced(file.spec()):
             if not file.seek_subimage(file.current_subimage() + 1, 0):
@@ -322,7 +292,7 @@ def _header(path: Path, file: oiio.ImageInput, upright: bool) -> Header:
     if alpha in ("straight", "associated"):
         needed = max(needed, stored + 4 * colors)
     pixels = (colors, needed, depth, encoding, orientation, alpha)
-    return Header(width, height, *pixels, notes, upright)
+    return Header(width, height, *pixels, notes, upright, kind)
 
 
 FLOATS = ("half", "float", "double")
@@ -423,13 +393,12 @@ _RADIANCE = {
 """EXIF orientation for each order of pixels in a Radiance file. OpenImageIO 3.2 swaps 6 and 8."""
 
 MAX_TEXT = 1 << 16
-"""Bytes of a file that are searched for what OpenImageIO does not tell."""
+"""Bytes of a file that are searched for what OpenImageIO and Pillow do not tell."""
 
 
 def _radiance(path: Path) -> tuple[int, tuple[str, ...]]:
     """Return the orientation of a Radiance file, and a warning about its primaries."""
-    with path.open("rb") as file:
-        text = file.read(MAX_TEXT)
+    text = _start_of(path, MAX_TEXT)
     order, primaries = _RESOLUTION.search(text), _PRIMARIES.search(text)
     orientation = _RADIANCE.get(order[1] + order[2], 1) if order else 1
     if not primaries:
@@ -456,28 +425,25 @@ def _check_png(path: Path, last: bytes) -> None:
 
 def _png_frames(path: Path) -> int:
     """Return the number of frames of an animated PNG file, 1 if it is not animated."""
-    with path.open("rb") as file:
-        found = re.search(rb"acTL(....)", file.read(MAX_TEXT).partition(b"IDAT")[0], re.S)
+    found = re.search(rb"acTL(....)", _start_of(path, MAX_TEXT).partition(b"IDAT")[0], re.S)
     return int.from_bytes(found[1], "big") if found else 1
 
 
-def _pixels(path: Path, header: Header) -> tuple[Pixels, str]:
+def _pixels(path: Path, header: Header, kind: str) -> tuple[Pixels, str]:
     """Return the pixels of a file with its orientation applied, and what their alpha is."""
     try:
-        if _format_of(path) == "png":
+        if kind == "png":
             _check_png(path, b"IEND")
-        with _opened(path) as file:
+        with _opened(path, kind) as file:
             spec = file.spec()
             if _is_palette(spec):
                 raise _Unread("its palette has other levels")
-            if _has_gain_map(file):
-                raise _Unread("its codes cannot be read")
             samples = file.read_image(file.current_subimage(), 0, 0, spec.nchannels, spec.format)
             reason = file.geterror().strip()
             if samples is None or reason:  # a JPEG file that is cut has both
                 raise _Unread(reason)
             pixels = _to_colors(samples.reshape(spec.height, spec.width, -1), spec)
-            if file.format_name() == "openexr":
+            if kind == "openexr":
                 pixels = _in_display(pixels, spec)
         orientation = header.orientation if header.upright else 1
         return oriented(pixels, orientation), header.alpha
@@ -546,10 +512,10 @@ def has_windows(path: Path, header: Header) -> bool:
     Files that are turned, that OpenImageIO converts as a whole or from the first row on, and those
     that Pillow reads, are better decoded once.
     """
-    if _format_of(path) != "tiff" or header.orientation != 1:
+    if header.kind != "tiff" or header.orientation != 1:
         return False
     try:
-        with _opened(path) as file:
+        with _opened(path, header.kind) as file:
             spec = file.spec()
             values = _band_rows(spec) * (spec.tile_width or spec.width) * spec.nchannels
             name, codec = (spec.getattribute(key) for key in ("tiff:ColorSpace", "compression"))
@@ -613,7 +579,7 @@ def read_window(path: str, rows: slice, columns: slice) -> Pixels:
         If the file is missing or damaged.
     """
     try:
-        with _opened(Path(path)) as file:
+        with _opened(Path(path), "tiff") as file:
             spec, step, parts = file.spec(), _band_rows(file.spec()), []
             for top in range(rows.start // step * step, rows.stop, step):
                 band = _read_band(file, slice(top, top + step), columns)
@@ -642,9 +608,7 @@ def _opened_picture(path: Path) -> Iterator[Image]:
     """Open a file with Pillow; nothing is decoded yet."""
     from PIL import Image
 
-    with path.open("rb") as file:
-        is_heif = file.read(8)[4:] == b"ftyp"
-    if is_heif and HAS_HEIF:
+    if HAS_HEIF and _start_of(path, 8)[4:] == b"ftyp":
         from pillow_heif import register_heif_opener
 
         register_heif_opener()
@@ -666,7 +630,7 @@ def _picture_header(path: Path, upright: bool) -> Header:
         notes = profile_note(image.info.get("icc_profile") or b"", "srgb", space)
         # The other pictures of an MPO file are a gain map or previews.
         frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
-        notes += depth_notes(path, image) + _frames_note(frames)
+        notes += depth_notes(image, _start_of(path, MAX_TEXT)) + _frames_note(frames)
     needed = TRANSPARENT_BYTES[channels] if transparent else OPAQUE_BYTES[channels]
     if upright or orientation not in range(1, 9):
         orientation = 1

@@ -18,8 +18,7 @@ from ..backend.messages import shown
 from ..storage.npz import BadValue
 from . import color
 from .color import Samples
-from .pixels import MAX_PIXEL, MIN_PIXEL, ImageError
-from .strips import by_strips
+from .pixels import MAX_PIXEL, MIN_PIXEL, ImageError, by_strips
 
 Image = NDArray[np.float32]
 

@@ -133,8 +133,8 @@ def fit_many(
         select(settings.backend)  # a missing backend is an error before any work
     job = Job(
         partial(_fit_group, options=settings),
-        partial(_may_join, options=settings),
         partial(_read, options=settings),
+        partial(_may_join, options=settings),
         settings.iterations,
         _digest_of(settings),
     )
@@ -142,7 +142,7 @@ def fit_many(
 
 
 def _read(image: Any, name: str, options: FitOptions) -> EncodedImage:
-    """Read an image, or data. An array is copied, because its owner may overwrite it."""
+    """Read an image, or data."""
     if not (options.space or YCBCR).is_color:
         return EncodedImage(check_data(image), "srgb")
     return read_floats(image, encoding=options.encoding)

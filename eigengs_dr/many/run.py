@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 import os
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -28,16 +27,14 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from ..backend.interrupts import Interrupted, defer_interrupts
-from ..backend.messages import warn
 from ..backend.recording import exclusive
 from ..cluster import Executor, executor_for
 from ..fitting.fit import Fit
 from ..gaussian.file import FitFigures, write_set
 from ..gaussian.gaussians import Gaussians
 from ..image.folder import read_ahead
-from ..image.io import read_floats
 from ..image.metrics import psnr
-from ..image.notes import NotedImages, kept_notes, series, tell_all
+from ..image.notes import NotedImages, kept_warnings, series, tell_all
 from ..image.pixels import EncodedImage
 from ..raster.render import render
 from ..storage.atomic import lock_folder, refuse_url, remove_stale
@@ -100,11 +97,11 @@ class Job(NamedTuple):
     ----------
     work : callable
         ``work(images)`` returns the results of a group, in order.
+    read : callable
+        ``read(image, name)`` reads an image, whose warnings name it so if it is no file.
     may_join : callable
         ``may_join(group, image)`` returns whether an image may join a group that is not empty; by
         default none may.
-    read : callable
-        ``read(image, name)`` reads an image, whose warnings name it so if it is no file.
     steps : int
         Number of descent steps per image, as a measure of the work.
     options : str
@@ -114,8 +111,8 @@ class Job(NamedTuple):
     """
 
     work: Callable[[list[EncodedImage]], list[Fit] | list[Gaussians]]
+    read: Callable[[Any, str], EncodedImage]
     may_join: Callable[[list[EncodedImage], EncodedImage], bool] | None = None
-    read: Callable[[Any, str], EncodedImage] = lambda image, name: read_floats(image)
     steps: int = 0
     options: str = ""
     measures: bool = False
@@ -258,7 +255,10 @@ def run_here(sources: Iterable[RunImage], job: Job) -> Generator[Finished, None,
 def _decode(source: RunImage, job: Job) -> Decoded:
     """Read one image. An array is copied, because its owner may overwrite it."""
     try:
-        return source, job.read(source.image, source.name)
+        image = job.read(source.image, source.name)
+        if source.path is None:
+            image = image._replace(pixels=np.array(image.pixels))
+        return source, image
     except FAILURES as error:
         return source, error
 
@@ -401,10 +401,8 @@ def run_on_workers(
     for last, tasks in enumerate(chunks):
         with closing(executor.map(run_chunk, tasks, (job, keep, Path.cwd()))) as ended:
             for chunk, result, lost in ended:
-                rows, noted, notes = result or ([_lost(s, lost) for s in chunk], {}, [])
+                rows, noted = result or ([_lost(s, lost) for s in chunk], {})
                 tell_all(noted)
-                for text in notes:
-                    warn(text)
                 for source, (row, is_transient) in zip(chunk, rows, strict=True):
                     if is_transient and not last:
                         retries.append(source)
@@ -423,14 +421,13 @@ def _lost(source: RunImage, lost: str) -> ChunkRow:
 
 def run_chunk(
     chunk: list[RunImage], shared: tuple[Job, bool, Path]
-) -> tuple[list[ChunkRow], NotedImages, list[str]]:
-    """Process the images of a chunk on a worker; return their rows, notes and other warnings.
+) -> tuple[list[ChunkRow], NotedImages]:
+    """Process the images of a chunk on a worker; return their rows, and the warnings.
 
     Names in the rows are as the user gave them, relative to the folder of the client.
     """
     job, keep, folder = shared
-    with kept_notes() as noted, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
+    with kept_warnings() as noted:
         ended = list(run_here((_absolute(source, folder) for source in chunk), job))
     rows = []
     for source, (_, row) in zip(chunk, ended, strict=True):
@@ -438,8 +435,7 @@ def run_chunk(
         result = row.result if keep and not row.error else None
         row = replace(row, input=source.path, output=source.output, result=result)
         rows.append((row, is_transient))
-    texts = [str(n.message) for n in caught if issubclass(n.category, UserWarning)]
-    return rows, noted, texts
+    return rows, noted
 
 
 def _absolute(source: RunImage, folder: Path) -> RunImage:

@@ -18,10 +18,18 @@ from numpy.typing import DTypeLike, NDArray
 from ..backend.types import Record, Values
 from ..gaussian.file import MAX_SET_SIDE
 from ..image.formats import check_room, raise_reason
-from ..image.io import ImageError, check_data, check_image, is_pipe, pixels_of, read_file
-from ..image.notes import tell
-from ..image.pixels import encoding_of, local_path
-from ..image.read import decode, has_windows, read_header, read_window, transparency_note
+from ..image.io import is_pipe, read_image
+from ..image.notes import tell, transparency_note
+from ..image.pixels import (
+    EncodedImage,
+    ImageError,
+    codes_of,
+    data_of,
+    floats_of,
+    local_path,
+    over_background,
+)
+from ..image.read import decode, has_windows, read_header, read_window
 
 Pixels = Values
 """Pixels (h, w) or (h, w, channels) of any dtype."""
@@ -55,13 +63,8 @@ class Window(NamedTuple):
         ImageError
             If the file cannot be read, a pixel is not finite, or sRGB is far outside [0, 1].
         """
-        pixels = self.load()
-        try:
-            if self.keep_grey:
-                return check_data(pixels, copy=False)
-            return check_image(pixels, copy=False, encoding=self.encoding)
-        except ImageError as error:
-            raise ImageError(f"{self.name}: {str(error).removeprefix('image: ')}") from None
+        part = EncodedImage(self.load(), self.encoding, self.name)
+        return data_of(part) if self.keep_grey else codes_of(floats_of(part))
 
 
 @dataclass(frozen=True)
@@ -128,26 +131,24 @@ def open_source(source: Any, keep_grey: bool = False, encoding: str | None = Non
     ImageError
         If there is no such file, it is not an image, or the shape or the size is wrong.
     """
-    source = pixels_of(source)
-    if isinstance(source, (str, os.PathLike)) and is_pipe(source):
-        source, encoding = read_file(source, keep_grey, encoding)
-    if isinstance(source, (str, os.PathLike)):
+    if isinstance(source, (str, os.PathLike)) and not is_pipe(source):
         name, file = str(source), local_path(source)
         identity = _identity(file)
         shape, pixels, file_encoding = _open_file(file, keep_grey)
         encoding = encoding or file_encoding
-    elif hasattr(source, "shape") and hasattr(source, "dtype"):
-        name, shape, pixels = "image", tuple(int(side) for side in source.shape), source
-        identity = {"shape": list(shape), "dtype": np.dtype(source.dtype).str}
-        encoding = encoding_of(source, encoding) or "srgb"
     else:
-        kind = type(source).__name__
-        raise ImageError(f"image: is a {kind}; pass a file or an array of shape (H, W, 3)")
+        pixels, encoding, name = read_image(source, keep_grey, encoding)
+        if not (hasattr(pixels, "shape") and hasattr(pixels, "dtype")):
+            kind = type(pixels).__name__
+            raise ImageError(f"image: is a {kind}; pass a file or an array of shape (H, W, 3)")
+        shape = tuple(int(side) for side in pixels.shape)
+        identity = {"shape": list(shape), "dtype": np.dtype(pixels.dtype).str}
     if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (1, 3)):
         raise ImageError(f"{name}: shape {shape}, expected (H, W) or (H, W, 3)")
     _check_sides(name, shape)
     channels = 1 if keep_grey and shape[2:] in ((), (1,)) else 3
-    return Source(shape[1], shape[0], channels, name, identity, pixels, keep_grey, encoding)
+    height, width = shape[:2]
+    return Source(width, height, channels, name, identity, pixels, keep_grey, encoding or "srgb")
 
 
 def _identity(path: Path) -> Record:
@@ -177,14 +178,15 @@ def _open_file(path: Path, keep_grey: bool) -> tuple[tuple[int, ...], str | Pixe
     header = read_header(path)
     shape = header.height, header.width, header.channels
     _check_sides(str(path), shape)
+    pixels: str | Pixels = absolute
     if has_windows(path, header):
-        shown = (transparency_note(header.alpha),) if header.alpha != "none" else ()
-        for note in header.notes + shown:
-            tell(str(path), note)
-        return shape, absolute, header.encoding
-    header.check_memory(path, as_floats=False)
-    pixels, encoding = decode(path, header, keep_grey)  # 8-bit files are not converted to floats
-    return shape, pixels, encoding
+        shown = transparency_note(header.alpha)
+    else:
+        header.check_memory(path, as_floats=False)  # 8-bit files are not converted to floats
+        pixels, shown = over_background(*decode(path, header, keep_grey))
+    for note in (*header.notes, *shown):
+        tell(str(path), note)
+    return shape, pixels, header.encoding
 
 
 def _check_sides(name: str, shape: tuple[int, ...]) -> None:

@@ -63,11 +63,14 @@ class Comparison(NamedTuple):
         Target of the compensation for the rounding, in the space of the set.
     extra_error : float
         Mean squared error that is not included in `error`, and is added to it.
+    dead_zone : float
+        Fraction of a step by which colours are rounded towards 0.
     """
 
     error: Callable[[Gaussians], float]
     target: Array
     extra_error: float
+    dead_zone: float = DEAD_ZONE
 
 
 def round_within(
@@ -116,11 +119,14 @@ def round_within(
         return Attempt(max(shares), packed, after[-1])  # the worst prefix counts
 
     def plain(octaves: float) -> Attempt:
-        return evaluate(quantize_sections(gaussians, _steps(gaussians, octaves), rows))
+        steps = _steps(gaussians, octaves)
+        return evaluate(quantize_sections(gaussians, steps, rows, compared.dead_zone))
 
     def compensated(octaves: float) -> Attempt:
         steps = _steps(gaussians, octaves)
-        return evaluate(quantize_with_feedback(gaussians, compared.target, steps))
+        return evaluate(
+            quantize_with_feedback(gaussians, compared.target, steps, compared.dead_zone)
+        )
 
     best = largest_within(plain)
     if len(rows) == 1:  # compensation for the full set would harm its prefixes
@@ -245,7 +251,9 @@ FEEDBACK_RATE = 0.2
 """Learning rates of this descent, relative to those of `fit`, because the optimum is near."""
 
 
-def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) -> EgsContent:
+def quantize_with_feedback(
+    gaussians: Gaussians, target: Array, steps: Steps, dead_zone: float
+) -> EgsContent:
     """Round a set, while the Gaussians that are not yet rounded compensate.
 
     Parameters
@@ -255,6 +263,8 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
     target : ndarray, shape (H, W, C)
         Target of the rendering, in the space of the set.
     steps : Steps
+    dead_zone : float
+        See `Comparison`.
 
     Returns
     -------
@@ -276,7 +286,7 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
     for group in range(groups):
         arrays, in_group = current.to_arrays(), group_of[free] == group
         selected = {name: arrays[name][in_group] for name in ("mean", "factor", "color")}
-        done.append(quantize(selected, steps, DEAD_ZONE))
+        done.append(quantize(selected, steps, dead_zone))
         free = free[~in_group]
         if not len(free):
             break
@@ -290,10 +300,12 @@ def quantize_with_feedback(gaussians: Gaussians, target: Array, steps: Steps) ->
     return _content(gaussians, [symbols], steps, current.to_arrays()["background"])
 
 
-def quantize_sections(gaussians: Gaussians, steps: Steps, rows: list[slice]) -> EgsContent:
+def quantize_sections(
+    gaussians: Gaussians, steps: Steps, rows: list[slice], dead_zone: float
+) -> EgsContent:
     """Round a set without compensation, divided into sections by ranges of Gaussians."""
     arrays = gaussians.to_arrays()
-    symbols = quantize(arrays, steps, DEAD_ZONE)
+    symbols = quantize(arrays, steps, dead_zone)
     return _content(gaussians, [symbols.select(r) for r in rows], steps, arrays["background"])
 
 

@@ -314,6 +314,11 @@ def sum_by_image(values: Float, grid: Grid) -> Float:
     return dr.block_sum(values, dr.width(values) // grid.images)
 
 
+def spread(values: Float, image: UInt | None) -> Float:
+    """Return the value of the image of each entry; `image` is None if there is only one."""
+    return values if image is None else dr.gather(type(values), values, image)
+
+
 def channel_sums(image: Float, channels: int, grid: Grid) -> list:
     """Sum each channel of images in tile layout; return a list of Float, shape (images,).
 

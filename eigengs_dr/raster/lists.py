@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 
 from ..backend.arrays import ArrayTypes, make_divisor, sorting_index, types_of, upload
 from ..backend.recording import record
@@ -179,7 +179,8 @@ def build_lists(
     types = types_of(shape[0])
     # Numbers are in arrays: as literals, each value would compile a program of its own.
     layout, wide = grid.in_arrays(types), dr.opaque(types.Float, radius * growth)
-    pad = dr.opaque(types.Float, pad) if isinstance(pad, float) else pad
+    if isinstance(pad, float):  # one for each Gaussian, as from a fit: one program for both
+        pad = dr.opaque(types.Float, pad, dr.width(shape[0]))
     share = granularity_of(types)
     touched, totals = _count_tiles(shape, radius, wide, layout, pad)
     narrow, entries = divmod(int(totals[0]), 1 << 40)  # one copy to the host
@@ -362,7 +363,7 @@ def _find_tiles(
     owner = _search(count, last, i + 1)
     real = owner < count
     owner_shape = [dr.gather(types.Float, row, owner, real) for row in shape]
-    pad = pad if dr.width(pad) == 1 else dr.gather(types.Float, pad, owner, real)
+    pad = dr.gather(types.Float, pad, owner, real)
     row, stop = tile_rows(owner_shape, radius, grid, pad)
 
     def visit(row: UInt, left: UInt, tile: UInt) -> tuple:
@@ -503,21 +504,15 @@ def transpose_by_counting(
         Range ``[starts[t], starts[t + 1])`` of tile t in `splat`.
     """
     starts = np.concatenate([[0], last.numpy()]).astype(np.int32)
-    by_tile = transpose_pattern(tile.numpy()[:entries].view(np.int32), starts, number)
+    columns = tile.numpy()[:entries].view(np.int32)
+    # The values are not used: memory that is never written takes no space.
+    pattern = csr_array((np.empty(entries, np.int8), columns, starts), (len(last), number))
+    by_tile = pattern.tocsc()  # its indices ascend
     splat = dr.empty(types.UInt, capacity)
     dr.eval(splat)
     memory = splat.numpy()  # on llvm a view: no second copy of the largest array
     memory[:entries], memory[entries:] = by_tile.indices, 0
     return splat, upload(types.UInt, by_tile.indptr.view(np.uint32))
-
-
-def transpose_pattern(
-    columns: NDArray[np.int32], starts: NDArray[np.int32], number: int
-) -> csc_array:
-    """Return the transpose of a sparse pattern of rows, with its indices in ascending order."""
-    # The values are not used: memory that is never written takes no space.
-    unused = np.empty(len(columns), np.int8)
-    return csr_array((unused, columns, starts), shape=(len(starts) - 1, number)).tocsc()
 
 
 def transpose_by_sorting(

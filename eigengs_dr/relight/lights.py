@@ -17,6 +17,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, upload
 from ..backend.messages import printable, warn
@@ -25,6 +26,7 @@ from ..image.folder import find_lists as find_lists
 from ..image.pixels import ImageError
 from ..storage.memory import open_regular
 from ..storage.npz import BadValue
+from .directions import LatLong
 
 HORIZON = -0.02
 """Smallest z of a light: a measured light at the horizon may be a degree below it."""
@@ -37,6 +39,15 @@ MIN_Z = 1e-4
 
 KINDS = ("thin_plate", "hsh")
 """Ways to interpolate between lights, see `LightTable`."""
+
+FOLDS = 8
+"""Number of parts of the lights, each left out once."""
+
+SEARCHED = LatLong(200, 100)
+"""Directions among which a light is found: 10,000 above the horizon, 1.8 degrees apart."""
+
+SHRINKAGE = 0.2
+"""How far covariances of factors between planes are drawn to 0: they are of few photos."""
 
 
 def read_lights(path: PathLike, photos: Any = None) -> tuple[list[Any], Doubles]:
@@ -249,6 +260,12 @@ def check_spread(lights: Doubles) -> None:
         warn("lights: all lie on one arc over the object; what other lights show is a guess")
 
 
+def folds(lights: Doubles) -> list[NDArray[np.bool_]]:
+    """Return which lights each part leaves out."""
+    count = min(FOLDS, len(lights))
+    return [np.arange(len(lights)) % count == fold for fold in range(count)]
+
+
 @dataclass(frozen=True, eq=False)
 class LightTable:
     """The factors of planes for every light: known for some, interpolated between them.
@@ -288,6 +305,45 @@ class LightTable:
         """Return the factors for directions (m, 3) of length 1, shape (m, 3, K + 1)."""
         rows = functions_at(self.kind, self.lights, lights)
         return np.tensordot(rows, self.coefficients, 1)
+
+    def changes(self) -> Doubles:
+        """Return the factors minus those that a table of other lights gives, (n, 3, K + 1)."""
+        changes = self.values.copy()
+        for out in folds(self.lights):
+            others = replace(self, lights=self.lights[~out], values=self.values[~out])
+            changes[out] -= others.at(self.lights[out])
+        return changes
+
+    def find(self, shown: Doubles, noise: Doubles) -> tuple[Doubles, float]:
+        """Return the light of a photo that shows some factors, see `Relightable.find_light`.
+
+        Between the factors of the photo and those of a table that has not seen it there is a
+        difference e, whose covariance C is that of `changes`. Its density is that of a Student
+        distribution, as C is estimated from n photos: ``(1 + e^T C^-1 e / n)^(-(n + 1) / 2)``
+        (A. Gelman et al.: Bayesian data analysis, CRC Press 2013, section 3.6).
+
+        Parameters
+        ----------
+        shown : ndarray of float64, shape (3, K + 1)
+        noise : ndarray of float64, shape (K + 1, K + 1)
+            Covariance of these factors by the noise of a colour of the photo.
+        """
+        directions = SEARCHED.directions().reshape(-1, 3)
+        above = directions[:, 2] > 0
+        lights, areas = directions[above], np.repeat(SEARCHED.areas(), SEARCHED.width)[above]
+        count = len(self.lights)
+        changes = self.changes().reshape(count, -1)
+        covariance = changes.T @ changes / count
+        covariance *= 1 - SHRINKAGE * (1 - np.eye(len(covariance)))
+        covariance += np.kron(np.eye(3), noise)
+        difference = (self.at(lights) - shown).reshape(len(lights), -1)
+        squares = (difference @ np.linalg.inv(covariance) * difference).sum(axis=1)
+        ratio = (count + squares.min()) / (count + squares)  # times a constant, against underflow
+        weights = areas * ratio ** ((count + 1) / 2)
+        light = weights @ lights
+        light /= np.linalg.norm(light)
+        angles = np.degrees(np.arccos(np.minimum(lights @ light, 1)))
+        return light, float(np.sqrt(np.average(np.square(angles), weights=weights)))
 
     def factors(self, types: ArrayTypes, light: Sequence[Float]) -> list[list[Float]]:
         """Return the factors for one direction of any length, three lists of K + 1 Floats.

@@ -21,13 +21,15 @@ from ..backend.doors import class_of_doors, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..codec.egs import is_packed, read_egs
+from ..eigenbasis.incremental import product
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
 from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
 from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.color import to_linear
-from ..image.io import read_floats
-from ..image.pixels import encoding_of
+from ..image.io import read_floats, read_photo
+from ..image.metrics import MAX_PSNR
+from ..image.pixels import ImageError, codes_of, encoding_of
 from ..image.read import is_picture
 from ..image.resize import resample
 from ..image.space import DATA, LINEAR, RGB
@@ -35,7 +37,15 @@ from ..raster.render import render
 from ..storage import npz
 from ..storage.npz import BadValue, Field, file_errors
 from .directions import LatLong
-from .fit import find_planes, fit_planes, most_planes, read_photos
+from .fit import (
+    MAX_PSNR_DROP,
+    ROUNDING,
+    find_planes,
+    fit_fewest,
+    fit_planes,
+    most_planes,
+    read_photos,
+)
 from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
 
 VERSION = 1
@@ -64,7 +74,8 @@ class Relightable:
     Attributes
     ----------
     planes : Gaussians
-        The planes, in the space "data": a channel for each. A light is a sum of them.
+        The planes, in the space "data": a channel for each. A light is a sum of them. Their mean
+        squared errors add up to that of photos that were left out.
     table : LightTable
         The factors of the planes for every light.
     psnr_held_out : float
@@ -99,6 +110,7 @@ class Relightable:
         *,
         gaussians: int | None = None,
         planes: int | None = None,
+        max_psnr_drop: float | None = None,
         iterations: int = 300,
         seed: int = 0,
         encoding: str | None = None,
@@ -121,9 +133,13 @@ class Relightable:
             directions. By default the only such file in the folder. A list is paired with files by
             name, and with arrays in order.
         gaussians : int, optional
-            Number of Gaussians, by default one for 16 pixels.
+            Number of Gaussians. By default one for 16 pixels, halved once or twice within the
+            budget, as short tries predict.
         planes : int, optional
-            Number of planes. By default as many as left-out lights need.
+            Number of planes. By default the smallest within the budget.
+        max_psnr_drop : float, optional
+            The budget: decibels of left-out lights that a model may lose, by default 0.4. Half of
+            it may go to fewer planes than are best, and half to fewer Gaussians.
         iterations : int, optional
             Number of steps of the fit of the planes.
         encoding : {"srgb", "linear"}, optional
@@ -144,14 +160,26 @@ class Relightable:
             At Ctrl-C or SIGTERM during the fit of the planes; its ``result`` is the model of the
             best set so far.
         """
+        if max_psnr_drop is not None and gaussians is not None and planes is not None:
+            raise ValueError("max_psnr_drop finds numbers; leave out gaussians, planes or it")
+        budget = MAX_PSNR_DROP if max_psnr_drop is None else max_psnr_drop
+        if not 0 < budget <= MAX_PSNR:
+            raise ValueError(
+                f"max_psnr_drop is {budget:g}; it must be above 0 and at most {MAX_PSNR:g} dB, "
+                f"such as {MAX_PSNR_DROP}"
+            )
         read = read_photos(photos, lights, encoding)
         most = most_planes(len(read.lights))
         if planes is not None and not 1 <= planes <= most:
             raise ValueError(f"planes is {planes}; {len(read.lights)} photos have 1 to {most}")
         brightest = max(1.0, float(read.rows.max()))
-        found = find_planes(read, planes)
+        found = find_planes(read, planes, budget / 2).for_left_out()
         del read  # the photos take more memory than the fit
-        result = fit_planes(found.images, gaussians, iterations, seed, backend, progress)
+        options = iterations, seed, backend, progress
+        if gaussians is None:
+            result = fit_fewest(found, budget / 2, *options)
+        else:
+            result = fit_planes(found.images, gaussians, *options)
         shown = result.image.reshape(found.images.shape)
         model = cls(result.gaussians, found.table, found.psnr_held_out(shown), brightest)
         if result.stopped == "interrupted":
@@ -233,6 +261,48 @@ class Relightable:
         space = LINEAR.above_white if total.max() > 1 else LINEAR
         start = with_colors(self.planes, np.zeros((len(self.planes) + 1, 3)), space)
         return solve(start, Pixels.plain(total, start, space.weight(total)))
+
+    def find_light(self, photo: Any, *, encoding: str | None = None) -> tuple[Doubles, float]:
+        """Find the light of a photo of the object, from the same camera with the same exposure.
+
+        Directions above the horizon are compared, by how well the photos of the model tell each
+        other: planes that are badly interpolated between lights count less.
+
+        Parameters
+        ----------
+        photo, encoding
+            As the photos of `fit`, and of their size.
+
+        Returns
+        -------
+        light : ndarray of float64, shape (3,)
+            The mean of the directions that the photo may have been lit from; a unit vector.
+        angle : float
+            Its uncertainty: the root mean square angle between these directions and their mean, in
+            degrees. Large where photos differ little, as those of a flat object may.
+
+        Raises
+        ------
+        ValueError
+            If the photo cannot be used, or is of another size than those of the model.
+        OSError
+            If a file cannot be opened.
+        """
+        width, height = self.planes.width, self.planes.height
+        pixels = codes_of(read_photo(photo, encoding, upright=False))
+        if pixels.shape[:2] != (height, width):
+            raise ImageError(
+                f"photo: is {pixels.shape[1]}x{pixels.shape[0]}, but those of the model are "
+                f"{width}x{height}; scale it to that size"
+            )
+        colors = pixels.reshape(-1, 3).T
+        images = render(self.planes).numpy().astype(np.float32).reshape(colors.shape[1], -1).T
+        images = np.vstack([images, np.ones((1, colors.shape[1]), np.float32)])
+        moments = product(images, images) / images.shape[1]
+        moments += UNSEEN * np.trace(moments) * np.eye(len(moments))
+        inverse = np.linalg.inv(moments)
+        shown = inverse @ product(images, colors) / images.shape[1]
+        return self.table.find(shown.T, ROUNDING * inverse)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
@@ -328,6 +398,9 @@ def or_camera(light: Any) -> Any:
     return dr.select(dr.isfinite(length) & (length > 0), light, type(light)(0, 0, 1))
 
 
+UNSEEN = 1e-7
+"""Added to the moments of planes, times their trace: what no Gaussian shows tells no light."""
+
 ENVIRONMENT_SIZE = (32, 16)
 """Width and height to which environments are averaged: 256 directions above the horizon."""
 
@@ -347,7 +420,7 @@ def environment_lights(environment: object) -> tuple[Doubles, Doubles]:
     """
     told = isinstance(environment, (str, os.PathLike)) or is_picture(environment)
     encoding = None if told else encoding_of(environment) or "linear"
-    pixels, encoding = read_floats(environment, encoding=encoding)
+    pixels, encoding, _ = read_floats(environment, encoding=encoding)
     light = to_linear(pixels) if encoding == "srgb" else pixels
     if light.min() < 0:
         raise ValueError(
@@ -372,22 +445,24 @@ _BRIGHTEST = struct.Struct("<f")
 """The largest code of photos."""
 
 
-def table_bytes(model: Relightable) -> bytes:
-    """Return the table of a model for an ``.egs`` file: 16 bits per coordinate, 8 per factor.
+def table_bytes(model: Relightable, width: int = 1) -> bytes:
+    """Return the table of a model for an ``.egs`` file: 16 bits per coordinate, 8 or 16 per factor.
 
     It has the kind and K, the number of planes, both uint8; n, the number of lights, uint16; the
     smoothing, float32; the PSNR of left-out photos, float64; K + 1 scales, float32; directions,
-    (n, 3) int16 over 32767; values, (n, 3, K + 1) int8 times the scales; and where photos are
-    brighter than white their largest code, float32. Rounding is 40 dB below the contrast of the
-    photos.
+    (n, 3) int16 over 32767; values, (n, 3, K + 1) int8 or int16 times the scales; and where photos
+    are brighter than white their largest code, float32. Rounding to 8 bits is 40 dB below the
+    contrast of the photos.
     """
     table, planes = model.table, model.planes.channels
     head = _HEAD.pack(
         KINDS.index(table.kind), planes, len(table.lights), table.smoothing, model.psnr_held_out
     )
-    scale = (np.abs(table.values).max(axis=(0, 1), initial=1e-6) / 127).astype("<f4")
+    kind = np.dtype(f"<i{width}")
+    scale = np.abs(table.values).max(axis=(0, 1), initial=1e-6) / np.iinfo(kind).max
+    scale = scale.astype("<f4")
     lights = np.round(table.lights * 32767).astype("<i2")
-    values = np.round(table.values / scale).astype(np.int8)
+    values = np.round(table.values / scale).astype(kind)
     brightest = _BRIGHTEST.pack(model.brightest) if model.brightest > 1 else b""
     return head + scale.tobytes() + lights.tobytes() + values.tobytes() + brightest
 
@@ -399,12 +474,14 @@ def read_table(content: bytes, channels: int) -> tuple[LightTable, float, float]
     kind, planes, count, smoothing, psnr = _HEAD.unpack_from(content)
     sizes = [4 * (planes + 1), 6 * count, 3 * (planes + 1) * count]
     rest = len(content) - _HEAD.size - sum(sizes)
+    width = 2 if rest >= sizes[2] else 1
+    rest, sizes[2] = rest - (width - 1) * sizes[2], width * sizes[2]
     if rest not in (0, _BRIGHTEST.size) or planes != channels:
         raise BadValue("the table of lights has another size; copy the file again")
     ends = (_HEAD.size + np.cumsum(sizes)).tolist()
     scale = np.frombuffer(content[_HEAD.size : ends[0]], "<f4").astype(np.float64)
     lights = np.frombuffer(content[ends[0] : ends[1]], "<i2").reshape(count, 3) / 32767
-    rounded = np.frombuffer(content[ends[1] : ends[2]], np.int8).reshape(count, 3, planes + 1)
+    rounded = np.frombuffer(content[ends[1] : ends[2]], f"<i{width}").reshape(count, 3, planes + 1)
     name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
     table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
     brightest = check_brightest(_BRIGHTEST.unpack_from(content, ends[2])[0] if rest else 1.0)

@@ -24,9 +24,8 @@ from ..backend.doors import door, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.selection import backend_of, select
 from ..backend.types import ArrayLike, Texture
-from ..fitting.channels import restored
+from ..fitting.channels import Measured, restored
 from ..fitting.loop import Descent
-from ..fitting.measure import Measured
 from ..fitting.method import DEFAULT
 from ..fitting.objective import Objective, Pixels
 from ..fitting.options import Goal
@@ -34,7 +33,7 @@ from ..fitting.search import search_count
 from ..gaussian.covariance import max_deviation
 from ..gaussian.file import CUTOFF
 from ..gaussian.gaussians import Gaussians
-from ..image.io import check_data, check_image
+from ..image.io import displayed
 from ..image.metrics import psnr as psnr_of
 from ..image.pixels import check_encoding
 from ..image.space import DATA, LINEAR, Affine, Space, space_of
@@ -282,7 +281,7 @@ def seen_image(
     encoding: str | None,
 ) -> SeenImage:
     """Find out what the cameras of a scene see of an image; for arguments see `fit_for_scene`."""
-    checked = check_image(image, encoding=encoding) if space.is_color else check_data(image)
+    checked = displayed(image, space, encoding)
     low, high = float(checked.min()), float(checked.max())
     if not space.is_color and (low < -ROUNDING or high > 1 + ROUNDING):
         raise ValueError(

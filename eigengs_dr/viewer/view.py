@@ -24,9 +24,9 @@ from ..eigenbasis.eigengs import EigenGS
 from ..fitting.fit import Fit
 from ..gaussian.file import check
 from ..gaussian.gaussians import Gaussians, one_image, set_of
-from ..image.io import Codes, codes_of, displayed, read_file, read_photo
+from ..image.io import Codes, displayed, read_photo
 from ..image.metrics import psnr
-from ..image.pixels import check_encoding
+from ..image.pixels import check_encoding, codes_of
 from ..image.resize import resample
 from ..raster.render import picture_of
 from ..relight.lights import check_lights
@@ -149,7 +149,7 @@ def view(
     if encoding and image is None:
         raise ValueError("encoding is for the pixels of an image; leave it out, or give one")
     model = source if isinstance(source, EigenGS) else None
-    lights, presets = None, []
+    lights, presets, pixels = None, [], None
     if isinstance(source, Relightable):
         if image is not None and light is None:
             raise ValueError(
@@ -161,12 +161,14 @@ def view(
         presets = light_presets(source)
         if image is not None:
             presets.insert(0, ("As in the photo", start))
-        pixels = None if image is None else _stored(image, encoding)
+            # Lights belong to the pixels that a file stores, as in `Relightable.fit`.
+            pixels = codes_of(read_photo(image, encoding, arrays="srgb", upright=False))
     else:
         if light is not None:
             raise ValueError("light is for a model of lights; leave it out")
         gaussians = one_image(set_of(source)) if model is None else model.gaussians
-        pixels = None if image is None else displayed(image, gaussians.space, encoding)
+        if image is not None:
+            pixels = displayed(image, gaussians.space, encoding)
     model_facts, note = None, ""
     if model is not None:
         counts = kept_counts(model)
@@ -182,7 +184,7 @@ def view(
         shown = picture_of(gaussians, pixels.shape[1], pixels.shape[0])
         summary += f"; psnr_rgb {psnr(shown, pixels, 'rgb'):.2f} dB"
     if isinstance(source, Relightable) and np.isfinite(source.psnr_held_out):
-        summary += f"; left-out lights {source.psnr_held_out:.2f} dB"
+        summary += f"; left-out lights: psnr_rgb {source.psnr_held_out:.2f} dB"
     views = channel_views(gaussians.channels)
     facts = {
         "set": describe_set(gaussians, levels) | ({} if lights is None else {"color": None}),
@@ -203,13 +205,6 @@ def view(
         color_name="Colour" if gaussians.space.is_color else "Values",
     )
     return Page(html)
-
-
-def _stored(image: ArrayLike, encoding: str | None) -> NDArray[np.float32]:
-    """Read a photo under a light as `Relightable.fit` does: lights belong to stored pixels."""
-    if isinstance(image, (str, os.PathLike)):
-        return codes_of(read_file(os.fspath(image), encoding=encoding, upright=False))
-    return codes_of(read_photo(image, encoding, arrays="srgb"))
 
 
 # --- The data of a page: arrays in base64, with colours decoded to RGB ----------------------------

@@ -3,6 +3,7 @@
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import eigengs_dr as eg
@@ -245,18 +246,37 @@ def lit(tmp_path):
 def test_relight(lit, tmp_path, monkeypatch):
     pytest.importorskip("mitsuba")
     eg.register_plugins()  # before the first row, which names the threads of Dr.Jit
-    few = {"PLANES": (6,), "QUALITIES": (30, 90), "PIXELS": (16,), "BUDGETS": (0.5,)}
+    few = {"PLANES": (3,), "PIXELS": (None, 8), "BUDGETS": (0.5, 4.0)}
     smaller(monkeypatch, relight, **few)
     shutil.rmtree(lit / "b")
+    list_of_lights = lit / "a" / "dirs.lp"
+    list_of_lights.write_text(list_of_lights.read_text().replace("20", "19", 1))  # only a warning
     rows, text = answered(tmp_path / "out", "relight", lit, "--iterations", 5)
     assert {row["job"]["set"] for row in rows} == {"a"}
     assert {row["job"]["method"] for row in rows} == {relight.OURS, *relight.METHODS}
     points = [point for row in rows for point in row["points"]]
     assert all(p["bytes_per_pixel"] == p["bytes"] / 24**2 for p in points)
     assert "median" in text and (tmp_path / "out" / "relight.svg").exists()
-    assert relight.summarize(rows[:-1]) == Section()  # the run was stopped
+    assert relight.summarize(rows[1:]) == Section()  # the run has not measured the default
     missing = run("bench", "relight", lit, "--set", "c", "-o", tmp_path / "other")
     assert_refused(missing, "--set c", "has a")
+
+
+def test_ratios_of_bytes_are_those_of_equal_psnr():
+    """Half the bytes at each PSNR; where ours begins above the other's end, that of the ends."""
+    sizes, psnrs = np.array([1.0, 2.0, 4.0]), np.array([30.0, 31.0, 32.0])
+    other = pd.DataFrame({"bytes_per_pixel": sizes, "psnr_rgb": psnrs})
+    ours = pd.DataFrame({"bytes_per_pixel": sizes / 2, "psnr_rgb": psnrs})
+    np.testing.assert_allclose(relight.ratios(ours, other), [0.5] * 5)
+    np.testing.assert_allclose(relight.ratios(ours, other[1:2]), [0.5] * 5)
+    assert list(relight.ratios(ours.assign(psnr_rgb=psnrs + 9), other)) == [0.5 / 4]
+    assert not len(relight.ratios(ours, other.assign(psnr_rgb=psnrs + 9)))
+
+
+def test_a_network_learns_a_set(lit):
+    pytest.importorskip("torch")
+    row = relight.network(*relight.photos_of(lit / "b"))
+    assert row["points"][0]["psnr_rgb"] > 15 and row["seconds"] > 0
 
 
 def test_every_fifth_light_is_left_out(lit):

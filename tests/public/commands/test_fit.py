@@ -79,10 +79,14 @@ MISTAKES = {
     "signs": (["--levels", "16;40"], ["16;40: expected a number, or several"]),
     "cluster": (["--cluster", "local"], ["--cluster takes several images"]),
     "recursive": (["--recursive"], ["--recursive takes a folder of images"]),
-    "blocks, target": (["--blocks", 64, "--target-psnr", 30], ["--blocks needs", "--target-psnr"]),
+    "blocks, target": (
+        ["--blocks", 64, "--target-psnr", 30],
+        ["--target-psnr and --blocks exclude"],
+    ),
     "small blocks": (["--blocks", 5], ["at least 32"]),
     "basis": (["--basis", "nowhere"], ["'nowhere'", "natural"]),
-    "basis, init": (["--basis", "natural", "--init", "grid"], ["--init and --basis"]),
+    "basis, init": (["--basis", "none.npz", "--init", "grid"], ["--init and --basis exclude"]),
+    "preset, init": (["--preset", "eigengs", "--init", "grid"], ["--init and --basis", "preset"]),
     "no folder": (["-o", "gone/x.npz"], ["gone"]),
     "a folder": (["--report", "."], ["is a folder"]),
     "suffix": (["-o", "x.png"], ["x.png", ".npz"]),
@@ -219,7 +223,7 @@ def test_levels(photo, tmp_path):
     assert_refused(too_many, "--first is 65; the file has 64 Gaussians")
     succeeded(run(*base, "--levels", "16,40,64", "--report", report))
     assert read(report)["levels"] == [16, 40, 64]
-    assert_refused(run("pack", fitted, "-o", small, "--levels", "16,40"), "levels 16, 40")
+    assert_refused(run("pack", fitted, "-o", small, "--levels", "16,40"), "levels is (16, 40)")
 
 
 # --- By blocks; and memory, before the image is read ---

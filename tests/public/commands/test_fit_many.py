@@ -113,7 +113,10 @@ MISTAKES = {
     "pattern": (["photos/*.jpg", "-o", "x"], "no file matches"),
     "empty": (["none", "-o", "x"], "none"),
     "a URL": (["photos", "-o", "memory://fits"], "URLs"),
-    "cluster": (["photos", "-o", "x", "--preview", "p", "--cluster", "local"], "no --preview"),
+    "cluster": (
+        ["photos", "-o", "x", "--preview", "p", "--cluster", "local"],
+        "--preview and --cluster",
+    ),
     "a word": (["photos", "-o", "x", "--cluster", "nowhere"], "is unknown; use"),
     "none": (["photos", "-o", "x", "--cluster", "local:0"], "is unknown"),
     "a photo": (["photos", "-o", "x", "--cluster", "photos/00.png"], "not the file of a scheduler"),

@@ -89,7 +89,7 @@ MISTAKES = {
     "no file": ([*FIT, "--map", "ao={0}/ao.png"], "no such file"),
     "space": ([*FIT, "--map", "ao:hsv={0}/other.png"], "space 'hsv' is not in"),
     "twice": ([*FIT, "--map", "albedo={0}/other.png"], "--map albedo is given twice"),
-    "an image": ([*FIT, "{0}/other.png"], "the image has no name"),
+    "an image": ([*FIT, "{0}/other.png"], "images and --map exclude each other: name all images"),
     "colour": ([*FIT, "--space", "rgb"], "--space and --map exclude each other"),
     "channels": (
         [*FIT, *(w for k in range(5) for w in ("--map", f"n{k}:normal={{0}}/normal.png"))],

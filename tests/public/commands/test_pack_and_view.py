@@ -111,7 +111,7 @@ def test_refuses_bad_input(photo, tmp_path):
         ([photo, "-o", "a.png"], ["a.png", "must end in .html"]),
         ([photo, "-o", "folder/a.html"], ["folder"]),
         ([photo, "--levels", 9], ["photo.npz", "levels is 9"]),
-        ([photo, "--levels", "40,16,64"], ["levels 40, 16, 64"]),
+        ([photo, "--levels", "40,16,64"], ["levels is (40, 16, 64)"]),
         ([photo, "--light", "0,0,1"], ["photo.npz: is no model of lights; leave out --light"]),
         ([photo, "--image", "wide.png"], ["photo.npz", "32x16 pixels"]),
         ([photo, "--image", "text.png"], ["text.png"]),

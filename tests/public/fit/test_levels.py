@@ -25,15 +25,16 @@ def reached(gaussians, image=IMAGE):
 @pytest.mark.parametrize(
     ("count", "levels", "message"),
     [
-        (9, [5, 5, 9], "levels 5, 5, 9: numbers of Gaussians must rise"),
-        (9, [4.5, 9], "levels 4.5, 9: numbers of Gaussians must be whole"),
-        (9, [5, 8], "levels 5, 8: the last must be the number of Gaussians, 9"),
+        (9, [5, 5, 9], r"levels is \[5, 5, 9\]; its numbers must rise"),
+        (9, [4.5, 9], r"levels is \[4.5, 9\]; it must be a list of whole numbers"),
+        (9, [5, 8], r"levels is \[5, 8\]; the last must be the number of Gaussians, 9"),
         (3, 2, "levels is 2; 3 Gaussians make 1 to 1"),
         (9, 10**9, "levels is 1000000000; 9 Gaussians make 1 to"),
     ],
 )
 def test_counts_that_are_refused(count, levels, message):
-    with pytest.raises(ValueError, match=message) as caught:
+    kind = TypeError if "whole numbers" in message else ValueError
+    with pytest.raises(kind, match=message) as caught:
         eg.level_counts(count, levels)
     assert "\n" not in str(caught.value)
 
@@ -41,14 +42,15 @@ def test_counts_that_are_refused(count, levels, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"gaussians": [True, 9]}, "levels True, 9: numbers of Gaussians must be whole"),
-        ({"gaussians": np.array([4.5, 9])}, "levels 4.5, 9.0: numbers of Gaussians must be whole"),
-        ({"method": METHODS["gaussianimage"]}, "levels need the placement Adaptive and no start"),
-        ({"start": "a.npz"}, "levels need the placement Adaptive and no start"),
+        ({"gaussians": [True, 9]}, r"gaussians is \[True, 9\]; it must be a list of whole numbers"),
+        ({"gaussians": np.array([4.5, 9])}, r"array\(.*; it must be a list of whole numbers"),
+        ({"method": METHODS["gaussianimage"]}, "levels need the placement Adaptive"),
+        ({"start": "a.npz"}, "levels and start exclude each other"),
     ],
 )
 def test_fits_that_are_refused(options, message):
-    with pytest.raises(ValueError, match=message) as caught:
+    kind = TypeError if "whole numbers" in message else ValueError
+    with pytest.raises(kind, match=message) as caught:
         eg.fit(IMAGE, **{"gaussians": [5, 9], **options})
     assert "\n" not in str(caught.value)
 

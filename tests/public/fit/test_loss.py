@@ -398,7 +398,7 @@ SQUARES = {"loss": squares, "size": (8, 8)}
         (SQUARES | {"weight": np.ones((8, 8, 2))}, "2 channels, but the"),
         (
             {"image": IMAGE, "target_psnr": 20, "loss": eg.Loss(squares, target=1e-4)},
-            "target_psnr and the target of a loss exclude each other",
+            "target_psnr and loss.target exclude each other",
         ),
         ({"image": IMAGE, "size": (8, 8)}, "size is for a loss without an image"),
     ],

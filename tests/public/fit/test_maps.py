@@ -143,7 +143,7 @@ ROUGH, WHITE = SMALL["roughness"], SMALL["albedo"]
         ({"albedo": eg.Map(WHITE, weight="x")}, {}, "'albedo': weight is 'x'; it must be a"),
         (SMALL | {"ao": eg.Map(ROUGH, goal=30)}, {}, "map 'albedo' has no goal; give each map one"),
         ({"ao": eg.Map(ROUGH, goal=np.nan)}, {}, "map 'ao': target_psnr is nan"),
-        (SMALL, {"space": "linear"}, "maps take no start and no space; a Map says the space"),
+        (SMALL, {"space": "linear"}, "space and maps exclude each other: give each map a space of"),
         (SMALL, {"weight": np.ones((8, 9))}, "map 'albedo': weight is for 9x8 pixels, but the im"),
     ],
 )

@@ -141,6 +141,13 @@ def test_light_above_white_in_a_family_gets_a_word(family, model):
     assert eg.render(rows[0].result).numpy().max() > 1.2
 
 
+def test_numbers_in_a_tensor_have_no_encoding(family):
+    data = mi.TensorXf(family[0])
+    fit, texts = warned(eg.fit, data, gaussians=8, iterations=1, space="data")
+    assert texts == []
+    assert fit.gaussians.space == "data"
+
+
 def test_an_encoding_without_pixels_is_refused(model, tmp_path):
     basis, fitted = model
     calls = {

@@ -149,3 +149,9 @@ def test_weights_that_are_refused(rng, metric, weight, words):
     with pytest.raises(ValueError, match=words) as error:
         metric(*rng.random((2, 20, 22, 3)), weight=weight)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("metric", [eg.psnr, eg.ssim, eg.ms_ssim])
+def test_a_path_is_refused(metric):
+    with pytest.raises(TypeError, match=r"^a\.png: is a path; compare the pixels"):
+        metric("a.png", np.zeros((200, 200, 3)))

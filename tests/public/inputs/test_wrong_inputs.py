@@ -209,10 +209,9 @@ def test_a_limit_in_the_environment_that_is_no_number(text, tmp_path, monkeypatc
 def test_arrays_in_place_of_options_give_one_line():
     """NumPy prints them in many."""
     wrong = np.ones((16, 16, 3))
-    for name in ("method", "encoding", "backend"):
-        complaint(TypeError, eg.fit, IMAGE, 5, iterations=1, **{name: wrong})
-    for name in ("gaussians", "space"):
-        complaint(ValueError, eg.fit, IMAGE, **{"gaussians": 5, name: wrong})
+    for name in ("gaussians", "method", "encoding", "backend"):
+        complaint(TypeError, eg.fit, IMAGE, **{"gaussians": 5, "iterations": 1, name: wrong})
+    complaint(ValueError, eg.fit, IMAGE, 5, space=wrong)
     complaint(ValueError, eg.Eigenbasis.from_images, [IMAGE], components=wrong)
 
 

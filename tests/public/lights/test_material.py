@@ -3,6 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
+from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.chi_square import assert_density
@@ -151,6 +152,16 @@ def test_light_comes_from_the_side_that_the_photo_has_on_a_sphere(formula, flip)
     assert np.percentile(abs(found - expected), 98) < TABLE
 
 
+def test_planes_may_be_texels(saved):
+    _, points, normals = of_a_wall(50)
+    bsdf = {"type": "gaussian_relightable", "model": saved}
+    found, expected = (
+        values({"type": "rectangle", "bsdf": bsdf | more}, points, normals, over(normals))
+        for more in ({"texels": 400}, {})
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
 def test_an_update_of_to_uv_turns_the_light(saved):
     _, points, normals = of_a_wall(50)
     bsdf = {"type": "gaussian_relightable", "model": saved}
@@ -293,7 +304,7 @@ def test_pictures_and_bitmaps_are_environments_of_their_own_encoding(formula):
     expected = eg.picture_of(model.relight(light))
     coded = mi.Bitmap(codes)
     coded.set_srgb_gamma(True)
-    for environment in (coded, mi.Bitmap(np.float32(light))):
+    for environment in (coded, mi.Bitmap(np.float32(light)), Image.fromarray(codes)):
         found = eg.picture_of(model.relight(environment))
         np.testing.assert_allclose(found, expected, atol=2e-3)
 

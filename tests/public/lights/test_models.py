@@ -14,7 +14,7 @@ from PIL import Image
 
 import eigengs_dr as eg
 from _helpers.command import assert_refused, run, said
-from _helpers.lit_models import LitFormula, changed
+from _helpers.lit_models import LitFormula, changed, to_light
 from _helpers.lit_spheres import directions, photos
 from _helpers.packed import few_groups
 
@@ -99,9 +99,26 @@ class TestFit:
             (few, {"gaussians": 0}, "gaussians is 0"),
             (few, {"planes": 22}, "planes is 22; 8 photos .* to 21"),
             ((PHOTOS, LIGHTS), {"planes": 65}, "planes is 65; 40 photos .* to 64"),
+            (few, {"max_psnr_drop": 0}, "max_psnr_drop is 0; .* above 0"),
+            (few, {"gaussians": 9, "planes": 3, "max_psnr_drop": 1}, "max_psnr_drop finds numbers"),
         ):
             with pytest.raises(ValueError, match=message):
                 eg.Relightable.fit(*arguments, progress=False, **options)
+
+    def test_has_as_few_gaussians_as_the_budget_allows(self):
+        options = {"gaussians": None, "planes": 6, "iterations": 10}
+        some, fewer = (
+            model_of(PHOTOS[~LEFT_OUT], max_psnr_drop=drop, **options) for drop in (0.01, 20)
+        )
+        assert (len(some.planes), len(fewer.planes)) == (64, 16)
+        assert fewer.psnr_held_out < some.psnr_held_out
+
+    def test_planes_show_best_what_other_lights_need(self):
+        """Noise that no light repeats does not take the Gaussians from the object."""
+        noisy = PHOTOS + 0.1 * np.random.default_rng(2).standard_normal(PHOTOS.shape)
+        model = model_of(np.maximum(noisy, 0)[~LEFT_OUT].astype(np.float32), planes=12)
+        energy = np.square(eg.picture_of(model.planes)).mean((0, 1))
+        assert energy[:3].sum() > 5 * energy[3:].sum()
 
     def test_an_interrupted_fit_tells_how_far_it_came(self, model):
         def stop(done, total, row):
@@ -172,6 +189,38 @@ class TestRelight:
         with pytest.raises(error, match=says) as caught:
             model.relight(light)
         assert "\n" not in str(caught.value)
+
+
+class TestFindLight:
+    def test_finds_lights_within_the_angle_that_it_tells(self, model):
+        for k in np.flatnonzero(LEFT_OUT):
+            light, angle = model.find_light(PHOTOS[k], encoding="srgb")
+            wrong = np.degrees(np.arccos(min(light @ LIGHTS[k], 1)))
+            assert np.linalg.norm(light) == pytest.approx(1)
+            assert wrong < 4 and wrong < 2.5 * angle and angle < 8
+
+    def test_of_a_flat_object_is_a_guess_and_says_so(self):
+        """Brightness tells how high the light is, and nothing where from."""
+        flat = 0.5 * LIGHTS[:, 2, None, None, None] * np.linspace(0.5, 1, 16)[:, None, None]
+        photos = np.broadcast_to(flat, (40, 16, 16, 3)).astype(np.float32)
+        guess = model_of(photos[~LEFT_OUT], gaussians=20, planes=1, iterations=0)
+        _, angle = guess.find_light(photos[20], encoding="srgb")
+        assert angle > 20
+
+    def test_reads_a_file_as_it_is_stored_and_light_as_codes(self, model, tmp_path):
+        exif = Image.Exif()
+        exif[274] = 6  # turned by a quarter
+        codes = np.rint(PHOTOS[4].clip(0, 1) * 255).astype(np.uint8)
+        Image.fromarray(codes).save(tmp_path / "photo.png", exif=exif)
+        expected = model.find_light(codes)
+        for photo in (tmp_path / "photo.png", to_light(codes / 255)):
+            light, angle = model.find_light(photo)
+            np.testing.assert_allclose(light, expected[0], atol=1e-3)
+            assert angle == pytest.approx(expected[1], rel=1e-2)
+
+    def test_refuses_a_photo_of_another_size(self, model):
+        with pytest.raises(ValueError, match="is 32x20, but those of the model are 32x32"):
+            model.find_light(PHOTOS[4, :20])
 
 
 class TestFiles:
@@ -256,7 +305,16 @@ class TestNumber:
 
     def test_that_is_too_good_for_the_table_where_the_budget_is_tiny(self, model, tmp_path):
         with pytest.raises(ValueError, match="no rounding is fine enough"):
-            eg.pack(replace(model, psnr_held_out=70.0), tmp_path / "x.egs", max_psnr_drop=0.1)
+            eg.pack(replace(model, psnr_held_out=99.0), tmp_path / "x.egs", max_psnr_drop=0.1)
+
+    def test_that_is_good_takes_a_finer_table(self, model, tmp_path):
+        tables = []
+        for psnr in (30.0, 60.0):
+            sure = replace(model, psnr_held_out=psnr)
+            result, loaded = packed(sure, tmp_path / "x.egs", 0.5)
+            assert 0.2 < result.psnr_drop <= 0.5
+            tables.append(np.abs(loaded.table.values - model.table.values).max())
+        assert tables[1] < 0.01 * tables[0]
 
     def test_is_repeated_by_commands_and_the_page(self, tmp_path):
         lines = ["8"]

@@ -1,5 +1,7 @@
 """What a bitmap does too: the texture in every slot of scenes, in other variants, and by name."""
 
+from functools import partial
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -17,9 +19,13 @@ from eigengs_dr.plugins import bake_environment, texture_of
 pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant")]
 
 
-def fine_bitmap(g, times=16):
+FINER = 16
+"""Texels of a bitmap for a pixel of its set."""
+
+
+def fine_bitmap(g):
     """A bitmap of many texels that shows a set; z follows from x and y of normals."""
-    shown = eg.render(g, g.width * times, g.height * times).numpy()
+    shown = eg.render(g, g.width * FINER, g.height * FINER).numpy()
     if shown.shape[2] == 2:
         x, y = 2 * shown[..., 0] - 1, 2 * shown[..., 1] - 1
         z = 0.5 + 0.5 * np.sqrt(np.maximum(1 - x * x - y * y, 0))
@@ -81,16 +87,17 @@ def gallery(show=texture_of):
     )
 
 
-def test_every_slot_shows_what_a_bitmap_of_the_same_picture_shows():
+@pytest.mark.parametrize("texels", [0, FINER * SIZE[0]])
+def test_every_slot_shows_what_a_bitmap_of_the_same_picture_shows(texels):
     """Slopes of a bitmap are those of its texels, and random normals point behind a surface."""
-    images = [
-        np.array(mi.render(gallery(show), spp=64, seed=1)) for show in (texture_of, fine_bitmap)
-    ]
+    shows = partial(texture_of, texels=texels), fine_bitmap
+    images = [np.array(mi.render(gallery(show), spp=64, seed=1)) for show in shows]
+    most = {} if texels else {"bump": 0.02, "normals": 0.05}
     for k, name in enumerate(slots(texture_of)):
         row, column = TILE * (k // COLUMNS), TILE * (k % COLUMNS)
         seen, expected = (i[row : row + TILE, column : column + TILE] for i in images)
         apart = np.sqrt(np.mean((seen - expected) ** 2)) / expected.mean()
-        assert apart < {"bump": 0.02, "normals": 0.05}.get(name, 5e-4), name
+        assert apart < most.get(name, 5e-4), name
         assert seen.std() > 1e-3, name
 
 
