@@ -123,7 +123,7 @@ class Coarse(Adaptive):
         `eigengs_dr.fitting.from_loss.STEPS_PER_TEXEL` for each texel of a Gaussian.
     """
 
-    share: float = 0.5
+    share: float = 0.9
     max_steps: int = 60
     rate: float = 0.025
     decay: float = 0.05

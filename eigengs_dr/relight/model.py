@@ -133,7 +133,7 @@ class Relightable:
             directions. By default the only such file in the folder. A list is paired with files by
             name, and with arrays in order.
         gaussians : int, optional
-            Number of Gaussians. By default one for 16 pixels, halved up to three times within the
+            Number of Gaussians. By default one for 16 pixels, halved once or twice within the
             budget, as short tries predict.
         planes : int, optional
             Number of planes. By default the smallest within the budget.
