@@ -15,7 +15,7 @@ from typing import TypeAlias
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
-from ..backend.doors import check_fields
+from ..backend.entry_points import check_fields
 from ..backend.recording import freeze_program
 from ..backend.types import Float, Rows, UInt
 from .loss import TINY, PictureLoss
