@@ -10,7 +10,7 @@ from hypothesis import given
 
 import eigengs_dr as eg
 from _helpers.sets import COUNT, SIZE, Scene, check_equal, few, random_scene, scenes
-from _oracles.objectives import objective_for
+from eigengs_dr.fitting.objective import Pixels
 from eigengs_dr.fitting.solve import solve as solve_objective
 
 
@@ -25,10 +25,9 @@ def roomy(count=COUNT // 2, channels=3):
     return Scene(*(a.astype(np.float32).astype(float) for a in arrays))
 
 
-def solve(gaussians, image, steps=10, warm_start=False, held=False, weight=None):
+def solve(gaussians, image, steps=10, warm_start=False, weight=None):
     """The solve for an image (H, W, C) in the space of the set, with weights."""
-    objective = objective_for(gaussians, image, weight)
-    return solve_objective(gaussians, objective, steps, warm_start, held)
+    return solve_objective(gaussians, Pixels.plain(image, gaussians, weight), steps, warm_start)
 
 
 def best_colors(scene, image, weight=None, cutoff=3.0):
