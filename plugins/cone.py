@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import rcp
-from eigengs_dr.backend.doors import door
+from eigengs_dr.backend.entry_points import entry_point
 from eigengs_dr.backend.messages import shown, warn
 from eigengs_dr.backend.types import Bool, Float, Texture
 
@@ -18,7 +18,7 @@ PIXEL = 0.4
 blur by 0.29 (a box); at 0.4, one sample of a receding plane came closest to the mean of 1,024."""
 
 
-@door
+@entry_point
 def pixel_angle(sensor: mi.Sensor) -> float:
     """Return the angle of a pixel in the centre of a perspective image, for ``prefilter``.
 
@@ -131,7 +131,7 @@ CLOSE = 1.25
 """Ratio of a prefilter to the angle of a pixel up to which nobody sees the difference."""
 
 
-@door
+@entry_point
 def follow(scene: mi.Scene, sensor: mi.Sensor | int = 0) -> None:
     """Set the prefilter of all Gaussian textures and environments of a scene to a sensor's pixels.
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from eigengs_dr.backend.arrays import types_of, upload
-from eigengs_dr.backend.doors import door
+from eigengs_dr.backend.entry_points import entry_point
 from eigengs_dr.backend.types import Record, Tensor
 from eigengs_dr.gaussian.gaussians import (
     FIELDS,
@@ -28,7 +28,7 @@ from eigengs_dr.relight.directions import LatLong
 from eigengs_dr.relight.model import Relightable
 
 
-@door
+@entry_point
 def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     """Return a set as the dictionary of a ``gaussian_texture``, for `mitsuba.load_dict`.
 
@@ -54,7 +54,7 @@ def texture_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     return plugin_of("gaussian_texture", gaussians, **properties)
 
 
-@door
+@entry_point
 def environment_of(gaussians: Gaussians | Fitted, **properties: object) -> Record:
     """Return a set as the dictionary of a ``gaussian_environment``, for `mitsuba.load_dict`.
 
@@ -85,7 +85,7 @@ def environment_of(gaussians: Gaussians | Fitted, **properties: object) -> Recor
     return plugin_of("gaussian_environment", gaussians, **properties)
 
 
-@door
+@entry_point
 def material_of(model: Relightable, **properties: object) -> Record:
     """Return a model of lights as the dictionary of a ``gaussian_relightable``.
 
@@ -128,7 +128,7 @@ def material_of(model: Relightable, **properties: object) -> Record:
     }
 
 
-@door
+@entry_point
 def bake_environment(
     gaussians: Gaussians, width: int | None = None, height: int | None = None, **properties: object
 ) -> Record:
@@ -222,7 +222,7 @@ def given(properties: Record) -> Record:
     return {name: value for name, value in properties.items() if value is not None}
 
 
-@door
+@entry_point
 def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians) -> Gaussians:
     """Read a set back from the parameters of a texture, differentiably.
 
@@ -249,7 +249,7 @@ def gaussians_of(parameters: Mapping[str, object], texture: str, like: Gaussians
     return from_tensors(_tensors_in(parameters, texture), like)
 
 
-@door
+@entry_point
 def keep_in_bounds(parameters: mi.SceneParameters, texture: str, like: Gaussians) -> None:
     """Project the parameters of a texture into their bounds, after a step of an optimiser.
 

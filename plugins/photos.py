@@ -12,7 +12,7 @@ from typing import Any, Literal
 import drjit as dr
 import mitsuba as mi
 
-from eigengs_dr.backend.doors import door
+from eigengs_dr.backend.entry_points import entry_point
 from eigengs_dr.backend.messages import warn
 from eigengs_dr.backend.recording import freeze_rendering
 from eigengs_dr.backend.types import ArrayLike
@@ -28,7 +28,7 @@ from .cone import check_scene, sensor_of
 from .parameters import texels_of
 
 
-@door
+@entry_point
 def photo_loss(
     scene: mi.Scene,
     pictures: str | Mapping[str, str],

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from eigengs_dr.backend.arrays import indices_of
-from eigengs_dr.backend.doors import door
+from eigengs_dr.backend.entry_points import entry_point
 from eigengs_dr.backend.types import Bool, DrJitArray, Float, Texture
 from eigengs_dr.raster.lookup.points import sum_at_points, value_terms
 
@@ -181,7 +181,7 @@ def plugin_of_sums(base: type) -> Any:
 # --- The memory that a plugin holds between renderings --------------------------------------------
 
 
-@door
+@entry_point
 def resident_bytes(texture: Texture) -> int:
     """Return the bytes of the arrays that a plugin holds between renderings.
 

@@ -224,12 +224,15 @@ def kodak() -> None:
 @click.argument("data", type=options.folder, metavar="DATA")
 @click.option("--set", "names", multiple=True, help="Folder in DATA, by default all.")
 @number("--iterations", "Steps of every fit.", 300, 1)
+@click.option(
+    "--neural", is_flag=True, help="Also train a network; needs torch, and minutes a set."
+)
 def relight() -> None:
     """Compare planes of Gaussians with planes of pixels.
 
     DATA holds folders of photos with their lights, an .lp file. PSNRs are those of photos that were
-    left out: those in Test beside a folder Dome, or every fifth one. A set of 50 photos takes a
-    minute.
+    left out: those in Test beside a folder Dome, or every fifth one. A set of 50 photos takes
+    ten minutes.
     """
 
 

@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -26,13 +27,21 @@ from eigengs_bench.clock import Image
 from eigengs_bench.names import SUBJECTS_OF_DATA, SUBJECTS_OF_SAMPLES
 from eigengs_bench.report import Section, Table, number, table
 from eigengs_bench.rows import Job, Row, Task
-from eigengs_bench.subjects import SPACES, SUBJECTS, Maps, Scene, grey, photos_of, scene_of
+from eigengs_bench.subjects import (
+    SPACES,
+    SPP,
+    SUBJECTS,
+    Maps,
+    Scene,
+    Subject,
+    grey,
+    photos_of,
+    scene_of,
+)
 from eigengs_dr.cli.scene import load_mitsuba
 from eigengs_dr.image.color import to_coded
 
-SPP, STEPS = 4, (120, 240, 480)  # samples of a pixel of a step; steps, each ends with small rates
-NOISES, NOISY_STEPS, LONGER = (1, 16), 240, 360  # samples of other descents; steps, and of rivals
-PAINTING = (128, 16)  # steps and samples of the scenes of DATA
+STEPS_OF_MAPS = 240  # of the fits whose maps are shown, if there are such
 WARM_UP = 40  # steps of a fit that compiles, as many as the first stage of a fit has
 LAST_RATE, MOMENTUM = 0.05, 0.5  # share to which rates fall by a cosine; of Adam, best for all
 RATES = {"texels": 0.02, "pyramid": 0.004}  # best for "coffee", a photo of no scene here
@@ -178,18 +187,28 @@ def run(task: Task, subjects: Sequence[str], seeds: int) -> list[Row]:
 
 def _jobs(task: Task, subjects: Sequence[str], seeds: int) -> Iterator[Job]:
     mi = load_mitsuba("cuda_ad_rgb" if task.backend == "cuda" else "llvm_ad_rgb", quiet=False)
-    settings = [(steps, SPP, method) for steps in STEPS for method in METHODS]
-    for spp in NOISES:
-        settings += [(NOISY_STEPS, spp, method) for method in ("pyramid", "fit")]
-        settings.append((LONGER, spp, "pyramid"))
-    hung = [(*PAINTING, method) for method in METHODS]
     cases = [(kind, count) for kind in subjects for count in SUBJECTS[kind].cameras]
     for kind, count in cases:
         for seed in range(seeds):
-            for steps, spp, method in hung if kind in SUBJECTS_OF_DATA else settings:
+            for steps, spp, method in _descents(SUBJECTS[kind]):
                 job = {"scene": kind, "cameras": count, "method": method, "steps": steps}
                 job |= {"spp": spp, "seed": seed}
                 yield job, partial(recover, mi, task.data, job)
+
+
+def _descents(subject: Subject) -> Iterator[tuple[int, int, str]]:
+    """Yield steps, samples and method; rivals also take half as many steps more than any fit."""
+    for spp, fits in subject.runs.items():
+        rivals = RIVALS if spp == first_spp(subject) else ("pyramid",)
+        for steps in (*fits, fits[-1] * 3 // 2):
+            yield from ((steps, spp, method) for method in rivals)
+            if steps in fits:
+                yield steps, spp, "fit"
+
+
+def first_spp(subject: Subject) -> int:
+    """Return the samples of a pixel of the descents that all methods take."""
+    return next(iter(subject.runs))
 
 
 def recover(mi: Any, data: Path | None, job: Row) -> Row:
@@ -235,15 +254,17 @@ def _by_seed(rows: Sequence[Row]) -> dict[tuple, Row]:
 
 
 def gain(curves: Curves, figure: str = "psnr_rgb") -> list[float]:
-    """Return the decibels of each fit above the best texels of about equal seconds.
+    """Return the decibels of each fit above the best texels within about its seconds.
 
-    Between two descents of a method, its PSNR is linear in the logarithm of the seconds; beyond
-    them it is that of the nearest.
+    The PSNR of a method is its best so far; between two descents it is linear in the logarithm of
+    the seconds, beyond them that of the nearest.
     """
     rivals = []
     for method in RIVALS:
         descents = curves.get(method, {}).values()
-        rivals.append(sorted((math.log(row["seconds"]), row[figure]) for row in descents))
+        points = sorted((math.log(row["seconds"]), row[figure]) for row in descents)
+        best_so_far = accumulate((decibels for _, decibels in points), max)
+        rivals.append([(time, best) for (time, _), best in zip(points, best_so_far, strict=True)])
     gains = []
     for _, row in sorted(curves["fit"].items()):
         time = math.log(SLOWER * row["seconds"])
@@ -267,7 +288,7 @@ def _gains(cases: Mapping[Case, Curves]) -> Table:
         (title, *(line.get(descent, "") for descent in descents)) for title, line in cells.items()
     ]
     columns = ("photos", *(f"{steps} steps, {spp} spp" for steps, spp in descents))
-    caption = "psnr_rgb of fit in dB over the best of texels and pyramid at equal seconds"
+    caption = "psnr_rgb of fit in dB over the best of texels and pyramid within equal seconds"
     if most > 1:
         caption += f"; means of {most:g} seeds, or of as many as brackets say"
     return table(caption, columns, lines, name="gains")
@@ -277,10 +298,10 @@ def _parts(cases: Mapping[Case, Curves]) -> Table:
     """Lay out what a fit recovers of each map after one number of steps, beside the best texels."""
     lines = []
     for case, curves in cases.items():
-        steps = NOISY_STEPS if NOISY_STEPS in curves["fit"] else max(curves["fit"])
-        place, row = sorted(curves["fit"]).index(steps), curves["fit"][steps]
-        if case[2] != (SPP if case[0] not in SUBJECTS_OF_DATA else PAINTING[1]):
+        if case[2] != first_spp(SUBJECTS[case[0]]):
             continue
+        steps = STEPS_OF_MAPS if STEPS_OF_MAPS in curves["fit"] else max(curves["fit"])
+        place, row = sorted(curves["fit"]).index(steps), curves["fit"][steps]
         share = row["parameters"] / next(iter(curves["pyramid"].values()))["parameters"]
         for name in SUBJECTS[case[0]].keys:
             cells = [
@@ -292,9 +313,9 @@ def _parts(cases: Mapping[Case, Curves]) -> Table:
             lines.append((_title(case), name, *cells, constant, count, f"{share:.2f}"))
     columns = ("photos", "map", "seen", "unseen", "constant", "Gaussians", "parameters")
     caption = (
-        f"PSNR of maps after {NOISY_STEPS} steps of {SPP} spp ({PAINTING[0]} of {PAINTING[1]} for "
-        "the painting and the wall), where photos show them and elsewhere; in brackets over the "
-        "best texels at equal seconds; that of the best constant; parameters per one of a pyramid"
+        f"PSNR of maps after {STEPS_OF_MAPS} steps of {SPP} spp (128 of 16 for the painting and "
+        "the wall), where photos show them and elsewhere; in brackets over the best texels within "
+        "equal seconds; that of the best constant; parameters per one of a pyramid"
     )
     return table(caption, columns, lines, name="maps")
 
@@ -305,7 +326,7 @@ def _title(case: Case) -> str:
 
 def _chart(cases: Mapping[Case, Curves]) -> Figure:
     """Draw PSNR over seconds, a panel for each scene and number of cameras."""
-    drawn = [case for case in cases if case[2] == SPP]
+    drawn = [case for case, curves in cases.items() if len(curves["fit"]) > 1]
     lines = max(1, math.ceil(len(drawn) / 2))
     figure = fr.new_figure(8, 1 + 2.1 * lines, "Textures recovered from photos")
     axes = np.ravel(figure.subplots(lines, 2, squeeze=False))

@@ -1,11 +1,12 @@
 """Scenes of Mitsuba whose textures are to be recovered, with their photos.
 
-The poster and the balls stand on a floor, under a lamp and the sky. "painting" and "wall" are those
-of the scene by Weier et al. 2025 (doi 10.1145/3730855), under a sky of ours; its folder is DATA.
+Most stand on a floor, under a lamp and the sky. "painting" and "wall" are those of the scene by
+Weier et al. 2025 (doi 10.1145/3730855), under a sky of ours; its folder is DATA. `SUBJECTS`, at the
+end, lists all.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,16 +15,19 @@ import drjit as dr
 import numpy as np
 
 import eigengs_dr as eg
+from eigengs_bench.alike import letters
 from eigengs_bench.clock import Image
 from eigengs_dr.image.color import to_linear
 from eigengs_dr.image.resize import center_crop, resample
 
 JUDGES, MANY, SEED = 4, 64, 1 << 20  # cameras without photos; samples and seed of photos
+SPP = 4  # samples of a pixel of a step
 SEEN_SPP = 16  # samples of the derivative that says what the photos show
 GREY = {"roughness": (0.5,), "normal": (0.5, 0.5, 1.0)}  # texels before the first step; colours:
 COLOR = (0.2, 0.2, 0.2)
 SPACES = {"color": "linear", "albedo": "linear", "roughness": "data", "normal": "normal"}
 Maps = Mapping[str, Image]
+Textures = Mapping[str, Any]
 
 
 class Subject(NamedTuple):
@@ -32,36 +36,13 @@ class Subject(NamedTuple):
     images: Mapping[str, str]
     keys: Mapping[str, str]
     cameras: tuple[int, ...]
+    shapes: Callable[[Any, Textures, Path | None], dict[str, Any]]  # of Mitsuba, textures and DATA
+    runs: Mapping[int, Sequence[int]] = {SPP: (240,)}  # steps of fits, by samples of a step
     texels: int = 256
     side: int = 128  # pixels of a photo
-
-
-BALL = {"albedo": "ball.bsdf.base_color", "roughness": "ball.bsdf.roughness"}
-PLANE = "textures/plane_divided_DefaultMaterial_"
-WALL = {"albedo": f"{PLANE}BaseColor.jpg", "normal": f"{PLANE}Normal.jpg", "roughness": "chelsea"}
-SUBJECTS = {
-    "poster": Subject({"color": "chelsea"}, {"color": "poster.bsdf.reflectance"}, (3, 16)),
-    "ball": Subject({"color": "astronaut"}, {"color": BALL["albedo"]}, (3, 16)),
-    "material": Subject({"albedo": "astronaut", "roughness": "chelsea"}, BALL, (6, 8)),
-    "painting": Subject(
-        {"color": "textures/Claude_Lorrain_008.jpg"},
-        {"color": "painting.bsdf.brdf_0.base_color"},
-        (2,),
-        texels=1024,
-        side=256,
-    ),
-    "wall": Subject(
-        WALL,
-        {
-            "albedo": "wall.bsdf.nested_bsdf.brdf_0.base_color",
-            "normal": "wall.bsdf.normalmap",
-            "roughness": "wall.bsdf.nested_bsdf.brdf_0.roughness",
-        },
-        (2,),
-        texels=1024,
-        side=256,
-    ),
-}
+    arc: float = 2 * math.pi  # from the first to the last camera
+    depth: int = 3  # vertices of a path of light
+    noise: float = 0.0  # standard deviation of the values of a photo
 
 
 class Scene(NamedTuple):
@@ -73,7 +54,7 @@ class Scene(NamedTuple):
     photos: Sequence[Image]  # of the cameras, and of the judges
     seen: Image  # how much the photos depend on each texel
     data: Path | None
-    spp: int = 4  # of a step
+    spp: int = SPP  # of a step
     seed: int = 0  # of renderings and of fits
 
     @property
@@ -93,6 +74,9 @@ def scene_of(mi: Any, kind: str, cameras: int, data: Path | None) -> Scene:
     maps = _maps(kind, data)
     loaded = load_scene(mi, kind, _bitmaps(mi, maps), cameras, data)
     photos, seen = photos_of(mi, loaded), _seen(mi, loaded, kind, cameras)
+    draw, noise = np.random.default_rng(SEED), SUBJECTS[kind].noise
+    for photo in photos[:cameras]:
+        photo += np.float32(noise * draw.standard_normal(photo.shape))
     return Scene(kind, cameras, maps, photos, seen, data)
 
 
@@ -119,6 +103,8 @@ def _maps(kind: str, data: Path | None) -> Maps:
     for name, image in subject.images.items():
         if data and "/" in image:
             codes = resample(eg.load_image(data / image), *size)
+        elif image == "letters":
+            codes = np.tile(letters(size[0]), 3)
         else:
             codes = center_crop(eg.sample(image), *size)
         codes = np.clip(codes, 0, 1)
@@ -148,59 +134,95 @@ def _bitmaps(mi: Any, maps: Maps) -> dict[str, Any]:
     return {name: bitmap(mi, values) for name, values in maps.items()}
 
 
-def load_scene(
-    mi: Any, kind: str, textures: Mapping[str, Any], count: int, data: Path | None = None
-) -> Any:
+def load_scene(mi: Any, kind: str, textures: Textures, count: int, data: Path | None = None) -> Any:
     """Load a scene with textures in place of its maps, `count` cameras, and the judges."""
-    if kind in ("painting", "wall"):
-        assert data is not None
-        content, cameras = _hung(mi, kind, textures, data), _before_the_painting(mi)
-    else:
-        content, cameras = _shown(mi, kind, textures), _around(mi, kind, count)
-    side, box = SUBJECTS[kind].side, {"type": "box"}
+    subject, box = SUBJECTS[kind], {"type": "box"}
+    side, path = subject.side, {"type": "prb", "max_depth": subject.depth}
     film = {"type": "hdrfilm", "pixel_format": "rgb", "width": side, "height": side, "rfilter": box}
-    scene: dict[str, Any] = {"type": "scene", "integrator": {"type": "prb", "max_depth": 3}}
+    scene: dict[str, Any] = {"type": "scene", "integrator": path}
+    cameras = _around(mi, subject.arc, count) if subject.arc else _before_the_painting(mi)
     for number, (fov, view) in enumerate(cameras):
         camera = {"type": "perspective", "film": film, "fov": fov, "fov_axis": "x"}
         scene[f"camera{number:02}"] = camera | {"near_clip": 1e-3, "to_world": view}
-    return mi.load_dict(scene | content)
+    return mi.load_dict(scene | subject.shapes(mi, textures, data))
 
 
 # ---------------------------------------------------------------------------------------------
-#  A poster, or a ball
+#  A poster, a ball or a crate
 # ---------------------------------------------------------------------------------------------
 
 
-def _around(mi: Any, kind: str, count: int) -> list[tuple[float, Any]]:
-    """Return cameras around a poster or a ball; judges are between those of photos."""
+def _around(mi: Any, arc: float, count: int) -> list[tuple[float, Any]]:
+    """Return cameras on an arc around the middle; judges are between those of photos."""
     views, shares = [], [*np.arange(0.5, count) / count, *np.arange(0.75, JUDGES) / JUDGES]
     for share in shares:
-        angle = 1.4 * (share - 0.5) if kind == "poster" else 2 * math.pi * share
+        angle = arc * (share - 0.5 if arc < math.pi else share)
         place = [3.7 * math.sin(angle), 0.9 * math.sin(16 * share), 3.7 * math.cos(angle)]
         views.append((36.0, mi.ScalarTransform4f().look_at(place, [0, 0, 0], [0, 1, 0])))
     return views
 
 
-def _shown(mi: Any, kind: str, textures: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a poster or a ball on a floor, under a lamp and the sky."""
+def _stage(mi: Any) -> dict[str, Any]:
+    """Return a floor, a lamp and the sky."""
     at = mi.ScalarTransform4f()
     light = {"type": "area", "radiance": {"type": "rgb", "value": 20.0}}
     lamp = at.look_at([1.5, 3, 3], [0, 0, 0], [0, 1, 0]).scale(0.7)
     floor = at.translate([0, -1.3, 0]).rotate([1, 0, 0], -90).scale(5)
-    scene: dict[str, Any] = {
+    return {
         "floor": {"type": "rectangle", "to_world": floor},
         "lamp": {"type": "rectangle", "to_world": lamp, "emitter": light},
         "sky": {"type": "constant", "radiance": 0.5},
     }
-    if kind == "poster":
-        paint = {"type": "diffuse", "reflectance": textures["color"]}
-        turned = at.scale([1, -1, 1])
-        return scene | {kind: {"type": "rectangle", "to_world": turned, "bsdf": paint}}
+
+
+def _poster(mi: Any, textures: Textures, data: Path | None) -> dict[str, Any]:
+    paint = {"type": "diffuse", "reflectance": textures["color"]}
+    turned = mi.ScalarTransform4f().scale([1, -1, 1])
+    return _stage(mi) | {"poster": {"type": "rectangle", "to_world": turned, "bsdf": paint}}
+
+
+def _poster_in_a_room(mi: Any, textures: Textures, data: Path | None) -> dict[str, Any]:
+    """Return a poster between white walls, which hide the sky and reflect the light of the lamp."""
+    around = mi.ScalarTransform4f().translate([0, 3, 0]).scale(4.5)
+    white = {"type": "diffuse", "reflectance": 0.8}
+    room = {"type": "cube", "flip_normals": True, "to_world": around, "bsdf": white}
+    return _poster(mi, textures, data) | {"room": room}
+
+
+def _ball(mi: Any, textures: Textures, data: Path | None) -> dict[str, Any]:
     coat: dict[str, Any] = {"type": "principled", "roughness": 0.4}
     for name, texture in textures.items():
         coat["roughness" if name == "roughness" else "base_color"] = texture
-    ball = {"type": "sphere", "to_world": at.rotate([1, 0, 0], 90), "bsdf": coat}
-    return scene | {"ball": ball}
+    upright = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    return _stage(mi) | {"ball": {"type": "sphere", "to_world": upright, "bsdf": coat}}
+
+
+def _tiled_ball(mi: Any, textures: Textures, data: Path | None) -> dict[str, Any]:
+    """Return a ball around which its texture goes twice."""
+    twice = {"wrap_mode": "repeat", "to_uv": mi.ScalarTransform4f().scale([2, 1, 1])}
+    return _ball(mi, {name: texture | twice for name, texture in textures.items()}, data)
+
+
+def _crate(mi: Any, textures: Textures, data: Path | None) -> dict[str, Any]:
+    """Return a box whose sides have parts of the texture of unequal sizes, with seams between."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    columns, rows = (0, 0.2, 0.55, 1), (0, 0.35, 1)  # of the parts
+    places, texels = np.zeros((3, 2, 4, 3)), np.zeros((3, 2, 4, 2))
+    for axis, end in np.ndindex(3, 2):
+        turn = corners[:: 2 * end - 1]  # counter-clockwise from outside
+        places[axis, end, :, axis] = 1.6 * end - 0.8
+        places[axis, end][:, [axis - 2, axis - 1]] = 1.6 * turn - 0.8
+        texels[axis, end, :, 0] = np.take(columns, axis + turn[:, 0])
+        texels[axis, end, :, 1] = np.take(rows, end + turn[:, 1])
+    faces = 4 * np.arange(6)[:, None, None] + [[0, 1, 2], [0, 2, 3]]
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": textures["color"]})
+    crate = mi.Mesh("crate", 24, 12, props=properties, has_vertex_texcoords=True)
+    buffers = mi.traverse(crate)
+    buffers["vertex_positions"], buffers["vertex_texcoords"] = places.ravel(), texels.ravel()
+    buffers["faces"] = faces.ravel()
+    buffers.update()
+    return _stage(mi) | {"crate": crate}
 
 
 # ---------------------------------------------------------------------------------------------
@@ -227,28 +249,32 @@ def _before_the_painting(mi: Any) -> list[tuple[float, Any]]:
     return [(39.597755, view) for view in views]
 
 
-def _hung(mi: Any, kind: str, textures: Mapping[str, Any], data: Path) -> dict[str, Any]:
+PAINTING = {"color": "textures/Claude_Lorrain_008.jpg"}
+PLANE = "textures/plane_divided_DefaultMaterial_"
+WALL = {"albedo": f"{PLANE}BaseColor.jpg", "normal": f"{PLANE}Normal.jpg", "roughness": "chelsea"}
+
+
+def _hung(mi: Any, textures: Textures, data: Path | None) -> dict[str, Any]:
     """Return the painting and the wall; one of them has the textures, the other its own."""
+    assert data is not None
 
     def known(name: str, power: float = 1.0) -> dict[str, Any]:
         codes = np.clip(resample(eg.load_image(data / name), 512, 512), 0, 1)
         return bitmap(mi, codes**power)
 
-    paint = {} if kind == "wall" else textures
-    wall = textures if kind == "wall" else {}
     plaster = {
         "type": "principled",
-        "base_color": wall.get("albedo") or known(WALL["albedo"], 2.2),
-        "roughness": wall.get("roughness", 0.5),
+        "base_color": textures.get("albedo") or known(WALL["albedo"], 2.2),
+        "roughness": textures.get("roughness", 0.5),
         "specular": 0.5,
     }
     picture = {
         "type": "principled",
-        "base_color": paint.get("color") or known("textures/Claude_Lorrain_008.jpg", 2.2),
+        "base_color": textures.get("color") or known(PAINTING["color"], 2.2),
         "roughness": 0.4,
         "specular": 0.5,
     }
-    normals = wall.get("normal") or known(WALL["normal"])
+    normals = textures.get("normal") or known(WALL["normal"])
     relief = {"type": "normalmap", "normalmap": normals, "b": {"type": "twosided", "b": plaster}}
     plane, canvas = (str(data / "meshes" / f"{name}.ply") for name in ("Plane", "Painting"))
     turned = mi.ScalarTransform4f([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
@@ -268,3 +294,33 @@ def _windows() -> Image:
         window = np.exp(-((x - column) ** 2 / 0.002 + (y - 0.35) ** 2 / 0.01))
         sky += strength * window[..., None] * [1, 0.95, 0.85]
     return sky.astype(np.float32)
+
+
+# ---------------------------------------------------------------------------------------------
+#  All scenes
+# ---------------------------------------------------------------------------------------------
+
+FULLY = {SPP: (60, 90, 120, 240, 480), 1: (240,), 16: (240,), 32: (240,), 64: (240,)}
+PHOTOS = {"albedo": "astronaut", "roughness": "chelsea"}
+POSTER = {"color": "poster.bsdf.reflectance"}
+BALL = {"albedo": "ball.bsdf.base_color", "roughness": "ball.bsdf.roughness"}
+PAINT = {"color": BALL["albedo"]}
+CANVAS = {"color": "painting.bsdf.brdf_0.base_color"}
+PLASTER = {
+    "albedo": "wall.bsdf.nested_bsdf.brdf_0.base_color",
+    "normal": "wall.bsdf.normalmap",
+    "roughness": "wall.bsdf.nested_bsdf.brdf_0.roughness",
+}
+HUNG: Mapping[str, Any] = {"runs": {16: (128,)}, "texels": 1024, "side": 256, "arc": 0.0}
+SUBJECTS = {
+    "poster": Subject({"color": "chelsea"}, POSTER, (3, 16), _poster, FULLY, arc=1.4),
+    "ball": Subject({"color": "astronaut"}, PAINT, (2, 3, 16), _ball, FULLY),
+    "material": Subject(PHOTOS, BALL, (6, 8), _ball, FULLY),
+    "text": Subject({"color": "letters"}, POSTER, (8,), _poster, texels=512, side=256, arc=1.4),
+    "tiled": Subject({"color": "motorcycle"}, PAINT, (8,), _tiled_ball),
+    "room": Subject({"color": "retina"}, POSTER, (8,), _poster_in_a_room, arc=1.4, depth=6),
+    "crate": Subject({"color": "astronaut"}, {"color": "crate.bsdf.reflectance"}, (8,), _crate),
+    "noisy": Subject({"color": "rocket"}, POSTER, (8,), _poster, arc=1.4, noise=0.03),
+    "painting": Subject(PAINTING, CANVAS, (2,), _hung, **HUNG),
+    "wall": Subject(WALL, PLASTER, (2,), _hung, **HUNG),
+}

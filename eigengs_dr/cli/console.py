@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import click
 
-from ..backend.doors import progress_bar
+from ..backend.entry_points import progress_bar
 from ..backend.interrupts import INTERRUPTED, NAME, terminate_as_interrupt
 from ..backend.messages import printable
 from ..backend.selection import BackendError

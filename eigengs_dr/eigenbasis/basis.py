@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..backend.doors import checks_types, shows_progress
+from ..backend.entry_points import checks_types, shows_progress
 from ..backend.messages import shown, warn
 from ..backend.types import ArrayLike, Doubles, Singles
 from ..gaussian.gaussians import notebook_html

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..backend.doors import check_types, door
+from ..backend.entry_points import check_types, entry_point
 from ..backend.types import Doubles, Record, Singles
 from ..fitting.place import grid_of
 from ..gaussian.gaussians import Gaussians, concatenate, with_colors
@@ -127,7 +127,7 @@ dB at 256 pixels and gains 1 dB at 512. Here, on cats of 512 pixels with 1,000 t
 it cost 0.1 dB initially, and gained 0.2 to 0.8 dB after 300 steps."""
 
 
-@door
+@entry_point
 def fit_model(
     basis: Eigenbasis,
     options: TrainOptions,

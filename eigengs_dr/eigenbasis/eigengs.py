@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..backend.doors import checks_types, door, shows_progress
+from ..backend.entry_points import checks_types, entry_point, shows_progress
 from ..backend.types import ArrayLike, Doubles, Record, Singles
 from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.io import Codes, check_member
@@ -158,7 +158,7 @@ class EigenGS:
             return None
         return curve_from_eigenvalues(self.eigenvalues, self.variance, self.mean_image.size)
 
-    @door
+    @entry_point
     def project(
         self, image: ArrayLike, target_psnr: float | None = None, encoding: str | None = None
     ) -> tuple[Singles, ...]:
@@ -196,7 +196,7 @@ class EigenGS:
         """
         return self.encoder.project(check_member(image, encoding), target_psnr)
 
-    @door
+    @entry_point
     def reconstruct(
         self, coefficients: Sequence[ArrayLike], size: tuple[int, int] | None = None
     ) -> Gaussians:
@@ -224,7 +224,7 @@ class EigenGS:
             raise ValueError("coefficients are not all finite in single precision; replace them")
         return self._colored(self.encoder.mean_colors + self.encoder.sum(coefficients), size)
 
-    @door
+    @entry_point
     def encode(
         self,
         image: ArrayLike,

@@ -15,7 +15,7 @@ from typing import TypeAlias
 import drjit as dr
 
 from ..backend.arrays import ArrayTypes, types_of
-from ..backend.doors import check_fields
+from ..backend.entry_points import check_fields
 from ..backend.recording import freeze_program
 from ..backend.types import Float, Rows, UInt
 from .loss import TINY, PictureLoss
@@ -123,7 +123,7 @@ class Coarse(Adaptive):
         `eigengs_dr.fitting.from_loss.STEPS_PER_TEXEL` for each texel of a Gaussian.
     """
 
-    share: float = 0.5
+    share: float = 0.9
     max_steps: int = 60
     rate: float = 0.025
     decay: float = 0.05

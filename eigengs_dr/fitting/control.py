@@ -20,7 +20,7 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import make_divisor, types_of
-from ..backend.doors import check_fields
+from ..backend.entry_points import check_fields
 from ..backend.types import Float, Rows
 from ..gaussian.gaussians import broadcast_rows
 from ..raster.kernels import sum_by_image

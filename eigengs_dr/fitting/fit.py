@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import checks_types, door, shows_progress
+from ..backend.entry_points import checks_types, entry_point, shows_progress
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.types import ArrayLike
 from ..gaussian.file import FitFigures, write_set
@@ -129,7 +129,7 @@ class Fit:
 
 @named_options
 @shows_progress
-@door
+@entry_point
 def fit(
     image: ArrayLike | os.PathLike[str] | Mapping[str, ArrayLike | Map] | None = None,
     gaussians: int | Sequence[int] | None = None,

@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import types_of
-from ..backend.doors import check_types
+from ..backend.entry_points import check_types
 from ..backend.messages import shown
 from ..backend.recording import collector_off, freeze_program
 from ..backend.types import Float, Record, Tensor

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import check_fields
+from ..backend.entry_points import check_fields
 from ..backend.messages import shown
 from ..gaussian.file import CUTOFF, MAX_CUTOFF
 from ..gaussian.gaussians import Gaussians

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from ..backend.doors import check_types, checks_types
+from ..backend.entry_points import check_types, checks_types
 from ..backend.messages import shown
 from ..gaussian.file import check_index_range, check_sides
 from ..gaussian.gaussians import Fitted, Gaussians

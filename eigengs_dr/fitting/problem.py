@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_in, types_of
-from ..backend.doors import check_types
+from ..backend.entry_points import check_types
 from ..backend.selection import select
 from ..backend.types import ArrayLike, PathLike, Values
 from ..gaussian.channels import TextureMap, check_maps, check_name, slices, usual_space

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 import drjit as dr
 
 from ..backend.arrays import rsqrt, types_of
-from ..backend.doors import check_fields
+from ..backend.entry_points import check_fields
 from ..backend.types import Float, FloatLike, Rows
 from ..gaussian.gaussians import Gaussians
 from ..raster.lists import TileLists

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..backend.arrays import eval_pending_scatters, types_in, types_of, upload, upload_rows
-from ..backend.doors import class_of_doors, door
+from ..backend.entry_points import class_of_entry_points, entry_point
 from ..backend.messages import shown
 from ..backend.selection import BackendError, select
 from ..backend.types import Array2f, Array3f, Float, FloatLike, Rows, Tensor, UInt
@@ -39,7 +39,7 @@ def notebook_html(value: object) -> str:
     return eg.to_html(value)
 
 
-@class_of_doors
+@class_of_entry_points
 @dataclass(repr=False, eq=False)
 class Gaussians:
     """N two-dimensional Gaussians and a constant background, which represent an image.
@@ -394,7 +394,7 @@ def broadcast_rows(rows: Rows, gaussians: Gaussians) -> list[Float]:
     return [row + dr.zeros(type(row), len(gaussians)) for row in rows]
 
 
-@door
+@entry_point
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     """Concatenate sets and add their backgrounds.
 
@@ -501,7 +501,7 @@ FIELDS = {"mean": 2, "factor": 3, "color": 0, "background": 0}
 """Parameters of a set, with their numbers of columns; 0 means the number of channels."""
 
 
-@door
+@entry_point
 def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return the parameters of a set as tensors; differentiable.
 
@@ -535,7 +535,7 @@ def to_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
     return tensors
 
 
-@door
+@entry_point
 def from_tensors(tensors: Mapping[str, Tensor], like: Gaussians) -> Gaussians:
     """Create a set from tensors; differentiable. The inverse of `to_tensors`.
 

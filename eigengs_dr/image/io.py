@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import checks_types
+from ..backend.entry_points import checks_types
 from ..backend.messages import printable
 from ..backend.types import ArrayLike, PathLike
 from ..storage.atomic import atomic_write, refuse_url

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
-from ..backend.doors import checks_types
+from ..backend.entry_points import checks_types
 from ..backend.types import ArrayLike, Doubles, DrJitArray, Float, Singles
 from .color import RGB_TO_YCBCR, rgb_to_ycbcr, to_linear, to_pu21
 from .io import read_image, to_8bit

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeGuard, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.doors import check_types
+from ..backend.entry_points import check_types
 from ..backend.messages import printable, shown, warn
 from ..backend.types import ArrayLike, PathLike, Singles, Tensor, Values
 from ..storage.atomic import is_url

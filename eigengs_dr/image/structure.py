@@ -32,7 +32,7 @@ from ..backend.arrays import (
     types_of,
     upload,
 )
-from ..backend.doors import door
+from ..backend.entry_points import entry_point
 from ..backend.selection import select
 from ..backend.types import Bool, Doubles, Float, Tensor, UInt, Values
 from .pixels import C1, C2, is_tensor
@@ -45,7 +45,7 @@ PLANES = 4
 """Largest number of planes that are blurred at once."""
 
 
-@door
+@entry_point
 def similarity(
     a: Tensor | Values, b: Tensor | Values, weight: Tensor | Values | None, taps: Doubles
 ) -> Float:
@@ -90,7 +90,7 @@ def similarity(
     return dr.custom(_Similarity, x, y, factors, size, wanted)
 
 
-@door
+@entry_point
 def plane_sums(a: Values, b: Values, weight: Values | None, taps: Doubles) -> tuple[float, float]:
     """Sum SSIM and its contrast-structure term over all windows of two planes.
 

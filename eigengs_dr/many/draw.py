@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..backend.doors import door
+from ..backend.entry_points import entry_point
 from ..backend.types import Values
 from ..gaussian.file import SetData
 from ..gaussian.gaussians import Gaussians
@@ -47,7 +47,7 @@ def _load(data: SetData, backend: str | None) -> Gaussians:
     return Gaussians.from_data(data, backend)
 
 
-@door
+@entry_point
 def _pixels_of(data: SetData, backend: str | None) -> Picture:
     return render(_load(data, backend)).numpy()
 

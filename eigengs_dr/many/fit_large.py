@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..backend.doors import checks_types, shows_progress
+from ..backend.entry_points import checks_types, shows_progress
 from ..backend.interrupts import Interrupted, defer_interrupts
 from ..backend.selection import select
 from ..backend.types import Arrays

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
-from ..backend.doors import checks_types, shows_progress
+from ..backend.entry_points import checks_types, shows_progress
 from ..backend.selection import name_of, select
 from ..fitting.control import Diverged
 from ..fitting.fit import Fit, fit_images

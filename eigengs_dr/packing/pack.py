@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import types_of
-from ..backend.doors import door
+from ..backend.entry_points import entry_point
 from ..backend.types import ArrayLike, PathLike
 from ..codec.egs import MAX_SECTIONS, SUFFIX
 from ..codec.quantization import Steps
@@ -49,7 +49,7 @@ READERS: dict[str, Callable[[PathLike, str | None], Content]] = {
 """What reads a file, by its format."""
 
 
-@door
+@entry_point
 def load(path: PathLike, backend: str | None = None) -> Content:
     """Read what a file of this package holds, whatever it is.
 
@@ -122,7 +122,7 @@ class PackResult(NamedTuple):
     steps: Steps
 
 
-@door
+@entry_point
 @np.errstate(under="ignore")  # small weights become 0, whatever the caller does about that
 def pack(
     gaussians: Gaussians | Fit | Relightable,

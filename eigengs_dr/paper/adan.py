@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from ..backend.doors import check_fields
+from ..backend.entry_points import check_fields
 from ..backend.types import Float, Rows
 from ..fitting.state import debias, zeros_like
 

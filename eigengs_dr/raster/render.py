@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 
 from ..backend.arrays import ArrayTypes, eval_pending_scatters, make_divisor, types_of
-from ..backend.doors import door
+from ..backend.entry_points import entry_point
 from ..backend.types import Float, FloatLike, Tensor, UInt, Values
 from ..gaussian.channels import slices
 from ..gaussian.covariance import add_variances
@@ -35,7 +35,7 @@ from .parameters import (
 from .tiles import TILE, Grid
 
 
-@door
+@entry_point
 def render(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -125,7 +125,7 @@ def render(
     return tensor if gaussians.space.affine else gaussians.space.decode_image(tensor)
 
 
-@door
+@entry_point
 def tile_lists(
     gaussians: Gaussians | Fitted,
     width: int | None = None,
@@ -182,7 +182,7 @@ def tile_lists(
     return replace(lists, frame=frame)
 
 
-@door
+@entry_point
 def picture_of(
     gaussians: Gaussians | Fitted,
     width: int | None = None,

@@ -71,8 +71,10 @@ MAX_PSNR_DROP = 0.4
 """Decibels of left-out lights that a model may lose: half by fewer planes, half by fewer Gaussians.
 Of ten sets, none shows left-out lights 0.1 dB worse than with a Gaussian for 16 pixels."""
 
-PIXELS_PER_GAUSSIAN, HALVINGS = 16, 3
-"""Pixels of a photo for each Gaussian, and how often the number is halved at most."""
+PIXELS_PER_GAUSSIAN, HALVINGS = 16, 2
+"""Pixels of a photo for each Gaussian, and how often the number is halved at most. With an eighth,
+two sets lose 0.09 to 0.20 dB by the estimate, and 0.12 to 0.29 dB of photos that it has not seen (a
+fifth of those of the fit, twice)."""
 
 TRY_SHARE = 0.1
 """Steps of a try as a fraction of those of a fit."""
@@ -350,11 +352,10 @@ def fit_fewest(
     """Fit the smallest number of Gaussians that costs left-out lights at most so many decibels.
 
     The number is halved while a try, a fit of few steps, predicts that: the other steps lower its
-    loss by about as large a factor as its own lowered the error, 0.2 to 0.7 on ten sets. An
+    loss by about as large a factor as its own lowered the error, 0.2 to 0.7 on nine sets. An
     interrupted try or fit is returned as well.
     """
-    height, width, _ = planes.images.shape
-    count = max(1, height * width // PIXELS_PER_GAUSSIAN)
+    count = max(1, planes.images[..., 0].size // PIXELS_PER_GAUSSIAN)
     exact, steps = planes.psnr_held_out(planes.images), round(TRY_SHARE * iterations)
     for _ in range(HALVINGS):
         tried = fit_planes(planes.images, max(1, count // 2), steps, seed, backend)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.arrays import ArrayTypes, types_of
-from ..backend.doors import class_of_doors, shows_progress
+from ..backend.entry_points import class_of_entry_points, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.types import ArrayLike, Doubles, Rows
 from ..codec.egs import is_packed, read_egs
@@ -66,7 +66,7 @@ BRIGHTEST = {"brightest": Field("f8", 0)}
 """An array that older files lack."""
 
 
-@class_of_doors
+@class_of_entry_points
 @dataclass(frozen=True, eq=False, repr=False)
 class Relightable:
     """An object under any light, from photos of one camera under some lights.
@@ -133,7 +133,7 @@ class Relightable:
             directions. By default the only such file in the folder. A list is paired with files by
             name, and with arrays in order.
         gaussians : int, optional
-            Number of Gaussians. By default one for 16 pixels, halved up to three times within the
+            Number of Gaussians. By default one for 16 pixels, halved once or twice within the
             budget, as short tries predict.
         planes : int, optional
             Number of planes. By default the smallest within the budget.

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt, zoom
 from skimage.transform import resize_local_mean
 
 from ..backend.arrays import types_in
-from ..backend.doors import door, shows_progress
+from ..backend.entry_points import entry_point, shows_progress
 from ..backend.interrupts import Interrupted
 from ..backend.selection import backend_of, select
 from ..backend.types import ArrayLike, Texture
@@ -103,7 +103,7 @@ class SceneFit(NamedTuple):
 
 
 @shows_progress
-@door
+@entry_point
 def fit_for_scene(
     scene: Any,
     texture: str | Texture | Sequence[str | Texture],

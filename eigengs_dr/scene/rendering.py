@@ -115,7 +115,7 @@ def render_in_passes(
     try:
         while done < total:
             count = min(max_count, total - done)
-            with collector_off():  # also between the lookups, whose doors make objects
+            with collector_off():  # also between the lookups, whose entry points make objects
                 part = mi.render(
                     scene, sensor=camera, integrator=integrator, spp=count, seed=seed + done
                 )

@@ -3,6 +3,7 @@
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import eigengs_dr as eg
@@ -16,10 +17,10 @@ from _helpers.command import assert_refused, run, said
 from _helpers.lit_spheres import directions, photos
 from eigengs_bench import alike, cases, inverse, kernels, rate, relight, scaling, texture
 from eigengs_bench.images import images_of
-from eigengs_bench.names import SETS, ImageSet
+from eigengs_bench.names import SETS, SUBJECTS_OF_SAMPLES, ImageSet
 from eigengs_bench.report import Section
 from eigengs_bench.rows import FILE, read
-from eigengs_bench.subjects import SUBJECTS
+from eigengs_bench.subjects import SUBJECTS, photos_of, scene_of
 
 slow = pytest.mark.slow
 
@@ -190,19 +191,36 @@ def test_texture(monkeypatch, tmp_path):
 @pytest.mark.mitsuba
 def test_inverse(monkeypatch, tmp_path):
     pytest.importorskip("mitsuba")
-    smaller(monkeypatch, inverse, STEPS=(4, 16), NOISES=(), WARM_UP=4, NOISY_STEPS=16)
+    smaller(monkeypatch, inverse, WARM_UP=4, STEPS_OF_MAPS=16)
     for name, subject in SUBJECTS.items():
-        one = subject._replace(texels=64, side=16, cameras=(2,))
+        one = subject._replace(texels=64, side=16, cameras=(2,), runs={4: (4, 16)})
         monkeypatch.setitem(SUBJECTS, name, one)
     scenes = ("--scene", "ball", "--scene", "material", "--seeds", "1")
     rows, text = answered(tmp_path / "out", "inverse", *scenes, "--backend", "llvm")
-    ball, material = rows[:6], rows[6:]
-    for first, then in zip(ball[:3], ball[3:], strict=True):
+    ball, material = rows[:8], rows[8:]
+    for first, then in zip(ball[:3], ball[3:6], strict=True):
         assert first["job"]["method"] == then["job"]["method"] in inverse.METHODS
         assert first["seconds"] > 0 and 5 < first["psnr_rgb"] < then["psnr_rgb"]
-    assert [row["job"]["method"] for row in material] == [*inverse.METHODS] * 2
+    descents = [(row["job"]["steps"], row["job"]["method"]) for row in material]
+    longer = [(24, method) for method in inverse.RIVALS]
+    assert descents == [(steps, m) for steps in (4, 16) for m in inverse.METHODS] + longer
     assert all(row["albedo"] > 5 and row["roughness_constant"] > 5 for row in material)
-    assert "ball, 2 cameras" in text and "at equal seconds" in text
+    assert "ball, 2 cameras" in text and "within equal seconds" in text
+
+
+@slow
+@pytest.mark.mitsuba
+def test_photos_of_all_scenes(monkeypatch):
+    """Each scene shows its texture: photos depend on most of it, and differ from those of grey."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    for name in SUBJECTS_OF_SAMPLES:
+        monkeypatch.setitem(SUBJECTS, name, SUBJECTS[name]._replace(texels=64, side=32))
+        scene = scene_of(mi, name, 3, None)
+        grey = photos_of(mi, scene.load(mi), 3)
+        for photo, other in zip(scene.photos[3:], grey, strict=True):
+            assert np.isfinite(photo).all() and np.abs(photo - other).mean() > 0.01
+        assert np.mean(scene.seen > 0) > 0.3
 
 
 # --- Photos under many lights ---
@@ -228,18 +246,37 @@ def lit(tmp_path):
 def test_relight(lit, tmp_path, monkeypatch):
     pytest.importorskip("mitsuba")
     eg.register_plugins()  # before the first row, which names the threads of Dr.Jit
-    few = {"PLANES": (6,), "QUALITIES": (30, 90), "PIXELS": (16,), "BUDGETS": (0.5,)}
+    few = {"PLANES": (3,), "PIXELS": (None, 8), "BUDGETS": (0.5, 4.0)}
     smaller(monkeypatch, relight, **few)
     shutil.rmtree(lit / "b")
+    list_of_lights = lit / "a" / "dirs.lp"
+    list_of_lights.write_text(list_of_lights.read_text().replace("20", "19", 1))  # only a warning
     rows, text = answered(tmp_path / "out", "relight", lit, "--iterations", 5)
     assert {row["job"]["set"] for row in rows} == {"a"}
     assert {row["job"]["method"] for row in rows} == {relight.OURS, *relight.METHODS}
     points = [point for row in rows for point in row["points"]]
     assert all(p["bytes_per_pixel"] == p["bytes"] / 24**2 for p in points)
     assert "median" in text and (tmp_path / "out" / "relight.svg").exists()
-    assert relight.summarize(rows[:-1]) == Section()  # the run was stopped
+    assert relight.summarize(rows[1:]) == Section()  # the run has not measured the default
     missing = run("bench", "relight", lit, "--set", "c", "-o", tmp_path / "other")
     assert_refused(missing, "--set c", "has a")
+
+
+def test_ratios_of_bytes_are_those_of_equal_psnr():
+    """Half the bytes at each PSNR; where ours begins above the other's end, that of the ends."""
+    sizes, psnrs = np.array([1.0, 2.0, 4.0]), np.array([30.0, 31.0, 32.0])
+    other = pd.DataFrame({"bytes_per_pixel": sizes, "psnr_rgb": psnrs})
+    ours = pd.DataFrame({"bytes_per_pixel": sizes / 2, "psnr_rgb": psnrs})
+    np.testing.assert_allclose(relight.ratios(ours, other), [0.5] * 5)
+    np.testing.assert_allclose(relight.ratios(ours, other[1:2]), [0.5] * 5)
+    assert list(relight.ratios(ours.assign(psnr_rgb=psnrs + 9), other)) == [0.5 / 4]
+    assert not len(relight.ratios(ours, other.assign(psnr_rgb=psnrs + 9)))
+
+
+def test_a_network_learns_a_set(lit):
+    pytest.importorskip("torch")
+    row = relight.network(*relight.photos_of(lit / "b"))
+    assert row["points"][0]["psnr_rgb"] > 15 and row["seconds"] > 0
 
 
 def test_every_fifth_light_is_left_out(lit):

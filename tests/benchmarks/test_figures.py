@@ -79,3 +79,5 @@ def test_gain_at_equal_seconds():
     assert inverse.gain({"pyramid": pyramid, "fit": fits}) == pytest.approx([1, -4, 6])
     both = {"pyramid": pyramid, "texels": texels, "fit": fits}
     assert inverse.gain(both) == pytest.approx([1, -4, 1])
+    worse = {3: {"seconds": 8, "psnr_rgb": 30}}  # what a rival has reached is not lost
+    assert inverse.gain({"pyramid": pyramid | worse, "fit": fits}) == pytest.approx([1, -4, 6])

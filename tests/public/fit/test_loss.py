@@ -130,7 +130,7 @@ def test_a_weight_says_where_the_picture_matters():
         fit(lambda picture, step: masked(picture, weight), 50, 100, weight=w, **FREE).loss
         for w in (None, weight)
     )
-    assert weighed < 0.85 * plain
+    assert weighed < 0.95 * plain
 
 
 def test_a_half_that_a_loss_ignores_looks_like_the_other():
@@ -209,12 +209,12 @@ def test_rows_between_the_ends_call_no_loss():
         calls.append(step)
         return squares(picture)
 
-    found = fit(counted, **FREE)
-    assert len(calls) == 60 + 2 and calls.count(0) == 1 + 2
+    found = fit(counted, 50, 100, **FREE)
+    assert len(calls) == 100 + 2 and calls.count(0) == 1 + 2
     assert found.loss == pytest.approx(squares(eg.render(found.gaussians)).array[0], rel=1e-5)
     losses = [row["loss"] for row in found.trace]
-    assert losses[0] > losses[-1] and len(losses) == 5  # texels; 0, 10, 20 and 30 steps after
-    for number in (0, 1):  # no step of texels: there is no mean
+    assert losses[0] > losses[-1] and len(losses) == 5  # texels; 0, 10, 20 and 40 steps after
+    for number in (0, 1):  # no step of Gaussians: there is no mean
         texels, first, *_ = fit(squares, 50, number, **FREE).trace
         assert texels["loss"] > 0.01 and first["loss"] > 0.01
 

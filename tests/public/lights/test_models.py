@@ -110,7 +110,7 @@ class TestFit:
         some, fewer = (
             model_of(PHOTOS[~LEFT_OUT], max_psnr_drop=drop, **options) for drop in (0.01, 20)
         )
-        assert (len(some.planes), len(fewer.planes)) == (64, 8)
+        assert (len(some.planes), len(fewer.planes)) == (64, 16)
         assert fewer.psnr_held_out < some.psnr_held_out
 
     def test_planes_show_best_what_other_lights_need(self):

@@ -394,7 +394,8 @@ def test_a_passing_error_is_told_once_and_the_next_steps_are_replayed():
         assert len(texts) == 1 and "\n" not in texts[0]
         begin = "photo_loss: a recording failed, its step renders anew: jit_malloc"
         assert texts[0].startswith(begin)
-        assert other == pytest.approx(loss, rel=1e-5)
+        # Mitsuba adds the derivatives of texels by several threads, in any order.
+        assert other == pytest.approx(loss, rel=1e-3)
 
 
 @pytest.mark.parametrize("kind", [RuntimeError, TypeError])

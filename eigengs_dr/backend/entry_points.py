@@ -1,7 +1,7 @@
-"""Doors: the entry points of the package, their numbers, progress bars, and the lock of Dr.Jit.
+"""The entry points of the package: their numbers, progress bars, and the lock of Dr.Jit.
 
-A public function that uses Dr.Jit is a door, and so is each public method of a class of doors.
-Functions that are only called from doors need no lock. Work that starts elsewhere takes
+Each public function that uses Dr.Jit is one, and so are the public methods of some classes.
+Functions that are only called from entry points need no lock. Work that starts elsewhere takes
 `eigengs_dr.exclusive` itself: a group of images, a block, a task of a cluster.
 """
 
@@ -28,7 +28,7 @@ Function = TypeVar("Function", bound=Callable[..., object])
 Kind = TypeVar("Kind", bound=type)
 
 
-def door(function: Function) -> Function:
+def entry_point(function: Function) -> Function:
     """Decorate a public function that uses Dr.Jit.
 
     No other thread uses Dr.Jit during a call. Without the lock, threads crash the process or hang,
@@ -52,15 +52,15 @@ def door(function: Function) -> Function:
     return cast(Function, call)
 
 
-def class_of_doors(kind: Kind) -> Kind:
-    """Decorate a class: its public methods and ``[...]`` become doors, its properties do not."""
+def class_of_entry_points(kind: Kind) -> Kind:
+    """Decorate a class: its public methods and ``[...]`` are entry points, properties are not."""
     for name, member in list(vars(kind).items()):
         if name.startswith("_") and name != "__getitem__":
             continue
         if isinstance(member, classmethod):
-            setattr(kind, name, classmethod(door(member.__func__)))
+            setattr(kind, name, classmethod(entry_point(member.__func__)))
         elif isfunction(member):
-            setattr(kind, name, door(member))
+            setattr(kind, name, entry_point(member))
     return kind
 
 
