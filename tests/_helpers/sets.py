@@ -59,9 +59,9 @@ class Scene(NamedTuple):
             space=space,
         )
 
-    def exact(self, cutoff=np.inf, size=None):
+    def exact(self, cutoff=np.inf):
         """Sum over all pairs of splats and pixels in float64, shape (H, W, C)."""
-        return render_exact(*self[:4], *(size or self.size), cutoff)
+        return render_exact(*self[:4], *self.size, cutoff)
 
     def at(self, size, filter=True):
         """The scene of a picture of another size.
@@ -160,11 +160,6 @@ def check_equal(gaussians, arrays):
     """Check that a set holds these arrays, rounded to its precision."""
     for name, found in gaussians.to_arrays().items():
         np.testing.assert_array_equal(found, np.asarray(arrays[name], found.dtype), err_msg=name)
-
-
-def upload(types, *arrays):
-    """Arrays of a backend that hold the values of NumPy arrays."""
-    return upload_rows(types.Float, arrays)
 
 
 def bound(scene, rounding):

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import eigengs_dr as eg
-from _helpers.errors import file_refused
+from _helpers.errors import check_refused
 from _helpers.packed import peak
 from _helpers.sets import COUNT, few, random_scene, scenes
 from eigengs_dr.codec import egs as packed
@@ -89,12 +88,6 @@ def test_stored_files_keep_their_numbers(version, digest):
 
 
 # --- Hostile files ---
-
-
-def check_refused(path, data, words=""):
-    path.write_bytes(data)
-    with file_refused(path, words):
-        eg.Gaussians.load(path)
 
 
 @cache

@@ -1,25 +1,11 @@
-"""Colour spaces against scikit-image, and the same formula on NumPy and Dr.Jit arrays."""
+"""Codes and light: the same formula on NumPy and Dr.Jit arrays."""
 
 import drjit as dr
 import numpy as np
 import pytest
-from skimage.color import rgb2ycbcr
 
 from eigengs_dr.backend.selection import select
-from eigengs_dr.image.color import from_log, rgb_to_ycbcr, to_coded, to_linear, to_log
-
-PRECISION = {np.float32: 2e-6, np.float64: 1e-14}
-
-# --- YCbCr -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", PRECISION)
-def test_equals_scikit_image(dtype):
-    image = np.random.default_rng(0).random((7, 5, 3)).astype(dtype)
-    result = rgb_to_ycbcr(image)
-    assert result.dtype == dtype
-    np.testing.assert_allclose(result, rgb2ycbcr(image) / 255, atol=PRECISION[dtype])
-
+from eigengs_dr.image.color import from_log, to_coded, to_linear, to_log
 
 # --- sRGB and linear light ---------------------------------------------------------------------
 

@@ -1,7 +1,5 @@
 """The peaks of an error, beside a plain search by NumPy and SciPy."""
 
-from types import SimpleNamespace
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,23 +11,18 @@ from eigengs_dr.backend.arrays import types_of
 from eigengs_dr.fitting.peaks import RADIUS, SIZE, Canvas, residual_peaks
 
 
-def found_peaks(missed, count, weight=None, backend="llvm"):
-    """Mean (n, 2), colour (n, C), image and rank (n,), for an error (H, W, C) and its weights."""
+def found_peaks(missed, count, weight, backend):
+    """Mean (n, 2) and colour (n, C), for an error (H, W, C) and its weights."""
     curvature = np.ones((*missed.shape[:-1], 1)) if weight is None else weight
     curvature = curvature.astype(np.float32)
     slope, grid = to_tiles(missed * curvature, backend)
     types = types_of(slope)
     canvas = Canvas(types, grid, grid.in_arrays(types))
     peaks = residual_peaks(canvas, slope, to_tiles(curvature, backend)[0], count)
-    return SimpleNamespace(
-        mean=peaks.mean.numpy().T,
-        color=np.stack([row.numpy() for row in peaks.color], axis=1),
-        image=peaks.image.numpy(),
-        rank=peaks.rank.numpy(),
-    )
+    return peaks.mean.numpy().T, np.stack([row.numpy() for row in peaks.color], axis=1)
 
 
-def plain_peaks(missed, weight=None):
+def plain_peaks(missed, weight):
     """Mean and colour of all peaks, the best first."""
     taps = np.exp(-0.5 * np.square(np.arange(-RADIUS, RADIUS + 1) / SIZE))
     weight = np.ones_like(missed) if weight is None else weight + 0 * missed
@@ -42,10 +35,6 @@ def plain_peaks(missed, weight=None):
     order = np.argsort(-gain[y, x])
     y, x = y[order], x[order]
     return np.stack([x + 0.5, y + 0.5], axis=1), color[y, x]
-
-
-def noise(*shape):
-    return np.random.default_rng(len(shape)).normal(size=shape).astype(np.float32)
 
 
 @few
@@ -61,16 +50,16 @@ def test_peaks_are_those_of_a_plain_search(backend, height, width, channels, sha
 
     Rounding may exchange peaks of equal gain.
     """
-    missed, generator = noise(height, width, channels), np.random.default_rng(1)
-    weight = None
+    generator, weight = np.random.default_rng(1), None
+    missed = generator.normal(size=(height, width, channels)).astype(np.float32)
     if layers:
         shape = (height, width, (1, channels)[layers - 1])
         weight = generator.uniform(0.5, 2, shape) * (generator.uniform(0, 1, shape) > 1 / 3)
         weight = weight.astype(np.float32)
     mean, color = plain_peaks(missed, weight)
     count = int(share * len(mean))
-    found = found_peaks(missed, count, weight, backend)
-    assert len(found.mean) == len(found.color) == count
+    places, colors = found_peaks(missed, count, weight, backend)
+    assert len(places) == len(colors) == count
     if count:
-        np.testing.assert_array_equal(found.mean, mean[:count])
-        np.testing.assert_allclose(found.color, color[:count], rtol=1e-4, atol=1e-5)
+        np.testing.assert_array_equal(places, mean[:count])
+        np.testing.assert_allclose(colors, color[:count], rtol=1e-4, atol=1e-5)

@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from _helpers.sets import upload
+from _helpers.arrays import upload_rows
 from eigengs_dr.backend.selection import select
 from eigengs_dr.raster.evaluate import exp2_neg, is_steep, weights, widen
 from eigengs_dr.raster.parameters import EXP2_SCALE, kernel_radius
@@ -35,8 +35,8 @@ def test_products_are_exact_for_all_but_steep_gaussians(types, rows, cutoff):
     b = rng.choice([-1, 1], count) * np.exp(rng.uniform(math.log(0.01), math.log(10), count))
     shape = np.stack([*mean, a, b, c]).astype(np.float32).astype(float)
     radius = kernel_radius(cutoff)
-    kernel = upload(types, *shape[:2], *(EXP2_SCALE * shape[2:]))  # in the units of kernels
-    corner = upload(types, x, y)
+    shape[2:] *= EXP2_SCALE  # in the units of kernels
+    kernel, corner = (upload_rows(types.Float, rows) for rows in (shape, (x, y)))
     both = [weights(kernel, *corner, (4, rows), radius, steep) for steep in (False, True)]
     dr.eval(both)
     found, expected = (np.stack([w.numpy() for w in some]) for some in both)

@@ -79,20 +79,13 @@ def needles(rng):
 
 
 def sub_pixel(rng):
-    return np.stack(
-        [rng.uniform(4, 50, COUNT), rng.uniform(-50, 50, COUNT), rng.uniform(4, 50, COUNT)], 1
-    )
+    return rng.uniform([4, -50, 4], 50, (COUNT, 3))
 
 
 def huge(rng):
-    return np.stack(
-        [
-            10 ** rng.uniform(-6, -1, COUNT),
-            rng.uniform(-1e-2, 1e-2, COUNT),
-            10 ** rng.uniform(-6, -1, COUNT),
-        ],
-        1,
-    )
+    factor = 10 ** rng.uniform(-6, -1, (COUNT, 3))
+    factor[:, 1] = rng.uniform(-1e-2, 1e-2, COUNT)
+    return factor
 
 
 @pytest.mark.parametrize("shapes", [needles, sub_pixel, huge])

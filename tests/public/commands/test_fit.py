@@ -6,7 +6,6 @@ import shutil
 import sys
 import time
 
-import drjit as dr
 import numpy as np
 import pytest
 from PIL import Image
@@ -103,12 +102,6 @@ def test_mistakes(photo, existing, case, monkeypatch):
     options, words = MISTAKES[case]
     assert_refused(run("fit", "photo.png", "-o", existing, "--overwrite", *options), *words)
     assert photo.read_bytes() == pixels
-
-
-@pytest.mark.skipif(dr.has_backend(dr.JitBackend.CUDA), reason="this machine has a GPU")
-def test_cuda_without_gpu(photo, existing):
-    command = ["fit", photo, "-o", existing, "--overwrite", "--backend", "cuda"]
-    assert_refused(run(*command), "CUDA", "llvm")
 
 
 @pytest.mark.slow

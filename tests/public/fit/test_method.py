@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import eigengs_dr as eg
+from _helpers.errors import complaint
 from _helpers.photos import coffee
 from _helpers.waves import CONTROLS, METHODS, picture
 from eigengs_dr.paper import adan
@@ -70,16 +71,14 @@ FIELDS = [(part, name) for part, names in NUMBERS.items() for name in names.spli
 def test_numbers_out_of_range_are_refused_in_a_line(part, name, value):
     is_whole = type(getattr(part, name)) is int
     kind = ValueError if type(value) in ((int,) if is_whole else (int, float)) else TypeError
-    with pytest.raises(kind, match="is ") as caught:
-        replace(part, **{name: value})
-    assert "\n" not in str(caught.value)
+    assert "is " in complaint(kind, replace, part, **{name: value})
 
 
 @pytest.mark.parametrize(
     ("part", "changed", "words"),
     [
-        (eg.DEFAULT, {"cutoff": 0}, r"Method: cutoff is 0.0; it must be in \(0, 12\]"),
-        (eg.DEFAULT, {"solve_steps": -1}, r"solve_steps is -1; it must be in \[0, inf\)"),
+        (eg.DEFAULT, {"cutoff": 0}, "Method: cutoff is 0.0; it must be in (0, 12]"),
+        (eg.DEFAULT, {"solve_steps": -1}, "solve_steps is -1; it must be in [0, inf)"),
         (eg.DEFAULT, {"controls": (CONTROLS["Surplus"],)}, "controls: a Surplus leaves by a Reloc"),
         (
             eg.DEFAULT,
@@ -88,16 +87,14 @@ def test_numbers_out_of_range_are_refused_in_a_line(part, name, value):
         ),
         (eg.DEFAULT, {"rates": {}}, "rates are {}; each must be above 0"),
         (eg.DEFAULT, {"rates": {"mean": np.inf}}, "each must be above 0 and finite"),
-        (CONTROLS["Relocate"], {"share": 1.1}, r"Relocate: share is 1.1; it must be in \[0, 1\]"),
-        (ADAM, {"beta_1": 1.0}, "^Adam: beta_1 is 1.0; "),
+        (CONTROLS["Relocate"], {"share": 1.1}, "Relocate: share is 1.1; it must be in [0, 1]"),
+        (ADAM, {"beta_1": 1.0}, "Adam: beta_1 is 1.0; "),
         (adan.Adan(), {"betas": (0.9, -0.1, 0.9)}, "betas"),
         (AGREEING, {"least": 0.0}, "least"),
     ],
 )
 def test_bad_values_are_refused(part, changed, words):
-    with pytest.raises(ValueError, match=words) as error:
-        replace(part, **changed)
-    assert "\n" not in str(error.value)
+    assert words in complaint(ValueError, replace, part, **changed)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import eigengs_dr as eg
-from _helpers.errors import file_refused
+from _helpers.errors import check_refused, file_refused
 from _helpers.files import members_of
 from _helpers.materials import material
 from _helpers.packed import peak
@@ -128,13 +128,6 @@ def zipped(contents, method=zipfile.ZIP_DEFLATED):
         for key, data in contents.items():
             target.writestr(f"{key}.npy", data)
     return file.getvalue()
-
-
-def check_refused(path, content, words=""):
-    """Loading says in one line which file it is and what is wrong."""
-    path.write_bytes(content)
-    with file_refused(path, words):
-        eg.Gaussians.load(path)
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED])

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import eigengs_dr as eg
+from _helpers.errors import complaint
 from _helpers.materials import MAPS, material
 from _helpers.reference import render_exact
 from _helpers.sets import COUNT, NAMES, SIZE, arrays_of, check_equal, few, random_scene
@@ -117,18 +118,14 @@ def test_selection(backend, index):
     assert (chosen.width, chosen.height, chosen.space) == (*SIZE, "data")
 
 
-@pytest.mark.parametrize(
-    "index", [COUNT, -COUNT - 1, [0, COUNT], np.ones(COUNT - 1, bool), 0.5, [[0], [1]]], ids=str
-)
-def test_selection_of_what_is_not_there(index):
-    with pytest.raises(IndexError):
-        random_scene().on("llvm")[index]
-
-
-@pytest.mark.parametrize("index", [np.array([], int), slice(5, 5), np.zeros(COUNT, bool)], ids=str)
-def test_selection_of_nothing(index):
-    with pytest.raises(ValueError, match="empty"):
-        random_scene().on("llvm")[index]
+def test_selection_of_what_is_not_there_or_of_nothing():
+    gaussians = random_scene().on("llvm")
+    for index in (COUNT, -COUNT - 1, [0, COUNT], np.ones(COUNT - 1, bool), 0.5, [[0], [1]]):
+        with pytest.raises(IndexError):
+            gaussians[index]
+    for index in (np.array([], int), slice(5, 5), np.zeros(COUNT, bool)):
+        with pytest.raises(ValueError, match="empty"):
+            gaussians[index]
 
 
 # --- Sizes, trees, precision --------------------------------------------------------------------
@@ -197,9 +194,7 @@ def test_concatenation_of_what_differs():
         replace(first, space="rgb"),
         random_scene().on("llvm", 64),
     ):
-        with pytest.raises(ValueError, match="sets differ") as error:
-            eg.concatenate([first, other])
-        assert "\n" not in str(error.value)
+        assert "sets differ" in complaint(ValueError, eg.concatenate, [first, other])
 
 
 # --- Bounds -------------------------------------------------------------------------------------

@@ -11,22 +11,14 @@ from _helpers.command import assert_refused, run
 from _helpers.errors import refused
 from _helpers.light import to_coded, to_linear
 from _helpers.lit_spheres import directions, photos
+from _helpers.variants import in_variants, variant  # noqa: F401
 
 mi = pytest.importorskip("mitsuba", reason="renderings are tensors and bitmaps of Mitsuba")
 
-pytestmark = pytest.mark.mitsuba
+pytestmark = [pytest.mark.mitsuba, pytest.mark.usefixtures("variant"), in_variants(["llvm_ad_rgb"])]
 
 LIGHTS = directions(12)
 SMALL = {"gaussians": 100, "planes": 8, "iterations": 30, "progress": False}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def llvm():
-    before = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    yield
-    if before:
-        mi.set_variant(before)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from skimage.color import rgb2ycbcr
 
 import eigengs_dr as eg
-from _helpers.errors import file_refused
+from _helpers.errors import check_refused
 from _helpers.packed import few_groups, small_fit
 from _helpers.sets import COUNT, SIZE, few, random_scene
 
@@ -189,12 +189,6 @@ def test_sections_hold_the_splats_in_their_order_and_are_read_alone(path):
     gaussians.save(path.with_suffix(".npz"))
     with pytest.raises(ValueError, match=r"x\.npz: has no sections"):
         eg.Gaussians.load(path.with_suffix(".npz"), sections=1)
-
-
-def check_refused(path, data, words=""):
-    path.write_bytes(data)
-    with file_refused(path, words):
-        eg.Gaussians.load(path)
 
 
 def test_files_cut_off_anywhere(receipts, path):
