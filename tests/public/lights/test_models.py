@@ -113,6 +113,7 @@ class TestFit:
         assert (len(some.planes), len(fewer.planes)) == (64, 16)
         assert fewer.psnr_held_out < some.psnr_held_out
 
+    @pytest.mark.slow
     def test_planes_show_best_what_other_lights_need(self):
         """Noise that no light repeats does not take the Gaussians from the object."""
         noisy = PHOTOS + 0.1 * np.random.default_rng(2).standard_normal(PHOTOS.shape)

@@ -87,7 +87,7 @@ def gallery(show=texture_of):
     )
 
 
-@pytest.mark.parametrize("texels", [0, FINER * SIZE[0]])
+@pytest.mark.parametrize("texels", [0, pytest.param(FINER * SIZE[0], marks=pytest.mark.slow)])
 def test_every_slot_shows_what_a_bitmap_of_the_same_picture_shows(texels):
     """Slopes of a bitmap are those of its texels, and random normals point behind a surface."""
     shows = partial(texture_of, texels=texels), fine_bitmap

@@ -95,6 +95,7 @@ class TestDerivatives:
         scene = wall(integrator, cutoff=6.0, prefilter=angle)
         check_gradients(scene, "wall.bsdf.reflectance", PARAMETERS)
 
+    @pytest.mark.slow
     def test_in_forward_mode(self):
         scene = partial(wall, "prb", prefilter=0.1)
         check_forward_mode(scene, "wall.bsdf.reflectance", PARAMETERS)
