@@ -290,10 +290,8 @@ def test_the_memory_that_is_said_is_near_the_measured_one(tmp_path, monkeypatch)
 def test_a_second_run_into_one_file_says_who_writes(photo, tmp_path):
     output = tmp_path / "x.npz"
     with start("fit", photo, "-o", output, "--quiet", "--iterations", 10_000_000) as process:
-        # Names with ".npz" are of the trial whether the file can be written, which comes first.
-        while not any(
-            path.stat().st_size for path in tmp_path.glob(".*.lock") if ".npz" not in path.name
-        ):
+        # The trial whether the file can be written has a lock before, of a longer name.
+        while not any(path.stat().st_size for path in tmp_path.glob(".*-????????????????.lock")):
             assert process.poll() is None
             time.sleep(0.01)
         second = run("fit", photo, "-o", output, *QUICK)
