@@ -126,11 +126,13 @@ def test_a_weight_says_where_the_picture_matters():
     """Most of the loss lies in a quarter of the picture; the texels' picture does not say so."""
     weight = np.full((SIDE, SIDE, 1), 0.001, np.float32)
     weight[:16, :16] = 1
+    # Half of the steps, so that the Gaussians have settled.
+    options = FREE | {"method": replace(eg.COARSE_TO_FINE, place=eg.Coarse(share=0.5))}
     plain, weighed = (
-        fit(lambda picture, step: masked(picture, weight), 50, 100, weight=w, **FREE).loss
+        fit(lambda picture, step: masked(picture, weight), 50, 100, weight=w, **options).loss
         for w in (None, weight)
     )
-    assert weighed < 0.95 * plain
+    assert weighed < 0.85 * plain
 
 
 def test_a_half_that_a_loss_ignores_looks_like_the_other():
