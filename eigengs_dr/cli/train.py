@@ -47,7 +47,7 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
     "--lights", "DIRS.lp", options.EXISTING, "The photos show one object under these lights."
 )
 @options.value(
-    "--max-psnr-drop", "DB", float, "Loss of left-out --lights for fewer Gaussians.  [default: 0.4]"
+    "--max-psnr-drop", "DB", float, "Loss of left-out --lights for fewer Gaussians.  [default: 0.3]"
 )
 @options.shared("cluster", "backend", "report", "quiet")
 def train(
@@ -214,7 +214,7 @@ def _train_on_lights(
                 seed=choices["seed"],
                 encoding=choices["encoding"],
                 backend=run.backend,
-                progress=lambda done, total, row: show("planes", done, total),
+                progress=lambda done, total, row: show(row.get("stage", "planes"), done, total),
                 **({} if steps is None else {"iterations": steps}),
             )
     except eg.Interrupted as interrupt:
