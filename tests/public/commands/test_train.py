@@ -163,7 +163,6 @@ def test_render_takes_a_light(lit, tmp_path):
     [
         ([], "give --light"),
         (["--light", "0,1"], "expected x,y,z"),
-        (["--light", "0,0,-1"], "below the horizon"),
         (["--light", "0,0,1", "--map", "a"], "--light and --map exclude each other"),
         (["--planes", "x"], "--planes takes no other options"),
     ],
