@@ -159,7 +159,8 @@ def _find_lights(run: options.Run, folder: Path) -> Path | None:
         raise click.UsageError(f"{listed}; give one of them with --lights, or {family}")
     note = f"{lists[0]} names the lights of the photos"
     if given := _given(run, *FOR_FAMILIES, "components"):
-        raise click.UsageError(f"{note}; such a model takes no {given}: leave it out, or {family}")
+        planes = ", name the list with --lights" * (given == "--components")
+        raise click.UsageError(f"{note}; leave out {given}{planes}, or {family}")
     print_message(f"note: {note}: training a model of lights; {family}")
     return lists[0]
 

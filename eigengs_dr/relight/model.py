@@ -23,7 +23,7 @@ from ..codec.egs import is_packed, read_egs
 from ..eigenbasis.incremental import product
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
-from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
+from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, check_suffix, members_of, packed_data
 from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats, read_photo
@@ -307,6 +307,7 @@ class Relightable:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
+        check_suffix(path)
         table = self.table
         arrays = members_of(self.planes.data()) | {
             "lights": table.lights.astype(np.float32),

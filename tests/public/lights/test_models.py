@@ -254,6 +254,10 @@ class TestFiles:
         model.planes.save(tmp_path / "set.npz")
         with pytest.raises(ValueError, match=r"format is 'eigengs_dr\.gaussians'"):
             eg.Relightable.load(tmp_path / "set.npz")
+        command = "render", tmp_path / "set.npz", "-o", tmp_path, "--light", "0,0,1"
+        assert_refused(run(*command), "holds no model of lights; leave out --light")
+        with pytest.raises(ValueError, match=r"only eigengs_dr\.pack writes"):
+            model.save(tmp_path / "set.egs")
 
     @few_groups()
     def test_packed_files_that_are_no_models_are_refused(self, model, tmp_path):
