@@ -26,7 +26,7 @@ from eigengs_bench.names import KODAK_COUNTS, SOLVE_STEPS
 from eigengs_bench.rows import Job, Row, Task
 
 SET = "kodak"
-LEGIBLE = 13  # points of text that a chart of 6.4 inches shows with 10 pixels on a phone
+LEGIBLE = 18  # points of text that a chart of 9.2 inches shows with 10 pixels on a phone
 LABELLED = (5000, 30_000, 70_000)  # numbers of Gaussians that stand beside points
 
 KIND = ["iterations", "solve_steps"]
@@ -198,13 +198,13 @@ def _over_seconds(fits: pd.DataFrame, others: pd.DataFrame) -> Figure:
 
     Words stand beside points: a legend would take half of the height of a phone.
     """
-    figure = fr.new_figure(6.4, 4.4)
+    figure = fr.new_figure(9.2, 5.4)
     axis = figure.subplots()
     points = fits.groupby("gaussians").agg({"seconds": "median", "psnr_float": "mean"})
-    axis.plot(points.seconds, points.psnr_float, "o-", ms=6, color=fr.BLUE)
+    axis.plot(points.seconds, points.psnr_float, "o-", ms=8, color=fr.BLUE)
 
     def write(words: str, x: float, y: float, color: str, side: str) -> None:
-        offset = {"right": (-8, -4), "left": (9, -4), "center": (0, 10)}[side]
+        offset = {"right": (-11, -6), "left": (12, -6), "center": (0, 13)}[side]
         look: Any = {"ha": side, "fontsize": LEGIBLE, "color": color}
         axis.annotate(words, (x, y), offset, textcoords="offset points", **look)
 
@@ -216,7 +216,7 @@ def _over_seconds(fits: pd.DataFrame, others: pd.DataFrame) -> Figure:
     write(words, last.seconds, last.psnr_float, fr.BLUE, "right")
     for name, part in others.groupby("method", sort=False):
         method = re.split(r"[ ,]", str(name))[0]
-        axis.plot(part.seconds, part.psnr_float, "X", color=fr.RED, ms=9)
+        axis.plot(part.seconds, part.psnr_float, "X", color=fr.RED, ms=13)
         highest = part.loc[part.psnr_float.idxmax()]
         side = "left" if highest.seconds < 5 * last.seconds else "center"  # near the edge
         write(method, highest.seconds, highest.psnr_float, fr.RED, side)
