@@ -132,8 +132,9 @@ class Eigenbasis:
         size, limits = check_size(size), check_components(components, energy)
         ranks = [rank_for(k) for k in limits]
         check_encoding(encoding)
-        if isinstance(images, (str, os.PathLike)) and (lists := find_lists(images)):
-            warn(f"{lists[0]}: names the lights of photos; Relightable.fit makes a model of them")
+        if isinstance(images, (str, os.PathLike)) and os.path.isdir(images):
+            for file in find_lists(images)[:1]:
+                warn(f"{file}: names the lights of photos; Relightable.fit makes a model of them")
         stream = Stream(size, space, ranks, block_length(size), progress, encoding)
         with series():
             states = find_states(images, stream, client, checkpoint)

@@ -159,8 +159,8 @@ def list_images(images: str | os.PathLike[str], recursive: bool = False) -> list
 
 
 def find_lists(folder: PathLike) -> list[Path]:
-    """Return the lists of lights (.lp) in a folder, without hidden files."""
-    files = sorted(Path(folder).glob("*.[lL][pP]"))
+    """Return the lists of lights (.lp) in a folder, without hidden files; OSError if it is none."""
+    files = sorted(file for file in Path(folder).iterdir() if file.suffix.lower() == ".lp")
     return [file for file in files if file.name[0] != "." and file.is_file()]
 
 
