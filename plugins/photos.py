@@ -124,6 +124,8 @@ def photo_loss(
     for name, number, least in (("spp", spp, 1), ("seed", seed, 0)):
         if number < least:
             raise ValueError(f"photo_loss: {name} is {number}; it must be at least {least}")
+    if isinstance(photos, (str, os.PathLike)):
+        raise TypeError(f"photo_loss: photos is {photos!r}; give a list, one for each sensor")
     known = mi.traverse(scene)
     keys = dict(pictures) if isinstance(pictures, Mapping) else {"": pictures}
     keys = {name: _data_of(known, key) for name, key in keys.items()}

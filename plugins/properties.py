@@ -142,6 +142,8 @@ def lit_planes(props: mi.Properties) -> tuple[LightTable, float, mi.Properties]:
     planes.set_id(props.id())
     planes["raw"] = True
     if "lights" not in props:
+        if "model" not in props:
+            raise ValueError(f"{plugin}: give model, the file of a saved or packed Relightable")
         planes["planes"] = path(props, "model")
         model = Relightable.load(planes["planes"], backend_of(mi.variant()))
         table, brightest = model.table, model.brightest

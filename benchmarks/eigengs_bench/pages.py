@@ -140,13 +140,13 @@ def _captioned(measured: Table, rows: Sequence[Row]) -> str:
 
 
 def _runs(rows: Sequence[Row]) -> str:
-    """List the commands that measured rows, by machine, day and commit."""
+    """List the benchmarks that measured rows, by machine, day and commit."""
     machines: dict[str, dict[str, dict[str, None]]] = {}
     for row in rows:
         run = row["run"]
         code = f"{run['date'][:10]}, {code_name(run)}"
         commands = machines.setdefault(machine_of(run), {}).setdefault(code, {})
-        commands[_command(row).replace(" --quiet", "")] = None
+        commands[BENCHMARK.sub(r"\1\2", _command(row))] = None
     lines = []
     for machine, codes in machines.items():
         lines.append(f"- {machine}")

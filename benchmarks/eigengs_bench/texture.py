@@ -125,9 +125,9 @@ def _lights(lights: Sequence[Row]) -> Table:
 
 def _figures(balls: Sequence[Row], posters: Sequence[Row], lights: Sequence[Row]) -> dict[str, str]:
     """Return figures for sentences: of the last ball, memory of photos, and time of lights."""
-    small = [row["ratio_small"] for row in posters if row["kind"] == "photo"]
+    small = [row["ratio_small"] for row in posters if row["kind"] != "text"]
     ratios = [row["ratio"] for row in lights]
-    figures = {"small": f"{median(small):.2f}"} if small else {}
+    figures = {"small": f"{min(small):.2f} to {max(small):.2f}"} if small else {}
     figures |= {"lights": f"{min(ratios):.2f} to {max(ratios):.2f}"} if ratios else {}
     for row in balls[-1:]:
         held = [row[f"held_{count}"] for count in HELD]

@@ -55,9 +55,7 @@ def info(file: Path, as_json: bool, preview: Path | None, texture: bool) -> None
       eigengs-dr info fits/ --json
     """
     select()
-    from ..eigenbasis.eigengs import SHIPPED
-
-    file = SHIPPED.get(str(file), file)
+    file = options.file_of(file)
     files, in_folder = options.sets_in(file), file.is_dir()
     pictures = name_pictures(files, preview, in_folder)
     check_outputs(pictures, files)

@@ -75,6 +75,16 @@ def sets_in(path: Path, suffixes: tuple[str, ...] = (".npz", ".egs")) -> list[Pa
     return files
 
 
+def file_of(name: Path) -> Path:
+    """Return the path of a file or of a basis of the package; raise ValueError if it is neither."""
+    from ..eigenbasis.eigengs import SHIPPED
+
+    path = SHIPPED.get(str(name), name)
+    if not path.exists():
+        raise ValueError(f"{name}: is neither a file nor one of: {', '.join(SHIPPED)}")
+    return path
+
+
 def refuse_folder(path: Path) -> None:
     """Raise ValueError for a folder where one set belongs, with the names of the sets in it."""
     if path.is_dir():

@@ -57,8 +57,12 @@ def name_outputs(
         raise ValueError(f"{output}: is a file; several images, or a folder of them, need a folder")
     names = [path.stem + suffixes[0] for path in inputs]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
-        advice = "give an image once, or rename one of them"
-        raise ValueError(f"{output / twice[0]}: two images have this name; {advice}")
+        pairs = zip(inputs, names, strict=True)
+        first, second = [path for path, name in pairs if name == twice[0]][:2]
+        raise ValueError(
+            f"{output / twice[0]}: {first} and {second} have this name; give an image once, or "
+            "rename one of them"
+        )
     output.mkdir(parents=True, exist_ok=True)
     files = [output / name for name in names]
     for file in files:  # sets of Gaussians alone are looked at before they are replaced

@@ -120,8 +120,11 @@ def _render(
 
     name, region, first = (choices[key] for key in ("name", "region", "first"))
     light = choices["light"]
-    if light is None and kind_of(file) == LIGHTS:
+    lit = kind_of(file) == LIGHTS
+    if light is None and lit:
         raise ValueError(f"{file}: holds a model of lights; give --light, such as 0.3,0.2,0.9")
+    if light is not None and not lit:
+        raise ValueError(f"{file}: holds no model of lights; leave out --light")
     if light is not None and name is not None:
         raise ValueError("--light and --map exclude each other; give one of them")
     if light is not None:

@@ -47,7 +47,7 @@ HELD_OUT_FIGURES = ("psnr_pca", "psnr_init", "psnr_solved")
     "--lights", "DIRS.lp", options.EXISTING, "The photos show one object under these lights."
 )
 @options.value(
-    "--max-psnr-drop", "DB", float, "Loss of left-out --lights for fewer Gaussians.  [default: 0.4]"
+    "--max-psnr-drop", "DB", float, "Loss of left-out --lights for fewer Gaussians.  [default: 0.3]"
 )
 @options.shared("cluster", "backend", "report", "quiet")
 def train(
@@ -159,7 +159,8 @@ def _find_lights(run: options.Run, folder: Path) -> Path | None:
         raise click.UsageError(f"{listed}; give one of them with --lights, or {family}")
     note = f"{lists[0]} names the lights of the photos"
     if given := _given(run, *FOR_FAMILIES, "components"):
-        raise click.UsageError(f"{note}; such a model takes no {given}: leave it out, or {family}")
+        planes = ", name the list with --lights" * (given == "--components")
+        raise click.UsageError(f"{note}; leave out {given}{planes}, or {family}")
     print_message(f"note: {note}: training a model of lights; {family}")
     return lists[0]
 
@@ -214,7 +215,7 @@ def _train_on_lights(
                 seed=choices["seed"],
                 encoding=choices["encoding"],
                 backend=run.backend,
-                progress=lambda done, total, row: show("planes", done, total),
+                progress=lambda done, total, row: show(row.get("stage", "planes"), done, total),
                 **({} if steps is None else {"iterations": steps}),
             )
     except eg.Interrupted as interrupt:

@@ -90,11 +90,10 @@ def _load(
 
     The file need not be trusted: the number of Gaussians is checked before they are read.
     """
-    from ..eigenbasis.eigengs import SHIPPED
     from ..eigenbasis.files import MODEL_FORMAT
     from ..viewer.view import check_count
 
-    file = SHIPPED.get(str(file), file)
+    file = options.file_of(file)
     options.refuse_folder(file)
     if set_file.kind_of(file) in (MODEL_FORMAT, set_file.LIGHTS):
         if levels is not None or name is not None:

@@ -36,7 +36,7 @@ SUFFIX = ".egs"
 MAGIC = b"\x89EGS"
 """First bytes of a file. The first byte is not ASCII, so no text file starts with it."""
 
-VERSION, MAPS_VERSION, LIGHTS_VERSION = 5, 6, 7
+VERSION, MAPS_VERSION, LIGHTS_VERSION = 5, 6, 8
 """Versions of the format: for a set without maps, with a table of maps, and with a table of lights.
 Earlier versions were never released, and are not read."""
 
@@ -83,7 +83,7 @@ class EgsContent(NamedTuple):
     psnr : float
         PSNR against the image in dB, see `eigengs_dr.packing.pack.PackResult`; NaN if unknown.
     lights : bytes
-        The table of lights of planes, see `eigengs_dr.relight.model.table_bytes`; else empty.
+        The table of lights of planes, see `eigengs_dr.relight.packed.table_bytes`; else empty.
     """
 
     sections: list[Symbols]
@@ -268,8 +268,9 @@ def _read_header(file: BinaryIO) -> tuple[int, int, Integers, EgsContent]:
         raise BadValue("not a packed set of Gaussians; it may be damaged or of another kind")
     if version not in (VERSION, MAPS_VERSION, LIGHTS_VERSION):
         raise BadValue(
-            f"version is {version}, but this package reads versions {VERSION} to {LIGHTS_VERSION}; "
-            + ("upgrade eigengs-dr" if version > VERSION else "pack the set again")
+            f"version is {version}, but this package reads {VERSION}, {MAPS_VERSION} and "
+            f"{LIGHTS_VERSION}; "
+            + ("upgrade eigengs-dr" if version > LIGHTS_VERSION else "pack the set again")
         )
     width, height, x, y, color, cell, cutoff, psnr = rest
     background = exactly(file, 4 * channels)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.types import Arrays, Record, Singles
-from ..gaussian.file import CUTOFF, SetData, check
+from ..gaussian.file import CUTOFF, SetData, check, check_suffix
 from ..gaussian.gaussians import Gaussians
 from ..image.space import FAMILY_SPACES, space_of
 from ..storage import npz
@@ -60,6 +60,7 @@ MODEL_LAYOUT = FAMILY_LAYOUT | {
 
 def write_basis(path: str | os.PathLike[str], fields: Record) -> None:
     """Write the fields of an `eigengs_dr.Eigenbasis` atomically; see its `save`."""
+    check_suffix(path)
     arrays = {name: np.asarray(fields[name]) for name in ("mean", "variance", "count", "space")}
     pairs = zip(fields["components"], fields["eigenvalues"], strict=True)
     for c, (components, eigenvalues) in enumerate(pairs):
@@ -92,6 +93,7 @@ def read_basis(path: str | os.PathLike[str]) -> Record:
 
 def write_model(path: str | os.PathLike[str], fields: Record) -> None:
     """Write the fields of an `eigengs_dr.EigenGS` atomically; see its `save`."""
+    check_suffix(path)
     arrays = model_arrays(fields)
     with file_errors(path):
         check_model(arrays)

@@ -183,13 +183,13 @@ class FitFigures(NamedTuple):
 
 
 def check_suffix(path: str | os.PathLike[str]) -> None:
-    """Raise ValueError if the suffix of a file for a set belongs to another kind of file."""
+    """Raise ValueError if the suffix of a file for Gaussians belongs to another kind of file."""
     suffix = Path(path).suffix.lower()
     if suffix == ".egs":
         raise ValueError(f"{path}: only eigengs_dr.pack writes .egs files; save as .npz")
     if suffix in SUFFIXES:
         raise ValueError(
-            f"{path}: a set is not an image; save it as .npz, and its picture with save_image"
+            f"{path}: Gaussians are not an image; save them as .npz, and a picture with save_image"
         )
 
 

@@ -30,9 +30,10 @@ from ..image.io import check_data, check_image
 from ..image.metrics import MAX_PSNR, psnr, psnr_from_mse
 from ..image.pixels import check_encoding
 from ..raster.render import picture_of
-from ..relight.model import Relightable, read_table, table_bytes
+from ..relight.model import Relightable
+from ..relight.packed import read_table, table_bytes
 from ..storage.atomic import require_writable
-from .rounding import MIN_MSE, TOO_FINE, Comparison, planes_of, round_within
+from .rounding import MIN_MSE, Comparison, planes_of, round_within
 
 Array = NDArray[np.floating]
 
@@ -199,16 +200,10 @@ def pack(
         compare = _compare_maps if source.maps else _compare
         maps, display, compared = compare(source, image, encoding)
     else:
-        # The budget also pays for the rounding of the table, which is the error of equal planes.
-        for width in (1, 2):
-            maps, display, compared = _compare_planes(model, width)
-            unseen, lost = compared.extra_error, compared.error(source)
-            left = max_psnr_drop - psnr_from_mse(unseen) + psnr_from_mse(unseen + lost)
-            if left > TABLE_SHARE * max_psnr_drop:
-                break
-        if left <= 0:
-            raise ValueError(TOO_FINE)
-        max_psnr_drop = left
+        maps, display = (), []
+        compared, table_of = _compare_planes(model, max_psnr_drop)
+        unseen, lost = compared.extra_error, compared.error(source)  # of the table
+        max_psnr_drop += psnr_from_mse(unseen + lost) - psnr_from_mse(unseen)
     weighted = source
     if maps:
         weights = type(source.color)(channel_weights(maps))
@@ -221,8 +216,7 @@ def pack(
     lights = b""
     if model is not None:
         before = compared.extra_error
-        held_out = after if math.isfinite(model.psnr_held_out) else math.nan
-        lights = table_bytes(replace(model, psnr_held_out=held_out), width)
+        lights = table_of(after if math.isfinite(model.psnr_held_out) else math.nan)
     content = attempt.packed._replace(maps=maps, psnr=stored, lights=lights)
     size = write_packed(output, content)
     rounded = Gaussians.load(output, types_of(source.mean).backend)
@@ -301,32 +295,46 @@ def _display(g: Gaussians) -> Array:
 # --- The planes of a model of lights --------------------------------------------------------------
 
 
-TABLE_SHARE = 0.5
-"""Share of the budget that a table of bytes must leave; else a number of the table takes two."""
-
 LIGHTS_DEAD_ZONE = 0.2
 """Dead zone of planes, whose faint colours are mostly noise: 1 to 5 % fewer bytes and up to 0.1 dB
 more of left-out photos than with that of images (two sets)."""
 
 
-def _compare_planes(model: Relightable, width: int) -> Compared:
+def _compare_planes(
+    model: Relightable, max_psnr_drop: float
+) -> tuple[Comparison, Callable[[float], bytes]]:
     """Compare planes, whose errors add up to that of left-out photos, and pictures by the table.
 
-    The file rounds the table to bytes or pairs, which adds the error of the pictures of the photos.
+    The rounding of the table adds the error of the pictures of the photos. Bytes are spent best
+    where one more bit of any number lowers the error by as much, so the table gets the share of the
+    error that its numbers are of all numbers. Returned as well is what writes that table
+    beside the PSNR of left-out photos.
     """
     target, table = planes_of(model.planes), model.table
-    rounded_table, *_ = read_table(table_bytes(model, width), target.shape[2])
-    change = rounded_table.at(table.lights) - table.at(table.lights)
+    known = math.isfinite(model.psnr_held_out)
+    unseen = 10 ** (-model.psnr_held_out / 10) if known else MSE_WITHOUT_IMAGE
     plain = np.concatenate([target, np.ones_like(target[..., :1])], axis=2)
     moments = np.tensordot(plain, plain, ((0, 1), (0, 1))) / target[..., 0].size
+    numbers = len(model.planes) * (NUMBERS_OF_SHAPE + model.planes.channels)
+    share = table.values.size / (table.values.size + numbers)
+    error_of_table = share * unseen * (10 ** (max_psnr_drop / 10) - 1)
+    squares = np.diag(moments)[:-1]
+
+    def table_of(psnr: float) -> bytes:
+        return table_bytes(table, squares, error_of_table, psnr, model.brightest)
+
+    rounded_table, *_ = read_table(table_of(math.nan), len(squares))
+    change = rounded_table.at(table.lights) - table.at(table.lights)
     of_table = float(np.einsum("nck,kl,ncl->nc", change, moments, change).mean())
 
     def error(rounded: Gaussians) -> float:
         return float(np.square(planes_of(rounded) - target).sum(axis=2).mean()) + of_table
 
-    known = math.isfinite(model.psnr_held_out)
-    unseen = 10 ** (-model.psnr_held_out / 10) if known else MSE_WITHOUT_IMAGE
-    return (), [], Comparison(error, target, unseen, LIGHTS_DEAD_ZONE)
+    return Comparison(error, target, unseen, LIGHTS_DEAD_ZONE), table_of
+
+
+NUMBERS_OF_SHAPE = 5
+"""Numbers of a Gaussian besides its colours: mean and covariance."""
 
 
 # --- A set with maps -----------------------------------------------------------------------------

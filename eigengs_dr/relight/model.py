@@ -7,7 +7,6 @@ As in `eigengs_dr.EigenGS`, a new member of the family is a product: the colours
 from __future__ import annotations
 
 import os
-import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from ..codec.egs import is_packed, read_egs
 from ..eigenbasis.incremental import product
 from ..fitting.objective import Pixels
 from ..fitting.solve import solve
-from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, members_of, packed_data
+from ..gaussian.file import ARRAYS, LIGHTS, SetData, check, check_suffix, members_of, packed_data
 from ..gaussian.gaussians import Gaussians, notebook_html, with_colors
 from ..image.color import to_linear
 from ..image.io import read_floats, read_photo
@@ -39,6 +38,7 @@ from ..storage.npz import BadValue, Field, file_errors
 from .directions import LatLong
 from .fit import (
     MAX_PSNR_DROP,
+    PLANES_SHARE,
     ROUNDING,
     find_planes,
     fit_fewest,
@@ -46,7 +46,8 @@ from .fit import (
     most_planes,
     read_photos,
 )
-from .lights import KINDS, MAX_FACTOR, MAX_LIGHTS, LightTable, check_lights, check_table
+from .lights import MAX_LIGHTS, LightTable, check_lights, check_table
+from .packed import check_brightest, read_table
 
 VERSION = 1
 """Version of the format."""
@@ -133,13 +134,13 @@ class Relightable:
             directions. By default the only such file in the folder. A list is paired with files by
             name, and with arrays in order.
         gaussians : int, optional
-            Number of Gaussians. By default one for 16 pixels, halved once or twice within the
-            budget, as short tries predict.
+            Number of Gaussians. By default one for 16 pixels, halved as often as the budget allows,
+            as short tries predict.
         planes : int, optional
             Number of planes. By default the smallest within the budget.
         max_psnr_drop : float, optional
-            The budget: decibels of left-out lights that a model may lose, by default 0.4. Half of
-            it may go to fewer planes than are best, and half to fewer Gaussians.
+            The budget: decibels of left-out lights that a model may lose, by default 0.3. A quarter
+            may go to fewer planes than are best, and the rest to fewer Gaussians.
         iterations : int, optional
             Number of steps of the fit of the planes.
         encoding : {"srgb", "linear"}, optional
@@ -173,11 +174,11 @@ class Relightable:
         if planes is not None and not 1 <= planes <= most:
             raise ValueError(f"planes is {planes}; {len(read.lights)} photos have 1 to {most}")
         brightest = max(1.0, float(read.rows.max()))
-        found = find_planes(read, planes, budget / 2).for_left_out()
+        found = find_planes(read, planes, PLANES_SHARE * budget).for_left_out()
         del read  # the photos take more memory than the fit
         options = iterations, seed, backend, progress
         if gaussians is None:
-            result = fit_fewest(found, budget / 2, *options)
+            result = fit_fewest(found, (1 - PLANES_SHARE) * budget, *options)
         else:
             result = fit_planes(found.images, gaussians, *options)
         shown = result.image.reshape(found.images.shape)
@@ -306,6 +307,7 @@ class Relightable:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file atomically; if that raises OSError, an old file is unchanged."""
+        check_suffix(path)
         table = self.table
         arrays = members_of(self.planes.data()) | {
             "lights": table.lights.astype(np.float32),
@@ -349,13 +351,6 @@ class Relightable:
                 figures = [float(members.get(name, 1)) for name in ("psnr_held_out", "brightest")]
                 check_brightest(figures[1])
         return cls(Gaussians.from_data(data, backend), table, *figures)
-
-
-def check_brightest(code: float) -> float:
-    """Return the largest code of photos; raise `BadValue` if it is none."""
-    if not 1 <= code <= MAX_FACTOR:
-        raise BadValue(f"brightest is {code}, expected 1 to {MAX_FACTOR:g}")
-    return code
 
 
 GIVE = "give one direction, three numbers as lights[0], or an environment: an image (h, w, 3)"
@@ -434,55 +429,3 @@ def environment_lights(environment: object) -> tuple[Doubles, Doubles]:
     directions, areas = LatLong(width, height).directions(), LatLong(width, height).areas()
     above = directions[..., 2] > 0
     return directions[above], (average * areas[:, None, None] / np.pi)[above]
-
-
-# --- The table in a packed file ------------------------------------------------------------------
-
-_HEAD = struct.Struct("<BBHfd")
-"""Kind, planes, lights, smoothing, and the PSNR of left-out lights."""
-
-_BRIGHTEST = struct.Struct("<f")
-"""The largest code of photos."""
-
-
-def table_bytes(model: Relightable, width: int = 1) -> bytes:
-    """Return the table of a model for an ``.egs`` file: 16 bits per coordinate, 8 or 16 per factor.
-
-    It has the kind and K, the number of planes, both uint8; n, the number of lights, uint16; the
-    smoothing, float32; the PSNR of left-out photos, float64; K + 1 scales, float32; directions,
-    (n, 3) int16 over 32767; values, (n, 3, K + 1) int8 or int16 times the scales; and where photos
-    are brighter than white their largest code, float32. Rounding to 8 bits is 40 dB below the
-    contrast of the photos.
-    """
-    table, planes = model.table, model.planes.channels
-    head = _HEAD.pack(
-        KINDS.index(table.kind), planes, len(table.lights), table.smoothing, model.psnr_held_out
-    )
-    kind = np.dtype(f"<i{width}")
-    scale = np.abs(table.values).max(axis=(0, 1), initial=1e-6) / np.iinfo(kind).max
-    scale = scale.astype("<f4")
-    lights = np.round(table.lights * 32767).astype("<i2")
-    values = np.round(table.values / scale).astype(kind)
-    brightest = _BRIGHTEST.pack(model.brightest) if model.brightest > 1 else b""
-    return head + scale.tobytes() + lights.tobytes() + values.tobytes() + brightest
-
-
-def read_table(content: bytes, channels: int) -> tuple[LightTable, float, float]:
-    """Return what `table_bytes` wrote: the table, the PSNR and the largest code of photos."""
-    if len(content) < _HEAD.size:
-        raise BadValue("the table of lights is truncated; copy the file again")
-    kind, planes, count, smoothing, psnr = _HEAD.unpack_from(content)
-    sizes = [4 * (planes + 1), 6 * count, 3 * (planes + 1) * count]
-    rest = len(content) - _HEAD.size - sum(sizes)
-    width = 2 if rest >= sizes[2] else 1
-    rest, sizes[2] = rest - (width - 1) * sizes[2], width * sizes[2]
-    if rest not in (0, _BRIGHTEST.size) or planes != channels:
-        raise BadValue("the table of lights has another size; copy the file again")
-    ends = (_HEAD.size + np.cumsum(sizes)).tolist()
-    scale = np.frombuffer(content[_HEAD.size : ends[0]], "<f4").astype(np.float64)
-    lights = np.frombuffer(content[ends[0] : ends[1]], "<i2").reshape(count, 3) / 32767
-    rounded = np.frombuffer(content[ends[1] : ends[2]], f"<i{width}").reshape(count, 3, planes + 1)
-    name = KINDS[kind] if kind < len(KINDS) else f"number {kind}"
-    table = check_table(LightTable(lights, rounded * scale, name, smoothing), planes)
-    brightest = check_brightest(_BRIGHTEST.unpack_from(content, ends[2])[0] if rest else 1.0)
-    return table, psnr, brightest

@@ -20,7 +20,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from eigengs_bench.subjects import bitmap, grey, load_scene
-from eigengs_dr.image.color import to_coded
+from eigengs_dr.image.color import to_coded, to_linear
 from eigengs_dr.image.resize import center_crop, resample
 from eigengs_dr.image.sheet import text_line
 from eigengs_dr.plugins import keep_in_bounds, photo_loss, texture_of
@@ -34,6 +34,7 @@ IMAGES = ROOT / "docs" / "images"
 WIDTH, GAP = 840, 6  # pixels: of a whole picture, and white between two
 APART = ((0, GAP), (0, GAP), (0, 0))  # around a picture
 LETTERS = 22  # pixels: they can be read where the picture is shown half as wide
+ON_PHONES = 30  # pixels: 12 of a screen of 390, for the front page
 MAX_BYTES = 60_000
 CAMERAS, SLOT = 6, "poster.bsdf.reflectance"  # of the photos of a poster; what they recover
 ERROR_GAIN = 4  # errors are shown as absolute differences of sRGB values, times this
@@ -274,26 +275,37 @@ def wall_of(gaussians: eg.Gaussians) -> "mi.Scene":
     return load_scene(mi, "poster", {"color": texture_of(gaussians)}, 3)
 
 
-def recovery() -> list[Row]:
-    """Show a photo, its Gaussians, a scene with them, and what photos of the scene give back."""
+def overview() -> list[Row]:
+    """Show a photo and its Gaussians, a view that no photo of a scene shows, and three lights."""
     photo = eg.sample("coffee")[:400, 120:520]
-    few, many = eg.fit(photo, 1500), eg.fit(photo, 5000, space="linear").gaussians
-    scene = load_scene(mi, "poster", {"color": texture_of(many, wrap_mode="clamp")}, CAMERAS)
-    photos = [mi.render(scene, sensor=k, spp=64, seed=k).numpy() for k in range(CAMERAS)]
-    unknown = load_scene(mi, "poster", {"color": bitmap(mi, grey("poster", "color"))}, CAMERAS)
+    few = eg.fit(photo, 1500).gaussians
+    known, unknown = (
+        load_scene(mi, "poster", {"color": bitmap(mi, texels)}, CAMERAS)
+        for texels in (np.float32(to_linear(photo)), grey("poster", "color"))
+    )
+    for scene in (known, unknown):
+        parameters = mi.traverse(scene)
+        parameters["camera00.film.size"] = [256, 256]  # the one film of all cameras
+        parameters.update()
+    photos = [mi.render(known, sensor=k, spp=64, seed=k).numpy() for k in range(CAMERAS)]
     loss = photo_loss(unknown, SLOT, photos, sensors=range(CAMERAS))
-    recovered = eg.fit(loss=loss, size=(256, 256), iterations=480, space="linear").gaussians
-    seen = eg.psnr(photo, eg.picture_of(recovered, width=photo.shape[1]))
+    found = eg.fit(loss=loss, size=(256, 256), iterations=480, space="linear").gaussians
+    recovered = load_scene(mi, "poster", {"color": texture_of(found, wrap_mode="clamp")}, CAMERAS)
     view = mi.ScalarTransform4f().look_at([1.9, 0.5, 3.1], [0.05, -0.12, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "pixel_format": "rgb", "width": 300, "height": 300}
     side = mi.load_dict({"type": "perspective", "fov": 40, "to_world": view, "film": film})
+    truth, ours = (
+        to_coded(mi.render(scene, sensor=side, spp=512).numpy()) for scene in (known, recovered)
+    )
+    print(f"recovered from {CAMERAS} photos: psnr_rgb {eg.psnr(truth.clip(0, 1), ours):.1f} dB")
     return [
         {
-            "a photo": photo,
-            "1,500 Gaussians": overlay(few.gaussians, eg.picture_of(few.gaussians, width=800)),
-            "5,000 in a scene": to_coded(mi.render(scene, sensor=side, spp=512).numpy()),
-            f"recovered, {seen:.1f} dB": eg.picture_of(recovered),
-        }
+            "photo": photo,
+            "Gaussians": overlay(few, eg.picture_of(few, width=800)),
+            "unseen view": truth,
+            "recovered": ours,
+        },
+        {f"light {name.split(',')[0]}": picture for name, picture in relight()[1].items()},
     ]
 
 
@@ -326,10 +338,12 @@ def browser() -> list[Row]:
 
 def write(name: str, rows: list[Row]) -> None:
     """Write rows of pictures as one, as well as fits in `MAX_BYTES`."""
-    lines = []
+    lines, letters = [], ON_PHONES if name == "teaser" else LETTERS
     for row in rows:
         width = (WIDTH + GAP) // len(row) - GAP
-        cells = [labelled(label, cell_of(picture, width)) for label, picture in row.items()]
+        cells = [
+            labelled(label, cell_of(picture, width), letters) for label, picture in row.items()
+        ]
         line = np.concatenate([np.pad(cell, APART, constant_values=255) for cell in cells], axis=1)
         margin = WIDTH + GAP - line.shape[1]
         lines.append(np.pad(line, ((0, 0), (0, margin), (0, 0)), constant_values=255))
@@ -341,11 +355,11 @@ def write(name: str, rows: list[Row]) -> None:
             break
 
 
-def labelled(label: str, cell: np.ndarray) -> np.ndarray:
+def labelled(label: str, cell: np.ndarray, letters: int) -> np.ndarray:
     """Write what a picture is above it."""
     if not label:
         return cell
-    return np.concatenate([np.uint8(255 * text_line(label, cell.shape[1], LETTERS)), cell])
+    return np.concatenate([np.uint8(255 * text_line(label, cell.shape[1], letters)), cell])
 
 
 def cell_of(picture: np.ndarray, width: int) -> np.ndarray:
@@ -372,7 +386,7 @@ PICTURES: dict[str, Callable[[], list[Row]]] = {
     "prefilter": aliasing,
     "differentiate": descent,
     "view": browser,
-    "teaser": recovery,
+    "teaser": overview,
 }
 
 if __name__ == "__main__":

@@ -121,8 +121,8 @@ PLAIN = b"\0\0\0\0" * 5
 
 HEADERS = [
     ({"magic": b"\x89EGT"}, "not a file of eigengs_dr"),
-    ({"version": 8}, "8, but this package reads versions 5 to 7; upgrade"),
-    ({"version": 4}, "reads versions 5 to 7; pack the set"),
+    ({"version": 9}, "9, but this package reads 5, 6 and 8; upgrade"),
+    ({"version": 4}, "reads 5, 6 and 8; pack the set"),
     ({"version": 0}, "version is 0"),
     ({"space": 9}, "unknown values"),
     ({"channels": 0}, "claims 0 channels"),

@@ -85,7 +85,7 @@ def test_info_of_a_model(trained, tmp_path):
 def test_info_of_the_basis_that_ships(tmp_path):
     facts = facts_of("natural")
     assert facts["components"] == facts["truncation"][-1]["components"] == [230, 60, 60]
-    assert_refused(run("info", tmp_path / "natural"), tmp_path / "natural", "No such file")
+    assert_refused(run("info", tmp_path / "natural"), "natural: is neither a file nor")
 
 
 def test_info_of_something_else(trained, tmp_path):

@@ -163,7 +163,6 @@ def test_render_takes_a_light(lit, tmp_path):
     [
         ([], "give --light"),
         (["--light", "0,1"], "expected x,y,z"),
-        (["--light", "0,0,-1"], "below the horizon"),
         (["--light", "0,0,1", "--map", "a"], "--light and --map exclude each other"),
         (["--planes", "x"], "--planes takes no other options"),
     ],
@@ -189,13 +188,13 @@ def test_a_list_in_the_folder_counts_as_given(coin, given):
     "options",
     [
         ["--size", "16x16"],
-        ["--components", "4"],
+        ["--components", "4", "name the list with --lights"],
         ["--space", "rgb"],
         ["--preset", "eigengs", "--frequency-aware", "yes"],
     ],
 )
 def test_what_is_for_families_is_refused_by_name(coin, options):
-    result = run("train", "coin", "-o", "m.npz", *FEW, *options)
+    result = run("train", "coin", "-o", "m.npz", *FEW, *options[: len(options) // 2 * 2])
     assert_refused(result, "coin/dirs.lp names the lights", *options[::2], "'coin/*.png'")
 
 

@@ -142,6 +142,6 @@ def test_bad_pixels_touch_no_file(tmp_path):
         with pytest.raises(eg.ImageError, match=words):
             eg.save_image(tmp_path / "a.png", image)
     one = eg.Gaussians.from_arrays([[1, 1]], [[1, 0, 1]], [[1, 1, 1]], size=(8, 8))
-    with pytest.raises(ValueError, match="a set is not an image"):
+    with pytest.raises(ValueError, match="Gaussians are not an image"):
         one.save(tmp_path / "a.png")
     assert not list(tmp_path.iterdir())

@@ -342,6 +342,8 @@ def test_messages_name_the_material(formula, saved):
             with pytest.raises(RuntimeError, match="gaussian_relightable: ") as caught:
                 mi.load_dict(bsdf | properties)
             assert "gaussian_texture" not in str(caught.value)
+    with pytest.raises(RuntimeError, match="gaussian_relightable: give model"):
+        mi.load_dict({"type": "gaussian_relightable", "filename": saved})
 
 
 # --- A model in memory ---

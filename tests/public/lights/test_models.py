@@ -112,7 +112,7 @@ class TestFit:
         some, fewer = (
             model_of(PHOTOS[~LEFT_OUT], max_psnr_drop=drop, **options) for drop in (0.01, 20)
         )
-        assert (len(some.planes), len(fewer.planes)) == (64, 16)
+        assert len(some.planes) == 64 and len(fewer.planes) < 16
         assert fewer.psnr_held_out < some.psnr_held_out
 
     @pytest.mark.slow
@@ -254,6 +254,10 @@ class TestFiles:
         model.planes.save(tmp_path / "set.npz")
         with pytest.raises(ValueError, match=r"format is 'eigengs_dr\.gaussians'"):
             eg.Relightable.load(tmp_path / "set.npz")
+        command = "render", tmp_path / "set.npz", "-o", tmp_path, "--light", "0,0,1"
+        assert_refused(run(*command), "holds no model of lights; leave out --light")
+        with pytest.raises(ValueError, match=r"only eigengs_dr\.pack writes"):
+            model.save(tmp_path / "set.egs")
 
     @few_groups()
     def test_packed_files_that_are_no_models_are_refused(self, model, tmp_path):
@@ -306,18 +310,14 @@ class TestNumber:
         assert "psnr_held_out" not in said("info", tmp_path / "unknown.egs")
         assert "left-out" not in eg.view(unknown).html
 
-    def test_that_is_too_good_for_the_table_where_the_budget_is_tiny(self, model, tmp_path):
-        with pytest.raises(ValueError, match="no rounding is fine enough"):
-            eg.pack(replace(model, psnr_held_out=99.0), tmp_path / "x.egs", max_psnr_drop=0.1)
-
     def test_that_is_good_takes_a_finer_table(self, model, tmp_path):
         tables = []
-        for psnr in (30.0, 60.0):
+        for psnr in (30.0, 60.0, 90.0):
             sure = replace(model, psnr_held_out=psnr)
             result, loaded = packed(sure, tmp_path / "x.egs", 0.5)
             assert 0.2 < result.psnr_drop <= 0.5
             tables.append(np.abs(loaded.table.values - model.table.values).max())
-        assert tables[1] < 0.01 * tables[0]
+        assert tables[2] < 0.05 * tables[1] < 0.0025 * tables[0]
 
     def test_is_repeated_by_commands_and_the_page(self, tmp_path):
         lines = ["8"]
