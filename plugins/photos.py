@@ -185,6 +185,10 @@ class _Photos:
     def __post_init__(self) -> None:
         self.channels = {name: self.known[key].shape[2] for name, key in self.keys.items()}
         self.add_slopes = freeze_rendering(_add_slopes)
+        # A recording holds for the state of all films of the scene, which their first use changes.
+        with dr.suspend_grad():
+            for sensor in self.sensors if self.parameters is None else ():
+                dr.eval(mi.render(self.scene, None, sensor, self.integrator, spp=self.spp))
 
     def loss(self, picture: Any, step: int) -> Any:
         """Return the squared error of the rendering of one photo."""
