@@ -281,12 +281,13 @@ def inverse() -> None:
 
     \b
     poster    a flat picture, with 3 and with 16 cameras around it
-    ball      the colour of a glossy coat, seen from all sides
+    ball      the colour of a glossy coat, with 2, 3 and 16 cameras on all sides
     material  its colour and its roughness, with 6 and with 8 cameras
+    text, tiled, room, crate, noisy  each with 8 cameras
     painting  a large picture from two cameras; DATA is the folder of its scene
     wall      colour, normals and roughness of the wall behind the painting
 
-    Steps render 4 samples per pixel, others 1 and 16. Everything takes more than an hour.
+    Steps render 4 samples per pixel, others 1, 16 and 64. Everything takes more than an hour.
     """
 
 

@@ -300,7 +300,7 @@ def _windows() -> Image:
 #  All scenes
 # ---------------------------------------------------------------------------------------------
 
-FULLY = {SPP: (60, 90, 120, 240, 480), 1: (240,), 16: (240,), 32: (240,), 64: (240,)}
+FULLY = {SPP: (60, 90, 120, 240, 480), 1: (240,), 16: (240,), 64: (60,)}
 PHOTOS = {"albedo": "astronaut", "roughness": "chelsea"}
 POSTER = {"color": "poster.bsdf.reflectance"}
 BALL = {"albedo": "ball.bsdf.base_color", "roughness": "ball.bsdf.roughness"}
