@@ -390,9 +390,10 @@ def _networks(points: pd.DataFrame) -> fr.Table:
 def _chart(points: pd.DataFrame) -> Figure:
     """Draw PSNR over bytes per pixel: a panel for each set."""
     names = points.set.unique()
-    figure = fr.new_figure(3 * len(names), 2.8, "Photos under lights that were left out")
-    axes = figure.subplots(1, len(names), squeeze=False)[0]
-    for axis, name in zip(axes, names, strict=True):
+    down = -(-len(names) // 2)
+    figure = fr.new_figure(9, 3 * down, "Photos under lights that were left out")
+    axes = figure.subplots(down, 2, squeeze=False).ravel()
+    for axis, name in zip(axes, names, strict=False):
         for method in (method for method in STYLES if method in set(points.method)):
             some = points[(points.set == name) & (points.method == method)]
             line, (color, style) = fr.best(some, "bytes_per_pixel"), STYLES[method]
@@ -400,5 +401,7 @@ def _chart(points: pd.DataFrame) -> Figure:
             axis.plot(x, y, style, color=color, ms=4, label=method)
         axis.set_title(name, fontsize=8)
         fr.label_axes(axis, "bytes per pixel", "PSNR in RGB / dB", legend=False)
+    for axis in axes[len(names) :]:
+        axis.remove()
     fr.legend_below(figure, axes[0], 4)
     return figure
