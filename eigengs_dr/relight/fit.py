@@ -73,7 +73,7 @@ MAX_PSNR_DROP = 0.3
 
 PLANES_SHARE = 0.25
 """Share of the budget that planes may take. Half as many Gaussians take half of the bytes, for 0.1
-to 0.8 dB; half as many planes take a tenth to a third less, for 0.1 to 1.2 dB (five sets)."""
+to 0.9 dB; half as many planes take a tenth to a third less, for 0.1 to 1.2 dB (five sets)."""
 
 PIXELS_PER_GAUSSIAN = 16
 """Pixels of a photo for each Gaussian, at least."""
@@ -355,7 +355,7 @@ def fit_fewest(
 
     The number is halved while a try, a fit of few steps, predicts that: the other steps lower its
     loss by about as large a factor as its own lowered the error, 0.2 to 0.7 on nine sets; what is
-    lost is then 0.8 to 1.5 times the prediction. An interrupted try or fit is returned as well.
+    lost is then 0.9 to 1.5 times the prediction. An interrupted try or fit is returned as well.
     """
     count = max(1, planes.images[..., 0].size // PIXELS_PER_GAUSSIAN)
     exact, steps = planes.psnr_held_out(planes.images), round(TRY_SHARE * iterations)

@@ -29,6 +29,9 @@ STEPS_PER_OCTAVE = 4
 TAILS = 8
 """Degrees of freedom of Student's distribution, see `eigengs_dr.codec.range_coder.TAILS`."""
 
+TINY = 1e-12
+"""Smallest mean square that counts: a plane or a difference may be 0."""
+
 
 def table_bytes(
     table: LightTable, squares: Doubles, error: float, psnr_held_out: float, brightest: float
@@ -50,8 +53,9 @@ def table_bytes(
         Those of the model.
     """
     planes = len(squares)
-    allowed = 12 * error / (planes + 1) / np.append(np.maximum(squares, 1e-12), 1)
-    octaves = np.floor(STEPS_PER_OCTAVE / 2 * np.log2(allowed)).clip(-128, 127).astype(np.int8)
+    allowed = 12 * error / (planes + 1) / np.append(np.maximum(squares, TINY), 1)
+    logarithms = STEPS_PER_OCTAVE / 2 * np.log2(np.maximum(allowed, TINY**2))
+    octaves = np.floor(logarithms).clip(-128, 127).astype(np.int8)
     lights = np.round(table.lights[:, :2] * 32767).astype("<i2")
     integers = np.rint(table.values / _steps(octaves)).astype(np.int64)
     of_colors = np.diff(integers, axis=1, prepend=0)
@@ -59,8 +63,7 @@ def table_bytes(
     differences[1:] -= of_colors[_nearest_before(lights)]
     squared = np.square(differences, dtype=np.float64)
     mean_squares = np.stack([squared[:, 0].mean(axis=0), squared[:, 1:].mean(axis=(0, 1))])
-    with np.errstate(divide="ignore"):
-        logarithms = CLASSES_PER_OCTAVE / 2 * np.log2(mean_squares)
+    logarithms = CLASSES_PER_OCTAVE / 2 * np.log2(np.maximum(mean_squares, TINY))
     widths = np.rint(logarithms.clip(MIN_CLASS, 127)).astype(np.int8)
     coder = Encoder()
     _code(coder, widths, differences)
