@@ -57,6 +57,9 @@ class Agreeing(Adam):
         The rate r at the start, and its lower bound: ``0 < least <= first <= 1``.
     floor : float, optional
         Share of the mean of v that is added to each, at least 0.
+    fall : float, optional
+        A pyramid ends once the rate of its finest level is below this share of its highest: what
+        derivatives tell of texels is noise from then on. In [0, 1]; 0 for never.
 
     Raises
     ------
@@ -70,11 +73,12 @@ class Agreeing(Adam):
     first: float = 0.2
     least: float = 0.02
     floor: float = 0.05
+    fall: float = 0.95
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_fields(self, memory="[0, 1)", gain="[0, inf)", first="(0, 1]", floor="[0, inf)")
-        check_fields(self, least=f"(0, {self.first}]")
+        check_fields(self, least=f"(0, {self.first}]", fall="[0, 1]")
 
     def start(self, value: Rows) -> tuple[Rows, ...]:
         """Return both averages of `Adam`, that of the values, and the logarithms of the rates."""
@@ -99,6 +103,14 @@ class Agreeing(Adam):
         average = dr.lerp(value, average, self.memory)
         moved = value - scale * dr.exp(log_rate) * (m / (dr.sqrt(floored) + self.epsilon))
         return moved, (m, v, average, log_rate)
+
+    def rate_of(self, moments: tuple[Rows, ...]) -> float:
+        """Return the geometric mean of the rates r of all rows."""
+        return math.exp(float(dr.mean(moments[3], axis=None).numpy()[0]))
+
+    def average_of(self, moments: tuple[Rows, ...]) -> Rows:
+        """Return the averages a, which have less noise than the values."""
+        return moments[2]
 
 
 @dataclass(frozen=True)
@@ -249,7 +261,7 @@ def texel_sums(
     ------
     Float, shape (H * W * C,)
         The sums of all levels before the first step and after each, as rows of pixels; and last
-        those of `fill_unseen`.
+        those of `fill_unseen`. If an `Agreeing` optimizer ends early, these are of its averages.
     """
     optimizer, channels = coarse.optimizer, loss.number
     levels = texel_levels(loss.grid.width, loss.grid.height)
@@ -283,18 +295,30 @@ def texel_sums(
     dr.make_opaque(values)
     moments, sums = [optimizer.start(value) for value in values], _sum_levels(values, levels)
     pictures, time = loss.seen(sums), dr.opaque(types.Float, 0)
-    squares = zeros_like(values[0])
+    squares, rates = zeros_like(values[0]), list[float]()
     with freeze_program(advance) as take_step:
         yield sums
-        for _ in range(steps):
+        for step in range(1, steps + 1):
             slopes, size = loss.step(pictures)
             values, moments, time, sums, pictures, squares = take_step(
                 values, moments, time, sums, slopes, size, squares
             )
             yield sums
+            if step % LOOK or not isinstance(optimizer, Agreeing):
+                continue
+            rates.append(optimizer.rate_of(moments[0]))
+            if step >= SETTLED and rates[-1] < optimizer.fall * max(rates):
+                sums = _sum_levels([optimizer.average_of(one) for one in moments], levels)
+                break
     if steps:
         yield dr.ravel(fill_unseen(_planes(sums, channels), squares, levels))
 
+
+LOOK = 5
+"""Steps from one look at the rates to the next; each waits for the steps before."""
+
+SETTLED = 25
+"""Steps before which a pyramid does not end: rates may fall between its first steps."""
 
 DOUBT = 0.01
 """Share of the mean square of derivatives at which a texel counts half."""
