@@ -302,20 +302,17 @@ def _parts(cases: Mapping[Case, Curves]) -> Table:
             continue
         steps = STEPS_OF_MAPS if STEPS_OF_MAPS in curves["fit"] else max(curves["fit"])
         place, row = sorted(curves["fit"]).index(steps), curves["fit"][steps]
-        share = row["parameters"] / next(iter(curves["pyramid"].values()))["parameters"]
         for name in SUBJECTS[case[0]].keys:
             cells = [
                 f"{row[figure]:.1f} ({gain(curves, figure)[place]:+.1f})" if figure in row else ""
                 for figure in (name, f"{name}_unseen")
             ]
-            constant = f"{row[f'{name}_constant']:.1f}"
-            count = f"{row['gaussians']:,.0f}"
-            lines.append((_title(case), name, *cells, constant, count, f"{share:.2f}"))
-    columns = ("photos", "map", "seen", "unseen", "constant", "Gaussians", "parameters")
+            lines.append((_title(case), name, *cells, f"{row[f'{name}_constant']:.1f}"))
+    columns = ("photos", "map", "seen", "unseen", "constant")
     caption = (
         f"PSNR of maps after {STEPS_OF_MAPS} steps of {SPP} spp (128 of 16 for the painting and "
         "the wall), where photos show them and elsewhere; in brackets over the best texels within "
-        "equal seconds; that of the best constant; parameters per one of a pyramid"
+        "equal seconds; that of the best constant"
     )
     return table(caption, columns, lines, name="maps")
 

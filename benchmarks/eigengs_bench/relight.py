@@ -334,10 +334,9 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     ]
     caption = (
         "Packed Gaussians, by default; their bytes over those of planes of pixels at five PSNRs of "
-        "photos that were left out, evenly between the ends of both curves: median (and largest); "
-        "or, if ours shows more at every size, its smallest over their largest; what Gaussians "
-        "before packing reach above the best of 9 principal components and 27 planes of HSH "
-        "without rounding; bytes per pixel in memory"
+        "left-out photos, between the ends of both curves: median (largest); or, if ours shows "
+        "more at every size, its smallest over their largest; unpacked, above the best of 9 "
+        "principal components and 27 planes of HSH; bytes per pixel in memory"
     )
     columns = ("set", "dB; bytes per pixel", *rivals, "PSNR, dB", "in memory")
     figures = {name: fr.number(frame[name].median(), 2) for name in ("bytes", "held", "ahead")}

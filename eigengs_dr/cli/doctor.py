@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     "--compile/--no-compile",
     "compiles",
     default=True,
-    help="Compile the programs of a first fit.  [default: compile]",
+    help="Compile the programs of a first fit.",
 )
 @options.shared("quiet")
 def doctor(run: options.Run, as_json: bool, compiles: bool) -> None:

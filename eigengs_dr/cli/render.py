@@ -92,10 +92,13 @@ def render(
 
 def _write_planes(run: options.Run, file: Path, folder: Path) -> None:
     """Write the planes of a model of lights to a folder."""
+    from ..gaussian.file import LIGHTS, kind_of
     from ..relight.model import Relightable
     from ..relight.planes import PixelPlanes
 
     options.refuse_folder(file)
+    if kind_of(file) != LIGHTS:
+        raise ValueError(f"{file}: holds no model of lights; leave out --planes")
     select(run.backend)
     planes = PixelPlanes.of(Relightable.load(file, run.backend))
     planes.write(folder)

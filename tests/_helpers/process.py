@@ -24,9 +24,10 @@ else:
 HUNG = """
 import faulthandler, os
 # An import of Dr.Jit hides standard error, so the watch has its own copy.
+faulthandler.enable(os.dup(2))
 faulthandler.dump_traceback_later({seconds}, exit=True, file=os.dup(2))
 """
-"""What lets a program that hangs end, and say where: libLLVM, Dr.Jit and threads are in play."""
+"""What lets a program that hangs end, and one that crashes too say where: threads are in play."""
 
 
 def run_python(code, seconds=200, **environment):

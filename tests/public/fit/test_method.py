@@ -58,7 +58,7 @@ NUMBERS = {
     CONTROLS["Perturb"]: "strength every",
     CONTROLS["Backtrack"]: "rise factor first",
     ADAM: "beta_1 beta_2 epsilon",
-    AGREEING: "memory gain first least floor epsilon",
+    AGREEING: "memory gain first least floor fall epsilon",
     eg.Coarse(): "share max_steps rate decay fit_steps",
     adan.Adan(): "epsilon",
     eg.Goal(30.0): "psnr",
