@@ -279,10 +279,10 @@ def _gains(cases: Mapping[Case, Curves]) -> Table:
     fits = [row for curves in cases.values() for row in curves["fit"].values()]
     most = max((row["seeds"] for row in fits), default=1)
     for case, curves in cases.items():
-        line = cells.setdefault(_title(case), {})
-        for (steps, row), decibels in zip(sorted(curves["fit"].items()), gain(curves), strict=True):
-            seeds = "" if row["seeds"] == most else f" ({row['seeds']:g})"
-            line[steps, case[2]] = f"{decibels:+.1f}{seeds}"
+        seeds = min(row["seeds"] for row in curves["fit"].values())
+        line = cells.setdefault(_title(case) + ("" if seeds == most else f" ({seeds:g})"), {})
+        for steps, decibels in zip(sorted(curves["fit"]), gain(curves), strict=True):
+            line[steps, case[2]] = f"{decibels:+.1f}"
     descents = sorted({d for line in cells.values() for d in line}, key=lambda d: (d[1] != SPP, d))
     lines = [
         (title, *(line.get(descent, "") for descent in descents)) for title, line in cells.items()
@@ -322,8 +322,9 @@ def _title(case: Case) -> str:
 
 
 def _chart(cases: Mapping[Case, Curves]) -> Figure:
-    """Draw PSNR over seconds, a panel for each scene and number of cameras."""
-    drawn = [case for case, curves in cases.items() if len(curves["fit"]) > 1]
+    """Draw PSNR over seconds, a panel for the fewest and the most cameras of each scene."""
+    several = [case for case, curves in cases.items() if len(curves["fit"]) > 1]
+    drawn = [case for case in several if case[1] in np.take(SUBJECTS[case[0]].cameras, [0, -1])]
     lines = max(1, math.ceil(len(drawn) / 2))
     figure = fr.new_figure(8, 1 + 2.1 * lines, "Textures recovered from photos")
     axes = np.ravel(figure.subplots(lines, 2, squeeze=False))

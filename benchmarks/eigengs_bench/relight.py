@@ -321,7 +321,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     if not sets:  # a run that was stopped has not measured the default
         return fr.Section()
     frame = pd.DataFrame([_figures_of(methods) for methods in sets.values()], list(sets))
-    rivals = [rival for rival in RIVALS if frame[rival].any()]
+    rivals = [rival for rival in RIVALS if frame[rival].any() and rival != SPLINES]
     lines = [
         (
             name,
