@@ -58,8 +58,9 @@ class Agreeing(Adam):
     floor : float, optional
         Share of the mean of v that is added to each, at least 0.
     fall : float, optional
-        A pyramid ends once the rate of its finest level is below this share of its highest: what
-        derivatives tell of texels is noise from then on. In [0, 1]; 0 for never.
+        For a loss that says its `pixels`, as that of photos: a pyramid ends once the rate of its
+        finest level is below this share of its highest, as texels then copy the noise of single
+        photos. In [0, 1]; 0 for never. Losses that see all texels at each step need the last steps.
 
     Raises
     ------
@@ -304,7 +305,7 @@ def texel_sums(
                 values, moments, time, sums, slopes, size, squares
             )
             yield sums
-            if step % LOOK or not isinstance(optimizer, Agreeing):
+            if step % LOOK or loss.loss.pixels is None or not isinstance(optimizer, Agreeing):
                 continue
             rates.append(optimizer.rate_of(moments[0]))
             if step >= SETTLED and rates[-1] < optimizer.fall * max(rates):

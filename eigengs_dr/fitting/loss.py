@@ -72,6 +72,7 @@ class Loss:
         Number of pixels that the function looks at, such as those of all photos of a texture. More
         than one Gaussian for 3 of them would show their noise: without an image or a number, there
         are no more.
+        Steps of such a function see parts of them, see `eigengs_dr.fitting.coarse.Agreeing`.
 
     Raises
     ------

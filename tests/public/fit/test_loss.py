@@ -146,19 +146,15 @@ def test_a_half_that_a_loss_ignores_looks_like_the_other():
     np.testing.assert_allclose(result.image[:, SIDE // 2 + 4 :].mean((0, 1)), red, atol=0.05)
 
 
-def test_texels_end_where_only_noise_is_left():
-    """Of a picture that every step sees with other noise, the mean of all texels is better."""
-
-    def noisy(picture, step):
-        noise = np.random.default_rng(step).normal(0, 0.3, IMAGE.shape)
-        return dr.mean(dr.square(picture - type(picture)(np.float32(IMAGE + noise))), axis=None)
-
+def test_texels_of_photos_end_once_their_rate_falls():
+    """A loss says by its pixels that steps see parts of the picture, as photos do."""
     kinds = eg.Coarse().optimizer, replace(eg.Coarse().optimizer, fall=0.0)
     methods = [replace(eg.COARSE_TO_FINE, place=eg.Coarse(optimizer=kind)) for kind in kinds]
-    early, late = (fit(noisy, 50, 100, method=method, **FREE) for method in methods)
-    assert early.trace[0]["iteration"] < late.trace[0]["iteration"] == 60
-    assert eg.psnr(early.image, IMAGE) > eg.psnr(late.image, IMAGE)
-    assert fit(squares, 50, 100, **FREE).trace[0]["iteration"] == 60
+    photos = eg.Loss(squares, pixels=10 * SIDE**2)
+    early, late = (fit(photos, iterations=100, method=method, **FREE) for method in methods)
+    assert 25 <= early.trace[0]["iteration"] < late.trace[0]["iteration"] == 60
+    assert early.iterations == late.iterations == 100 and early.loss < 2e-4
+    assert fit(squares, iterations=100, **FREE).trace[0]["iteration"] == 60
 
 
 def test_the_space_of_a_loss_is_a_default():
