@@ -71,8 +71,8 @@ class Loss:
     pixels : int, optional
         Number of pixels that the function looks at, such as those of all photos of a texture. More
         than one Gaussian for 3 of them would show their noise: without an image or a number, there
-        are no more.
-        Steps of such a function see parts of them, see `eigengs_dr.fitting.coarse.Agreeing`.
+        are no more. A step of such a function sees a part of them, as one photo; see
+        `eigengs_dr.fitting.coarse.Agreeing` for what follows.
 
     Raises
     ------
