@@ -319,8 +319,8 @@ LOOK = 5
 """Steps from one look at the rates to the next; each waits for the steps before."""
 
 SETTLED = 25
-"""Steps before which a pyramid does not end. Rates may fall for a while before: ended after 15 steps,
-a picture of 256x256 that a loss saw by means of 4x4 pixels was 1.7 dB worse."""
+"""Steps before which a pyramid does not end. Rates may fall for a while before: after 15 steps,
+a picture of 256x256 that a loss saw by means of 4x4 pixels ended 1.7 dB worse."""
 
 DOUBT = 0.01
 """Share of the mean square of derivatives at which a texel counts half."""
