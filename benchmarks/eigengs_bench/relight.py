@@ -321,6 +321,7 @@ def summarize(rows: Sequence[Row]) -> fr.Section:
     if not sets:  # a run that was stopped has not measured the default
         return fr.Section()
     frame = pd.DataFrame([_figures_of(methods) for methods in sets.values()], list(sets))
+    # The chart alone has splines: another way to read the planes of relight, not another rival.
     rivals = [rival for rival in RIVALS if frame[rival].any() and rival != SPLINES]
     lines = [
         (
